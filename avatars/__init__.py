@@ -1,4 +1,4 @@
 """An avatar on disk: its manifest, its body, its neural texture and its integer network.
 
-It may use `pipeline/` and the folders below it; so far it needs only the modules in `src/trilane`.
+This folder may import `pipeline/` and the folders below that; so far it needs `body/` and the modules in `src/trilane`.
 """

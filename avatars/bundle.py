@@ -34,8 +34,8 @@ CAPTURE = "capture.toml"
 HOW_TO_TRAIN = "docs/own-avatar.md says how `trilane avatar train` makes one from frames of a person"
 HOW_TO_CREATE = "`trilane avatar create --body` puts a body of the same UV layout into an avatar"
 TEXTURE_KEYS = ("texture", "scale", "levels")
-#: Distance in metres that clothes and hair of an avatar reach from its body. The pose stage and the training crop by
-#: it.
+#: How far, in metres, clothes and hair of an avatar may reach from its body. The pose stage and the training grow the
+#: crop rectangle by this distance.
 CLOTHES_STANDOFF_M = 0.045
 
 
@@ -70,11 +70,11 @@ class Bundle:
         return replace(body, offsets=read_offsets(self.offsets_path, len(body.v_template)))
 
     def shaped_body(self) -> ShapedBody:
-        """Return the avatar at rest. Raises BadInputError."""
+        """Return the body in its rest pose, with the shape and expression of the manifest. Raises BadInputError."""
         return self.read_body().shape(self.manifest.betas, self.manifest.expression)
 
     def read_mesh_levels(self, shaped: ShapedBody) -> tuple[MeshLevel, ...]:
-        """Return the levels of the mesh of `shaped`, finest first; none where the bundle has no file of them.
+        """Return the levels of the mesh of `shaped`, finest first; none if the bundle has no file of levels.
 
         Raises BadInputError.
         """
@@ -86,7 +86,7 @@ class Bundle:
         return read_texture(self.texture_path, self.manifest.network.channels)
 
     def read_levels(self) -> NDArray[np.float32] | None:
-        """Return smaller levels of the neural texture, see `pack_levels`; None where it has none.
+        """Return the smaller levels of the neural texture, packed as by `pack_levels`; None if the bundle has none.
 
         Raises BadInputError.
         """
@@ -116,12 +116,12 @@ def read_texture(path: Path, channels: int) -> NDArray[np.float32]:
 
 
 def bundle_folder(name: str | Path) -> Path:
-    """Return the folder of a bundle: a name of `BUILT_IN` is part of the package, anything else is a path."""
+    """Return the folder of the bundle `name`: a name of `BUILT_IN` means a folder of the package, any other a path."""
     return Path(__file__).parent / name if str(name) in BUILT_IN else Path(name)
 
 
 def load_bundle(name: str | Path) -> Bundle:
-    """Read a bundle's manifest. Raises BadInputError naming file and key."""
+    """Return the bundle `name`, as in `bundle_folder`. Raises BadInputError that names file and key."""
     folder = bundle_folder(name)
     path = folder / MANIFEST
     if not folder.exists():
@@ -139,7 +139,7 @@ def load_bundle(name: str | Path) -> Bundle:
 
 
 def _what_it_is(file: Path) -> tuple[str, str, str]:
-    """Describe a file that lies where an avatar's folder should: what it is, what is expected, and what to do."""
+    """Return found, expected and remedy for the error about `file`, which should be an avatar's folder."""
     try:
         is_body = bool(read_npz(file, ("v_template",), "a body"))
     except BadInputError:
@@ -162,17 +162,17 @@ def write_bundle(
 ) -> None:
     """Write a bundle beside `folder`, read it back, then put its files in `folder`.
 
-    A validation of other parts than these is left out of the manifest.
+    If the manifest's validation is of other files than these, it is left out.
 
     `folder`: folder of the bundle; made when it does not exist.
     `manifest`: manifest to write; this function adds the names of the files of `offsets` and `mesh_levels`.
     `body`: .npz file to copy.
     `texture`: (H, W, C) float16, or int8 with `scale`.
     `network`: network to write.
-    `scale`: scale of each channel of an int8 texture, (C,) float32.
+    `scale`: scale of each channel of an int8 texture, (C,) float32; None for a float16 texture.
     `offsets`: offsets of the body's vertices at rest, (V,3) metres; None for a body that is drawn bare.
-    `levels`: smaller levels of the texture, of its type, see `pack_levels`.
-    `mesh_levels`: levels of the mesh of the body with `offsets`, in the manifest's shape.
+    `levels`: smaller levels of the texture, packed by `pack_levels`, with the dtype of the texture; None for none.
+    `mesh_levels`: levels of the mesh of this body with the `offsets` and the manifest's shape.
     Raises BadInputError when the parts do not fit together; then nothing is written.
     """
     with write_folder(folder) as draft:
@@ -209,13 +209,13 @@ def add_mesh_levels(bundle: Bundle, levels: Sequence[MeshLevel]) -> None:
 def write_manifest(folder: Path, manifest: Manifest) -> None:
     """Replace the manifest of the bundle in `folder` by `manifest`, whole or not at all. Raises BadInputError.
 
-    Where the manifest is a symbolic link, the file that it leads to is replaced and the link stays.
+    If the manifest is a symbolic link, the linked file is replaced and the link stays.
     """
     write_bytes(_manifest_file(folder), _content(manifest))
 
 
 def require_writable_manifest(folder: Path) -> None:
-    """Find out before the work whether `write_manifest` can write. Raises BadInputError when it cannot."""
+    """Raise BadInputError, before long work, when `write_manifest` cannot write the manifest in `folder`."""
     require_writable(_manifest_file(folder))
 
 
@@ -228,7 +228,7 @@ def _content(manifest: Manifest) -> bytes:
 
 
 def _with_own_validation(manifest: Manifest, folder: Path) -> Manifest:
-    """Return `manifest` without its validation where that is of other files than those in `folder`."""
+    """Return `manifest`, without its validation if that is not of the files in `folder`."""
     validation = manifest.validation
     own = validation is not None and validation.digests == digests_of(folder, manifest)
     return manifest if own else manifest.model_copy(update={"validation": None})
@@ -280,24 +280,29 @@ def _check_scale(scale: Any, path: Path, channels: int) -> NDArray[np.float32]:
     return factor
 
 
-# Smaller levels of a neural texture, which were learnt with it. They are read where a texel is smaller than a pixel.
+# Smaller levels of a neural texture (H, W, C), learnt together with it. They are sampled where texels are smaller than
+# pixels.
 #
-# Rule: they are stored side by side in one array (H/2, W/2 + W/4 + ..., C), each at the top. An avatar then has a
-# single array more, whose width says how many levels there are.
+# Rule: the levels are stored side by side in one array (H/2, W/2 + W/4 + ..., C), each at the top. An avatar thus has
+# only one more array, and the width of that array tells the number of levels.
 
-#: A further level would have fewer than 16 of the usual 512 texels along a side, too few for any part of a body.
+#: The fifth level of a usual texture of 512x512 has 16 texels along a side. A sixth would have too few for a body.
 MOST_LEVELS = 5
 
 
 def pack_levels(levels: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Pack `levels` (H/2,W/2,C), (H/4,W/4,C), ..., at least one, into an array."""
+    """Return one array of `levels` (H/2,W/2,C), (H/4,W/4,C), ..., side by side; at least one level."""
     height = levels[0].shape[0]
     rows = [np.pad(level, ((0, height - level.shape[0]), (0, 0), (0, 0))) for level in levels]
     return np.concatenate(rows, axis=1)
 
 
 def split_levels(packed: NDArray[Any] | None, width: int) -> list[NDArray[Any]]:
-    """Return the levels in `packed`, for a texture of `width`; none without an array."""
+    """Return the levels in `packed`, largest first; none if `packed` is None.
+
+    `packed`: array of `pack_levels`, or None.
+    `width`: width of the whole texture in texels.
+    """
     levels: list[NDArray[Any]] = []
     left = 0
     while packed is not None and left < packed.shape[1]:
@@ -309,7 +314,10 @@ def split_levels(packed: NDArray[Any] | None, width: int) -> list[NDArray[Any]]:
 
 
 def check_levels(packed: NDArray[Any], texture: NDArray[Any], where: object) -> None:
-    """Raise BadInputError unless `packed` has levels of `texture` (H,W,C), in numbers of its kind."""
+    """Raise BadInputError unless `packed` has levels of `texture` (H,W,C), with the same dtype.
+
+    `where`: file to name in the error.
+    """
     height, width, channels = texture.shape
     widths = [sum(width >> (k + 1) for k in range(count)) for count in range(1, MOST_LEVELS + 1)]
     fits = packed.ndim == 3 and packed.shape[::2] == (height // 2, channels) and packed.shape[1] in widths
@@ -321,29 +329,32 @@ def check_levels(packed: NDArray[Any], texture: NDArray[Any], where: object) -> 
         raise BadInputError(where, found, expected)  # type: ignore[arg-type]
 
 
-# Offsets of a body's vertices, from the skin to what is drawn, as a file of a bundle.
+# Offsets of a body's vertices, from the skin to the clothes or the hair, as a file of a bundle.
 #
-# Rule: there are as many as the body has vertices; they are finite and no longer than clothes and hair reach. They are
-# stored in float16, which is exact to 16 micrometres at 5 cm.
+# Rule: there is one offset for each vertex; each is finite and at most `LONGEST_M` long. Offsets are stored in float16,
+# which is exact to 16 micrometres at 5 cm.
 
 OFFSETS_KEY = "offsets"
 OFFSETS_EXPECTED = "offsets of a body's vertices at rest (.npz)"
-#: Greatest length in metres; what stands farther off is no part of a body's surface.
+#: Greatest length of an offset in metres; a point farther from the skin is no part of a body's surface.
 LONGEST_M = 0.5
 
 
 def as_kept(offsets: F32) -> F32:
-    """Return `offsets` (V,3) as a file stores them."""
+    """Return `offsets` (V,3) rounded as a file stores them."""
     return offsets.astype(np.float16).astype(np.float32)
 
 
 def save_offsets(file: Path | BinaryIO, offsets: F32) -> None:
-    """Write `offsets` (V,3), metres."""
+    """Write `offsets` (V,3), metres, to an .npz file."""
     np.savez_compressed(file, offsets=offsets.astype(np.float16))
 
 
 def read_offsets(path: Path, vertices: int) -> F32:
-    """Read offsets (V,3), metres, of a body of so many `vertices`. Raises BadInputError."""
+    """Return the offsets (V,3), metres, in an .npz file. Raises BadInputError.
+
+    `vertices`: number V of vertices that the body has.
+    """
     array = read_npz(path, (OFFSETS_KEY,), OFFSETS_EXPECTED).get(OFFSETS_KEY)
     if array is None:
         raise BadInputError(path, f"no array {OFFSETS_KEY!r}", OFFSETS_EXPECTED)

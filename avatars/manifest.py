@@ -10,7 +10,7 @@ import hashlib
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import (
     BaseModel,
@@ -27,9 +27,10 @@ from trilane.errors import BadInputError
 
 #: Value of `weights` in `provenance` for a network that nobody trained.
 UNTRAINED = "untrained: for speed alone"
-#: Value of `body` in `provenance` where the person is known by frames alone: nobody can draw another pose or view.
+#: Value of `body` in `provenance` if the person is known from frames alone: no ground truth of other poses or views can
+#: be drawn.
 CAPTURED = "that of a capture"
-BANDS = ("far", "full_body", "upper_body", "face")
+
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 #: A shape or expression coefficient in standard deviations; values outside this range describe no human body.
 Coefficient = Annotated[float, Field(ge=-100, le=100, allow_inf_nan=False)]
@@ -37,7 +38,9 @@ FileName = Annotated[str, Field(min_length=1, max_length=200)]
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 #: An existing day, in JSON as YYYY-MM-DD.
 Day = Annotated[datetime.date, Field(strict=True)]
+#: How much of the person a view shows.
 Band = Literal["far", "full_body", "upper_body", "face"]
+BANDS: tuple[Band, ...] = get_args(Band)
 Share = Annotated[float, Field(ge=0, le=1)]
 
 
@@ -55,8 +58,9 @@ class ByteRange(_Model):
 class NetworkEntry(_Model):
     """The network file and the network in it.
 
-    `width`: 64 is the full network. `channels`: channels of the neural texture.
-    `input`, `output`: scale and zero point of the file's bytes, which the GPU unit encodes with.
+    `encoder`, `norm`: names, as `trilane avatar network` takes them. `width`: channels of the first layers; 64 is the
+    full network. `channels`: channels of the neural texture.
+    `input`, `output`: scale and zero point of the network's input and output bytes.
     """
 
     file: FileName
@@ -84,9 +88,10 @@ class Digests(_Model):
 
 
 class WorstView(_Model):
-    """The view of the least PSNR, with the numbers that identify it.
+    """The view of the least PSNR, with the numbers that identify the view.
 
-    `number`: number of the view among those of `seed`.
+    `number`: number of the view among the views of `seed`.
+    `psnr_db`, `body_psnr_db`: PSNR of this view in dB, as in `training/image_error.py`.
     """
 
     seed: int
@@ -97,7 +102,7 @@ class WorstView(_Model):
 
 
 class SeedFigures(_Model):
-    """Figures of the views of one seed, in dB: two means and the least."""
+    """Figures of the views of one seed, in dB: the mean PSNR, the mean PSNR on the body, and the least PSNR."""
 
     psnr_db: Finite
     body_psnr_db: Finite
@@ -107,11 +112,10 @@ class SeedFigures(_Model):
 class AccuracyFigures(_Model):
     """Image error of one network on one runtime, on poses and views that were not trained on.
 
-    `psnr_db_by_band`: PSNR in dB, before random backgrounds, inside the box of the true mask. `see_through`: share of
-    the inside of the person whose alpha is less than 0.9. `iou`, `ssim`: means.
-    The other keys are those of `summary` in `training/image_error.py`; they are None, and not written, where nobody
-    measured them. Without `psnr_db_by_background` the figures are before a single grey, as an older Trilane measured
-    them.
+    `psnr_db_by_band`: mean PSNR in dB, in front of random backgrounds, inside the bounding box of the true mask.
+    `see_through`: share of the pixels inside the person whose alpha is less than 0.9. `iou`, `ssim`: means.
+    The other keys are those of `summary` in `training/image_error.py`; a key that nobody measured is None and not
+    written. If `psnr_db_by_background` is None, an older Trilane measured the figures in front of a single grey.
     """
 
     model_config = ConfigDict(extra="allow", frozen=True)
@@ -148,10 +152,11 @@ class AccuracyFigures(_Model):
 
 
 class MadeWith(_Model):
-    """The software that measured the figures, beside the avatar's files. No digest covers it.
+    """The software that measured the figures.
 
-    `trilane`: its version. `revision`, `modified`: state of its checkout in git. All three are None where not known.
-    `renderer`: OpenGL's renderer. `runtimes`: name and version of the library, by the runtime's name.
+    `trilane`: version of Trilane. `revision`, `modified`: commit of its checkout in git, and whether files differ from
+    that commit. These three are None if unknown. `renderer`: name of OpenGL's renderer. `runtimes`: name and version of
+    each runtime's library, by the runtime's name.
     """
 
     trilane: str | None
@@ -162,11 +167,11 @@ class MadeWith(_Model):
 
 
 class BySize(_Model):
-    """The cost of smaller tensors: the same views painted at several sizes, and enlarged to the first one's.
+    """The loss by smaller tensors: the same views are painted at several tensor sizes, then enlarged to the first size.
 
-    `date`: date in UTC. `runtime`: runtime that painted. `seed`, `per_band`, `held_out`: choice of the views.
-    `psnr_db`: mean PSNR in dB inside the box of the true mask, by HEIGHTxWIDTH of the tensor; the network's own size
-    first.
+    `date`: date in UTC. `runtime`: runtime that ran the network. `seed`, `per_band`, `held_out`: choice of the views.
+    `psnr_db`: mean PSNR in dB inside the bounding box of the true mask, by HEIGHTxWIDTH of the tensor; the network's
+    own size comes first.
     """
 
     date: Day
@@ -177,7 +182,7 @@ class BySize(_Model):
     psnr_db: dict[Annotated[str, Field(pattern=r"^[0-9]{1,4}x[0-9]{1,4}$")], Finite] = Field(min_length=1)
 
 
-#: Figures that stand at the top of a validation too, taken from its own runtime.
+#: Figures that a validation repeats at its top level; they are those of its `runtime`.
 AT_THE_TOP = ("psnr_db_by_band", "psnr_db_by_background", "see_through", "iou", "ssim")
 
 
@@ -187,9 +192,9 @@ class Validation(AccuracyFigures):
     `date`: day of the validation, UTC. `date`, `digests`, `figures_digest` and `made_with` are None in a manifest that
     an older Trilane wrote.
     `digests`: digests of the validated files.
-    `figures_digest`: digest of all other keys here, by `figures_digest` of `avatars/manifest.py`.
-    `made_with`: software that measured.
-    `runtime`: runtime that painted the pictures of `integer`, whose errors stand at the top too.
+    `figures_digest`: digest of all other keys here, by the function `figures_digest`.
+    `made_with`: software that measured the figures.
+    `runtime`: runtime of the figures in `integer`. The keys of `AT_THE_TOP` repeat these figures.
     `other_runtimes`: figures of more runtimes, by name.
     `size`: tensor size, as `trilane run --size` takes it.
     `texture_filter`: filter of the neural texture.
@@ -210,16 +215,18 @@ class Validation(AccuracyFigures):
     by_size: BySize | None = None
 
     def on(self, runtime: str) -> AccuracyFigures | None:
-        """Return the figures of `runtime`; None when nothing was painted on it."""
+        """Return the figures of `runtime`; None if the avatar was not validated on that runtime."""
         if runtime != self.runtime:
             return self.other_runtimes.get(runtime)
         return self.integer or AccuracyFigures(**{key: getattr(self, key) for key in AT_THE_TOP})
 
 
 class Manifest(_Model):
-    """`manifest.json`. File names are relative to the bundle's folder; a body without `offsets` is drawn bare.
+    """`manifest.json`. File names are relative to the bundle's folder.
 
-    `mesh_levels`: levels of the mesh; None where the whole mesh is drawn at every distance.
+    `offsets`: file of the offsets of the body's vertices; None if the body is drawn bare.
+    `mesh_levels`: file of the levels of the mesh; None if the whole mesh is drawn at every distance.
+    `betas`, `expression`: coefficients of shape and of expression.
     """
 
     schema_version: Literal[1] = 1
@@ -238,12 +245,7 @@ class Manifest(_Model):
 
 
 def network_entry(network: NetworkFile, encoder: str, norm: str, width: int) -> NetworkEntry:
-    """Return the manifest's entry for a quantised network, stored as `network.onnx`.
-
-    `network`: network whose scales and zero points are written into the entry.
-    `encoder`, `norm`: names, as `trilane avatar network` takes them.
-    `width`: 64 is the full network.
-    """
+    """Return the manifest's entry for a quantised network in the file `network.onnx`. See `NetworkEntry`."""
     ends = [ByteRange(scale=end.scale, zero_point=end.zero_point) for end in (network.input, network.output)]
     return NetworkEntry(
         file="network.onnx",
@@ -275,7 +277,7 @@ def _short(value: object) -> str:
 
 # Digests of everything that an avatar's pictures depend on: the bytes of its files and the numbers of its manifest.
 #
-# Rule: a byte that changes the picture changes a digest; names, provenance and other words change none.
+# Rule: a byte that may change a picture changes a digest. Names, provenance and other texts do not.
 
 BLOCK = 1 << 20
 
@@ -291,21 +293,21 @@ def digests_of(folder: Path, manifest: Manifest) -> Digests:
 
 
 def figures_digest(validation: Validation) -> str:
-    """Return the SHA-256, hexadecimal, of all of `validation` except this digest, in a canonical form.
+    """Return the SHA-256, hexadecimal, of a canonical JSON of `validation` without its `figures_digest`.
 
-    A key that is None counts as not there, so an optional key that a later Trilane adds changes no older digest.
+    Optional keys of the figures that are None are left out. A new optional key thus changes no older digest.
     """
     said = validation.model_dump(mode="json", exclude={"figures_digest"})
     return hashlib.sha256(_in_one_way(said).encode()).hexdigest()
 
 
 def with_figures_digest(validation: Validation) -> Validation:
-    """Return `validation`, which has just been measured, with the digest of its figures."""
+    """Return the newly measured `validation` with its `figures_digest`."""
     return validation.model_copy(update={"figures_digest": figures_digest(validation)})
 
 
 def sha256_of(files: Sequence[Path]) -> str:
-    """Return the SHA-256, hexadecimal, of the bytes of `files`, one after the other. Raises BadInputError."""
+    """Return the SHA-256, hexadecimal, of the joined bytes of `files`. Raises BadInputError."""
     digest = hashlib.sha256()
     for file in files:
         try:
@@ -318,7 +320,7 @@ def sha256_of(files: Sequence[Path]) -> str:
 
 
 def _constants(manifest: Manifest) -> str:
-    """Return the manifest's numbers that the picture depends on, in a canonical form."""
+    """Return a canonical JSON of those numbers of the manifest that the pictures depend on."""
     network = manifest.network
     numbers = {
         "betas": list(manifest.betas),

@@ -1,8 +1,8 @@
-"""Levels of a body's mesh: fewer triangles between some of its vertices, and how far each level moves the surface.
+"""Levels of a body's mesh: fewer triangles between some of its vertices, and a bound on how far they move the surface.
 
-A level keeps vertices as they are, so it is a list of triangles. **Where it moves the surface to** is said texel by
-texel: the point of the whole mesh that shows a texel, and the point of the level that shows the same one. So the bound
-holds for the outline and for what is painted inside of it.
+A level keeps vertices where they are, so a level is a list of triangles. **How far it moves the surface** is measured
+texel by texel. Each texel shows on a point of the whole mesh and on a point of the level; the bound holds for the
+distance between these two points. It holds for the outline and for all details inside the outline.
 
 Proof of the bound. A posed point of either mesh is a sum of b_v x_v over the corners of its triangle, with x_v = sum_j
 w_vj G_j v and G_j the rigid motion of joint j. Let e_v be the level's b_v minus the whole mesh's; the e_v sum to 0, and
@@ -13,14 +13,15 @@ distance is at most
 
     |d| + sum_b 2 sin(t_b / 2) |y_b or d - y_b|
 
-for any k. Between the places where the edges of the two meshes cross, both points are linear in the texel. So the
-distance is largest where edges cross, or at a vertex that the level leaves out. `training/mesh_levels.py` evaluates the
-terms there. Pose blend shapes move a vertex by at most r_v = sum_b r_vb |R_b - I|, which adds sum |e_v| r_v. Rows of
-terms are taken in groups, with the largest of each term in the group.
+for any k. Between the places where the edges of the two meshes cross in the texture, both points are linear functions
+of the texel. The distance is thus largest where edges cross, or at a vertex that the level leaves out.
+`training/mesh_levels.py` evaluates the terms at these places, one row for each place. Pose blend shapes move a vertex
+by at most r_v = sum_b r_vb |R_b - I|, which adds sum |e_v| r_v. Rows are joined in groups: a group has the largest
+value of each term.
 
-A bundle has its levels in `mesh-levels.npz`. Rule: that file names the body that its levels were made for, by a digest
-of what a body file holds and by measures of what is computed from it. For any other body its bounds would be wrong, so
-it is refused. An avatar without this file has one level, its whole mesh.
+A bundle has its levels in `mesh-levels.npz`. Rule: this file identifies the body that the levels were made for, by a
+digest of the body's stored arrays and by measures of the computed arrays. The bounds would be wrong for any other body,
+so the file is refused for any other. An avatar without this file has one level, its whole mesh.
 """
 
 from __future__ import annotations
@@ -44,18 +45,19 @@ from trilane.files import read_npz
 #: Error that float32 may add, metres: the rounding of weights, of skinned vertices and of the stored terms.
 ROUNDING_M = 5e-6
 TURNS = JOINTS - 1
-#: About so many rows of terms bound a level.
+#: Approximate number of rows of terms that bound a level.
 BOUND_ROWS = 2048
 
 
 @dataclass(frozen=True)
 class MeshLevel:
-    """A level of a mesh.
+    """A level of a mesh: F triangles and G rows of terms of its bound, see the module.
 
-    `faces`, `uv_faces` (F,3): triangles, as indices of the whole body's vertices and texture coordinates.
-    `rest` (G,), `swing` (G,54), `blend` (G,54): terms of the bound, metres: |d|, the factors of 2 sin(t_b / 2), and
-    those of |R_b - I|.
-    `uv_error`: distance between the texels at the seams of the level and of the whole mesh, in sides of the texture.
+    `faces`, `uv_faces`: (F,3) indices of the whole body's vertices and of its texture coordinates.
+    `rest`: (G,) |d|, metres.
+    `swing`: (G,54) factors of 2 sin(t_b / 2), metres.
+    `blend`: (G,54) factors of |R_b - I|, metres.
+    `uv_error`: largest distance between the seams of the level and of the whole mesh, in texture widths.
     """
 
     faces: I32
@@ -66,7 +68,7 @@ class MeshLevel:
     uv_error: float
 
     def metres(self, posed: Posed) -> float:
-        """Return the furthest, in metres, that the level moves a point of the surface in a frame of `Skeleton.pose`."""
+        """Return the bound, in metres, on how far the level moves any point of the surface in the pose `posed`."""
         turned = np.linalg.norm(posed.feature.reshape(TURNS, 9), axis=1)
         moved = self.rest + self.swing @ (turned / np.float32(np.sqrt(2.0)))
         if self.has_blend:
@@ -80,7 +82,7 @@ class MeshLevel:
 
     @cached_property
     def least_m(self) -> float:
-        """Least that `metres` returns in any pose: the largest move at rest."""
+        """Lower bound of `metres` over all poses: the largest move at rest, in metres."""
         return float(self.rest.max())
 
     def reduced(self, shaped: ShapedBody) -> ShapedBody:
@@ -103,10 +105,10 @@ class MeshLevel:
 
 
 def grouped(rest: F64, swing: F64, blend: F64) -> tuple[F32, F32, F32]:
-    """Return fewer rows of terms (G,), (G,54), (G,54) that bound all of `rest` (P,), `swing` (P,54), `blend` (P,54).
+    """Return G rows of terms (G,), (G,54), (G,54) that bound the P rows `rest` (P,), `swing` (P,54), `blend` (P,54).
 
-    Rows that are never the largest, however far the joints turn, are left out. The others are sorted by their two
-    largest swings and by their size, and neighbours become one row with the largest of each term.
+    A row that never has the largest sum, however far the joints turn, is left out. The rows are sorted by the joints of
+    their two largest swings, then by their largest sum. Neighbours become one row with the largest value of each term.
     """
     most = rest + 2.0 * swing.sum(axis=1) + 2.0 * np.sqrt(2.0) * blend.sum(axis=1)
     matters = most >= rest.max()
@@ -118,7 +120,7 @@ def grouped(rest: F64, swing: F64, blend: F64) -> tuple[F32, F32, F32]:
     begins[:: max(len(rest) // BOUND_ROWS, 1)] = True
     starts = np.flatnonzero(begins)
     tops = [np.maximum.reduceat(rows[order], starts, axis=0) for rows in (rest, swing, blend)]
-    # Rounded up, so that a term in float32 is never smaller than it was.
+    # Rounded up, so that a float32 term is never smaller than its float64 value.
     up = [np.nextafter(rows.astype(np.float32), np.float32(np.inf)) for rows in tops]
     return up[0], up[1], up[2]
 
@@ -127,12 +129,12 @@ MESH_LEVELS = "mesh-levels.npz"
 EXPECTED = "levels of a mesh (.npz)"
 REMEDY = "`trilane avatar levels` makes them"
 DIGEST, MEASURES = "digest", "measures"
-#: Largest difference of a measure. Sums of products differ in their last digits from processor to processor; places
-#: 10 micrometres apart are the same to a bound of millimetres.
+#: Largest difference between equal measures. Sums of products differ in their last digits from processor to processor,
+#: and 10 micrometres do not matter to a bound of millimetres.
 MOST_APART = 1e-5
-#: One vertex in so many is a measure.
+#: Every `STEP`th vertex is measured.
 STEP = 97
-#: For each array of a level, its columns (0 for one number a row) and whether it holds indices.
+#: For each array of a level, the number of its columns (0: one-dimensional) and whether it holds indices.
 COLUMNS = {
     "faces": (3, True),
     "uv_faces": (3, True),
@@ -141,14 +143,14 @@ COLUMNS = {
     "blend": (TURNS, False),
 }
 UV_ERROR = "uv_error"
-#: Most levels that a file may have; a run makes each of them ready to be drawn.
+#: Most levels that a file may have: a run uploads all of them.
 MOST_LEVELS = 8
-#: Most rows of an array, the most triangles that a body may have.
+#: Most rows of an array: the largest number of triangles that a body may have.
 MOST_ROWS = 1 << 19
 
 
 def digest_of(shaped: ShapedBody) -> str:
-    """Return the SHA-256, hexadecimal, of what levels of the mesh of `shaped` depend on and a file holds as it is."""
+    """Return the SHA-256, hexadecimal, of those stored arrays of the body that levels of its mesh depend on."""
     body = shaped.body
     digest = hashlib.sha256()
     arrays = (body.v_template, body.parents, body.faces, body.uv_faces, body.uv)
@@ -159,14 +161,14 @@ def digest_of(shaped: ShapedBody) -> str:
 
 
 def measures_of(shaped: ShapedBody) -> NDArray[np.float64]:
-    """Return numbers (N,) float64 of what is computed from a body file: the person's shape, and the joints' weights."""
+    """Return samples (N,) float64 of arrays that are computed from a body file: joints, vertices, skinning weights."""
     weights = shaped.body.weights.astype(np.float64)
     parts = (shaped.joints, shaped.vertices[::STEP], weights.mean(axis=0), weights[::STEP])
     return np.concatenate([np.asarray(part, np.float64).ravel() for part in parts])
 
 
 def levels_to_arrays(levels: Sequence[MeshLevel]) -> dict[str, NDArray[Any]]:
-    """Return the arrays of `levels`: `faces1`, `uv_faces1`, ... of the first, and `uv_error` (L,) of all."""
+    """Return the arrays of L levels: `faces1`, `uv_faces1`, ... of the first level, and one `uv_error` (L,)."""
     arrays = {f"{name}{k}": getattr(level, name) for k, level in enumerate(levels, 1) for name in COLUMNS}
     return {**arrays, UV_ERROR: np.array([level.uv_error for level in levels], np.float64)}
 
@@ -180,16 +182,16 @@ def levels_from_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[MeshLevel, .
 
 
 def save_mesh_levels(file: Path | BinaryIO, shaped: ShapedBody, levels: Sequence[MeshLevel]) -> None:
-    """Write `levels` of the mesh of `shaped`."""
+    """Write `levels` of the mesh of `shaped` to an .npz file, with the digest and the measures of `shaped`."""
     digest = np.frombuffer(bytes.fromhex(digest_of(shaped)), np.uint8)
     own: dict[str, Any] = {DIGEST: digest, MEASURES: measures_of(shaped)}
     np.savez_compressed(file, allow_pickle=False, **levels_to_arrays(levels), **own)
 
 
 def read_mesh_levels(path: Path, shaped: ShapedBody) -> tuple[MeshLevel, ...]:
-    """Read the levels of the mesh of `shaped`, finest first.
+    """Return the levels of the mesh of `shaped`, finest first.
 
-    Raises BadInputError when the file is missing, damaged, of another body, or has numbers that no level has.
+    Raises BadInputError when the file is missing or damaged, is for another body, or has impossible numbers.
     """
     numbers = range(1, MOST_LEVELS + 1)
     arrays = read_npz(

@@ -22,7 +22,8 @@ from trilane.files import require_file, signature_of
 
 # The integer network that an avatar's file holds and a runtime loads.
 #
-# Rule: a static graph with bytes at both ends; its layers run in integers, except those that it names itself.
+# Rule: the graph has fixed shapes, and bytes at both ends. Its layers run in integers, except those that its metadata
+# names.
 
 #: Metadata key of the file: a JSON list of the names of layers that were left in float on purpose.
 FLOAT_LAYERS_KEY = "trilane.float_layers"
@@ -45,7 +46,7 @@ class Affine:
 class IntegerNetwork:
     """The network that a runtime loads.
 
-    `model`: static integer graph with bytes at its ends. `where`: place that it was read from.
+    `model`: integer graph with fixed shapes and bytes at both ends. `where`: source to name in errors, such as a file.
     """
 
     where: str
@@ -73,8 +74,8 @@ class IntegerNetwork:
 class NetworkFile(IntegerNetwork):
     """A checked network.
 
-    `shape`: (N, H, W, C) of its uint8 input; its output is (N, H, W, 4) uint8. `input`, `output`: scale and zero point
-    of the bytes.
+    `shape`: (N, H, W, C) of the uint8 input; the output is (N, H, W, 4) uint8. `input`, `output`: scale and zero point
+    of the input and output bytes.
     """
 
     shape: tuple[int, int, int, int]
@@ -87,7 +88,7 @@ class NetworkFile(IntegerNetwork):
 
 
 def node_name(node: onnx.NodeProto) -> str:
-    """Return the node's name; without one, its operator and the tensor that it outputs."""
+    """Return the node's name; if it has none, its operator and the name of its output tensor."""
     return node.name or f"{node.op_type} that makes {next(iter(node.output), 'nothing')}"
 
 
@@ -101,7 +102,7 @@ def constants_of(model: onnx.ModelProto) -> Mapping[str, TensorProto]:
 
 
 def check_integer_layers(network: IntegerNetwork) -> None:
-    """Raise BadInputError naming layers whose inputs are not dequantised integers; `float_layers` are allowed."""
+    """Raise BadInputError for layers outside `float_layers` whose inputs are not dequantised integers."""
     makers = {out: node for node in network.model.graph.node for out in node.output}
     float_layers = []
     for node in network.model.graph.node:
@@ -122,17 +123,17 @@ def _beyond_transposes(makers: Mapping[str, onnx.NodeProto], name: str) -> onnx.
     return node
 
 
-# Checks a network: operators, shapes of its ends, scales and zero points.
+# Checks a network: operators, shapes of its input and output, scales and zero points.
 #
-# Rule: a network that passes is a static integer network from NHWC bytes to RGBA bytes, so a runtime need not check it
-# again. The refusal of another one names the node that is wrong.
+# Rule: a network that passes is an integer network with fixed shapes, from NHWC bytes to RGBA bytes. A runtime need not
+# check it again. The error about any other network names the wrong node.
 
 RGBA = 4
-#: Remedy for a network of floats.
+#: Remedy for a float network.
 TO_INTEGERS = "make it one of integers: trilane avatar quantise FLOAT.onnx --frames FRAMES.npy --out NETWORK.onnx"
-#: Smallest and largest plausible scale; others come from an empty calibration or a damaged file.
+#: Smallest and largest plausible scale. A scale outside comes from an empty calibration or a damaged file.
 SCALE_RANGE = (1e-30, 1e30)
-#: Operators that a network may have: layers that quantise, activations, norms, and operators that move data.
+#: Operators that a network may have: layers, arithmetic, activations, norms, and operators that move or quantise data.
 OPERATORS = {
     *("Conv", "ConvTranspose", "Gemm", "Add", "Sub", "Mul", "Div", "Sqrt", "ReduceMean", "Constant", "Identity"),
     *("Relu", "LeakyRelu", "Clip", "Sigmoid", "HardSigmoid", "HardSwish", "Tanh"),
@@ -150,7 +151,7 @@ ZERO_POINT_TYPES = {
 
 
 def check_network(model: onnx.ModelProto, where: str) -> NetworkFile:
-    """Check `model`, which came from `where`, and return the network. Raises BadInputError that names the node."""
+    """Return `model` as a checked network. Raises BadInputError that names `where` and the wrong node."""
     _check_operators(model, where)
     shape = _check_input(model, where)
     _check_output(model, where, shape)
@@ -252,7 +253,7 @@ def _array(tensor: TensorProto, where: str) -> NDArray[np.generic]:
 
 
 def _reader_of(graph: onnx.GraphProto, name: str, op_type: str, where: str) -> onnx.NodeProto:
-    """Return the node of `op_type` that reads tensor `name`, with only Transposes between them."""
+    """Return the node of `op_type` that reads tensor `name`, directly or through Transposes. Raises BadInputError."""
     for _ in graph.node:
         users = [node for node in graph.node if name in node.input]
         if users and all(node.op_type == op_type for node in users):
@@ -264,7 +265,7 @@ def _reader_of(graph: onnx.GraphProto, name: str, op_type: str, where: str) -> o
 
 
 def _maker_of(graph: onnx.GraphProto, name: str, op_type: str, where: str) -> onnx.NodeProto:
-    """Return the node of `op_type` that makes tensor `name`, with only Transposes between them."""
+    """Return the node of `op_type` that makes tensor `name`, directly or through Transposes. Raises BadInputError."""
     makers = {out: node for node in graph.node for out in node.output}
     for _ in graph.node:
         node = makers.get(name)
@@ -290,15 +291,14 @@ def _affine(node: onnx.NodeProto, constants: Mapping[str, TensorProto], where: s
 
 # Makes the same network for another tensor shape: rewrites batch, height and width, and infers all other shapes again.
 #
-# Rule: the result is static and passes the checks of every network; weights do not change.
+# Rule: the result has fixed shapes and passes `check_network`; weights do not change.
 
 STRIDE = 32
 
 
 def reshaped(network: NetworkFile, height: int, width: int, batch: int = 1) -> NetworkFile:
-    """Return `network` for inputs of another shape; the same object when it has that shape already.
+    """Return `network` for inputs of another shape; `network` itself if it already has that shape.
 
-    `network`: checked network.
     `height`, `width`: size of the input in pixels, multiples of 32.
     `batch`: number of frames that are inferred together.
     Raises BadInputError when the graph cannot run at that shape.
@@ -328,19 +328,19 @@ EXPECTED = "an ONNX network"
 
 
 def read_network(path: Path) -> NetworkFile:
-    """Read and check an ONNX file. Raises BadInputError that names the file, the node and the remedy."""
+    """Return the checked network in an ONNX file. Raises BadInputError that names the file and the node."""
     return check_network(parse_network(path), str(path))
 
 
 def parse_network(path: Path) -> onnx.ModelProto:
-    """Read the ONNX model in the file, of any kind, with external data. Raises BadInputError when unreadable."""
+    """Return the unchecked ONNX model in a file, with its external data. Raises BadInputError if it is unreadable."""
     model = _parse(path)
     _load_external(model, path)
     return model
 
 
 def network_files(path: Path) -> list[Path]:
-    """Return the ONNX file itself, then every file beside it that holds tensors of it. Raises BadInputError."""
+    """Return the ONNX file, then the files of its external data, sorted. Raises BadInputError."""
     kept = {_external_file(tensor, path) for tensor in _external_tensors(_parse(path))}
     return [path, *sorted(kept)]
 
@@ -378,7 +378,10 @@ def _load_external(model: onnx.ModelProto, path: Path) -> None:
 
 
 def _external_file(tensor: TensorProto, path: Path) -> Path:
-    """Return the file that holds the data of `tensor` in network `path`. Raises BadInputError for a forbidden place."""
+    """Return the file of the external data of `tensor` in network `path`.
+
+    Raises BadInputError for a file that is missing, too large or outside the network's folder.
+    """
     folder = path.parent.resolve()
     entry = {pair.key: pair.value for pair in tensor.external_data}
     file: Path = (folder / entry.get("location", "")).resolve()

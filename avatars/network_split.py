@@ -2,8 +2,9 @@
 
 Rule: only bytes cross a cut, so the parts, run one after the other, give the same bytes as the whole network.
 
-Every tensor that a later part reads crosses the cut, not only the one that the cut is named after. Others are a U-Net's
-skips or its input. A Dequantize whose bytes cross, and a Transpose behind it, are repeated in the part that reads them.
+Every tensor that a later part reads crosses the cut: the tensor that names the cut, and others, such as a U-Net's skip
+connections or the network's input. A Dequantize and a Transpose that read a crossing tensor are repeated in the later
+part.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from trilane.avatars.network_file import IntegerNetwork, NetworkFile
 from trilane.errors import BadInputError
 
 QUANTIZE = "QuantizeLinear"
-#: Operators with one input that a later part can repeat from the bytes that cross.
+#: Operators with one input that a later part can repeat on crossing bytes.
 MOVABLE = ("DequantizeLinear", "Transpose")
 Shapes = dict[str, tuple[int, ...]]
 
@@ -30,8 +31,8 @@ Shapes = dict[str, tuple[int, ...]]
 class Cut:
     """A place to cut.
 
-    `at`: tensor that it is named after. `nodes`: number of the graph's nodes before it.
-    `crossing`: name and shape of every tensor that crosses, all uint8; `at` is one of them.
+    `at`: name of the tensor that names the cut. `nodes`: number of the graph's nodes before the cut.
+    `crossing`: shape of every tensor that crosses the cut, by name; all are uint8, and `at` is one of them.
     """
 
     at: str
@@ -46,11 +47,11 @@ class Cut:
 
 @dataclass(frozen=True)
 class NetworkPart(IntegerNetwork):
-    """A part of the network that runs by itself. Its four tables map a uint8 tensor's name to its shape.
+    """A part of the network that runs by itself. The four tables give the shapes of uint8 tensors by name.
 
-    `inputs`, `outputs`: tensors of `model`, in its order.
-    `crossing_in`: tensors that cross the cut before this part. `crossing_out`: tensors that cross the cut behind it. A
-    tensor of `crossing_out` that is not in `outputs` is in `crossing_in`, and has to be copied unchanged.
+    `inputs`, `outputs`: inputs and outputs of `model`, in the model's order.
+    `crossing_in`, `crossing_out`: tensors that cross the cut before this part, and the cut behind it. If a tensor of
+    `crossing_out` is not in `outputs`, it is in `crossing_in`, and has to be copied unchanged.
     """
 
     inputs: Shapes
@@ -70,9 +71,9 @@ def cuts(network: NetworkFile) -> Iterator[Cut]:
 
 
 def split(network: NetworkFile, at: Sequence[str]) -> list[NetworkPart]:
-    """Return the parts of `network`, cut at the quantised tensors `at`, given in the order of the network's nodes.
+    """Return the parts of `network` between the cuts `at`. Raises BadInputError if there is no such cut.
 
-    Raises BadInputError when it cannot be cut there.
+    `at`: names of cuts, in the order of the network's nodes.
     """
     known = {cut.at: cut for cut in cuts(network)} if at else {}
     for name in at:
@@ -89,7 +90,7 @@ def split(network: NetworkFile, at: Sequence[str]) -> list[NetworkPart]:
 
 
 def _crossing(graph: onnx.GraphProto, nodes: int) -> Shapes | None:
-    """Return the tensors that nodes from number `nodes` on read from earlier ones; None unless all are bytes."""
+    """Return the tensors that cross a cut behind the first `nodes` nodes, with shapes; None if any is not uint8."""
     makers = {name: node for node in graph.node[:nodes] for name in node.output}
     names = []
     for node in graph.node[nodes:]:
@@ -130,7 +131,7 @@ def _part(network: NetworkFile, before: Cut, after: Cut) -> NetworkPart:
 
 
 def _needed(nodes: Sequence[onnx.NodeProto], outputs: Sequence[str]) -> list[onnx.NodeProto]:
-    """Return the nodes that `outputs` depend on, in their order."""
+    """Return those of `nodes` that `outputs` depend on, in the order of `nodes`."""
     wanted, needed = set(outputs), []
     for node in reversed(nodes):
         if wanted.intersection(node.output):

@@ -32,7 +32,7 @@ HELD_OUT = "held_out_error"
 ON_HELD_OUT = "its error on those held out is in the provenance of its manifest"
 
 
-#: Warning about a validation at another size or on another runtime.
+#: Remark on the command that validates at another size or on another runtime.
 REPLACES = ", in place of what the manifest says now"
 NEIGHBOURS = "`trilane bench several` measures what an avatar loses to its neighbours"
 PLANNED, BY_FRAME = "auto", "`trilane bench planner` measures scenes whose tensor is planned"
@@ -42,8 +42,8 @@ PLANNED, BY_FRAME = "auto", "`trilane bench planner` measures scenes whose tenso
 class DrawnAs:
     """How a run draws an avatar.
 
-    `runtime`: runtime of the network. `size`: tensor size of the scene. `texture_filter`: filter of the neural texture.
-    `avatars`: number of avatars that share the tensor.
+    `runtime`: runtime of the network. `size`: tensor size, as `trilane run --size` takes it. `texture_filter`: filter
+    of the neural texture. `avatars`: number of avatars that share the tensor.
     """
 
     runtime: str
@@ -53,15 +53,15 @@ class DrawnAs:
 
 
 def from_validation(date: datetime.date | None) -> str:
-    """Return the source of a figure that an avatar's validation of `date` brought."""
+    """Return the source to name for a figure from an avatar's validation of `date`."""
     return f"from the avatar's validation of {date}"
 
 
 def accuracy_of(bundle: Bundle, drawn: DrawnAs) -> dict[str, Any]:
-    """Return what may be said about the error of the avatar's pictures in a run that draws it as `drawn`.
+    """Return the figures of the avatar's image error that hold for a run that draws it as `drawn`.
 
-    With figures: `source`, which names the validation and its date; `runtime`, `size`; the keys of `AccuracyFigures`.
-    Without: what `refused` returns, also where the avatar is drawn otherwise than in its validation.
+    Keys: `source`, which names the validation and its date; `runtime`, `size`; the keys of `AccuracyFigures`. If no
+    figure holds, the keys are those of `refused`: `source`, `changed`, `why`.
     Raises BadInputError for a file that cannot be read.
     """
     validation = bundle.manifest.validation
@@ -84,7 +84,10 @@ def accuracy_of(bundle: Bundle, drawn: DrawnAs) -> dict[str, Any]:
 
 
 def validation_facts(bundle: Bundle) -> dict[str, Any] | None:
-    """Return the whole validation with its `source`, or what `refused` returns; None for an unvalidated avatar."""
+    """Return the whole validation with its `source`; None for an avatar without one.
+
+    If the validation is not valid, return what `refused` returns.
+    """
     validation = bundle.manifest.validation
     if validation is None:
         return None
@@ -92,9 +95,10 @@ def validation_facts(bundle: Bundle) -> dict[str, Any] | None:
 
 
 def refused(bundle: Bundle) -> dict[str, Any]:
-    """Say why no figure of the manifest may be shown; empty when the files are those that were validated.
+    """Return why no figure of the manifest may be shown; empty if the figures are valid for the avatar's files.
 
-    Keys: `source`, which is `NO_FIGURES`; `changed`: keys of `PARTS` that were changed since; `why`: a sentence.
+    Keys: `source`, which is `NO_FIGURES`; `changed`: keys of `PARTS` that were changed since the validation; `why`: a
+    sentence.
     Raises BadInputError for a file that cannot be read.
     """
     validation = bundle.manifest.validation
@@ -125,12 +129,12 @@ def refused(bundle: Bundle) -> dict[str, Any]:
 
 
 def no_truth(bundle: Bundle) -> str:
-    """Say why an avatar of a capture cannot be validated, and where its error on frames is if somebody measured it."""
+    """Return why an avatar of a capture cannot be validated, and where its error on held out frames is, if known."""
     return f"{NO_TRUTH}; {ON_HELD_OUT}" if HELD_OUT in bundle.manifest.provenance else NO_TRUTH
 
 
 def _drawn_otherwise(validation: Validation, drawn: DrawnAs) -> str:
-    """Say how `drawn` differs from the way in which the avatar was validated; empty when it does not."""
+    """Return how `drawn` differs from the drawing in the validation, as a sentence part; "" if nothing differs."""
     runtimes = [validation.runtime, *validation.other_runtimes]
     if drawn.avatars > 1:
         return f"it was validated alone in its tensor, and here {drawn.avatars} avatars share one"
@@ -145,21 +149,24 @@ def _drawn_otherwise(validation: Validation, drawn: DrawnAs) -> str:
 
 
 def _no_figures(bundle: Bundle, changed: Sequence[str], why: str, how: str = "", remark: str = "") -> dict[str, Any]:
-    """Return `why`, and the command that measures the present files, with the options `how` and a `remark` on it."""
+    """Return the keys of `refused`, with the command that measures the present files added to `why`.
+
+    `how`: options of the command. `remark`: words after the command.
+    """
     command = f"{VALIDATE} {shlex.quote(name_of(bundle.folder))}{how}"
     return {"source": NO_FIGURES, "changed": list(changed), "why": f"{why}; `{command}` measures it{remark}"}
 
 
 def name_of(folder: Path) -> str:
-    """Return what a person types for `folder`: the name of a bundled avatar, or the folder."""
+    """Return what a person types for `folder`: the name of a built-in avatar, or the path."""
     known = (name for name in BUILT_IN if folder.absolute() == bundle_folder(name).absolute())
     return next(known, str(folder))
 
 
-# The loss of an avatar in smaller tensors than its network was trained for. Rule: it is its validation's figures or
-# none.
+# The loss of an avatar in smaller tensors than its network was trained for. Rule: the loss comes from the avatar's
+# validation, or there is no figure.
 
-WHOLE = 1000  # the work of a whole tensor, in thousandths
+WHOLE = 1000  # pixels of a tensor of the network's own size, in thousandths
 DIGITS = 2
 
 
@@ -167,15 +174,18 @@ DIGITS = 2
 class SizeLoss:
     """The loss of an avatar in smaller tensors.
 
-    `by_work`: loss of PSNR in dB, by thousandths of the pixels; empty without figures.
-    `source`: source of the figures, or why there are none and what measures them.
+    `source`: source of the figures; without figures, why there are none and which command measures them.
+    `by_work`: loss of PSNR in dB, by the tensor's pixels in thousandths of the largest; empty without figures.
     """
 
     source: str
     by_work: Mapping[int, float]
 
     def at(self, work: int) -> float | None:
-        """Return the loss with `work` thousandths of the pixels: the loss at the next smaller measured size, if any."""
+        """Return the loss in dB with `work` thousandths of the pixels: that of the next smaller measured size.
+
+        None if no smaller size was measured.
+        """
         if work >= WHOLE and self.by_work:
             return 0.0
         measured = [size for size in self.by_work if size <= work]
@@ -183,7 +193,7 @@ class SizeLoss:
 
 
 def size_loss(bundle: Bundle) -> SizeLoss:
-    """Return the loss of `bundle`. Raises BadInputError for a file that cannot be read."""
+    """Return the loss of `bundle` in smaller tensors. Raises BadInputError for a file that cannot be read."""
     validation, name = bundle.manifest.validation, bundle.manifest.name
     measures = f"`{VALIDATE} {name_of(bundle.folder)} --sizes` measures them"
     if validation is None or refused(bundle):

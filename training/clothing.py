@@ -1,7 +1,7 @@
-"""The clothes, hair and paint of the default body: looks as numbers and names, and the layers that they become.
+"""The clothes, hair and paint of the default body: looks as tables, and the mesh layers that are made from them.
 
-Rule: a look is one entry of a table; `clothing_layers` and `paint.frag` turn it into clothes and paint. A layer is a
-mesh that is skinned by the body's own weights; `paint.frag` decides where it ends and how it looks.
+Rule: a look is one entry of a table; `clothing_layers` and `paint.frag` turn the entry into clothes and paint. A layer
+is a mesh that is skinned by the body's own weights. `paint.frag` decides where a layer ends and how it looks.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ Triple = tuple[float, float, float]
 class Look:
     """The look of a person.
 
-    `betas`: coefficients of the body's shape. `garments`: names of `GARMENTS`, outer ones last. `colours`: colours of
-    `paint.frag`, sRGB from 0 to 1. `hairline`: height of forehead, temple and nape over the eyes, metres. `fringe`:
-    raggedness of the hairline, at most 1. `whorl`: direction from the middle of the head to where strands begin.
-    `ear_ring`: size of the gap in the hair around an ear. `sleeve_end`: place along the arm where sleeves end: 0 is the
-    shoulder, 1 the elbow. `legs_end`: a joint, and the height over it where trousers end, metres. `sock_end`: height
-    over the ankle, metres.
+    `betas`: coefficients of the body's shape. `garments`: names of `GARMENTS`. `colours`: colours of `paint.frag` by
+    name, sRGB in 0..1. `hairline`: heights of the hairline at forehead, temple and nape above the eyes, metres.
+    `fringe`: raggedness of the hairline, 0 to 1. `whorl`: direction from the middle of the head to the place where
+    strands begin. `ear_ring`: relative size of the gap in the hair around an ear. `sleeve_end`: place along the arm
+    where sleeves end: 0 is the shoulder, 1 the elbow. `legs_end`: a joint, and the height above it where trouser legs
+    end, metres. `sock_end`: height above the ankle where socks end, metres.
     """
 
     betas: tuple[float, ...]
@@ -49,9 +49,9 @@ class Look:
     sock_end: float
 
     def definitions(self, landmarks: Landmarks) -> dict[str, str]:
-        """Return the definitions that `paint.frag` is compiled with for the body of `landmarks`.
+        """Return the preprocessor definitions of `paint.frag`, by name, for the body of `landmarks`.
 
-        Constants, unlike uniforms, are rounded once.
+        They are constants, because constants, unlike uniforms, are rounded only once.
         """
         joint, over = self.legs_end
         end = landmarks.joints[JOINT_INDEX[joint], 1] - landmarks.joints[ANKLES[1], 1] + over
@@ -128,7 +128,7 @@ LOOKS: dict[str, Look] = {DEFAULT_NAME: DEFAULT, "hiker": HIKER}
 
 
 def look_of(provenance: Mapping[str, Any]) -> Look:
-    """Return the look of the person in an avatar whose manifest has `provenance`. Raises BadInputError."""
+    """Return the look that the `provenance` of an avatar's manifest names. Raises BadInputError for an unknown one."""
     return look_named(str(provenance.get(KEY, DEFAULT_NAME)))
 
 
@@ -139,25 +139,25 @@ def look_named(name: str) -> Look:
     return LOOKS[name]
 
 
-# Landmarks of a body at rest, which place garments and paint: joints, eyes, ears, top and bottom.
+# Landmarks of a body at rest, by which garments and paint are placed: joints, eyes, ears, top and bottom.
 #
-# Rule: everything is measured from the body's arrays (rest pose, metres); no coordinate is a constant.
+# Rule: every landmark is measured from the body's arrays (rest pose, metres); no coordinate is a constant.
 
 PELVIS, NECK, HEAD = JOINT_INDEX["pelvis"], JOINT_INDEX["neck"], JOINT_INDEX["head"]
-#: Index of the left joint, for joints that both sides have.
+#: Joints that the body has on both sides: index of the left one.
 HIP, KNEE, ANKLE, FOOT = (JOINT_INDEX[f"left_{name}"] for name in ("hip", "knee", "ankle", "foot"))
 SHOULDER, ELBOW, WRIST = (JOINT_INDEX[f"left_{name}"] for name in ("shoulder", "elbow", "wrist"))
 LEFT_EYE, RIGHT_EYE = JOINT_INDEX["left_eye"], JOINT_INDEX["right_eye"]
-#: Index of each foot's ankle by its side: 1 is the left one (+X), -1 the right one.
+#: Index of each ankle, by side: 1 is left (+X), -1 is right.
 ANKLES = {1: JOINT_INDEX["left_ankle"], -1: JOINT_INDEX["right_ankle"]}
 
 
 @dataclass(frozen=True)
 class Landmarks:
-    """Positions in metres, rest pose.
+    """Landmarks of a body in the rest pose, metres.
 
-    `joints` (55,3). `eye` (3,): centre of the left eyeball; `eye_radius`: its radius. `eyeball` (V,) bool: whether a
-    vertex is of either eyeball. `ear` (3,): tip of the left ear. `crown`: greatest y. `sole`: least y.
+    `joints`: (55,3). `eye`, `eye_radius`: centre (3,) and radius of the left eyeball. `eyeball`: (V,) bool, whether a
+    vertex belongs to an eyeball. `ear`: tip (3,) of the left ear. `crown`: greatest y. `sole`: least y.
     """
 
     joints: F64
@@ -170,9 +170,9 @@ class Landmarks:
 
 
 def find_landmarks(vertices: F64, joints: F64, weights: NDArray[np.floating[Any]]) -> Landmarks:
-    """Find the landmarks of a body at rest.
+    """Return the landmarks of a body at rest.
 
-    `vertices` (V,3), `joints` (55,3), `weights` (V,55).
+    `vertices`: (V,3), metres. `joints`: (55,3), metres. `weights`: skin weights (V,55).
     """
     eyeball = weights[:, [LEFT_EYE, RIGHT_EYE]].sum(axis=1) > 0.5
     left = vertices[weights[:, LEFT_EYE] > 0.5]
@@ -191,10 +191,10 @@ def find_landmarks(vertices: F64, joints: F64, weights: NDArray[np.floating[Any]
 
 # The layers of a clothed body: its garments and hair, shoes and their soles, skin.
 
-#: The order of the materials is that of `material` in `paint.frag`.
+#: A material's index here is the value of `material` in `paint.frag`.
 MATERIALS = ("skin", "trousers", "shirt", "hair", "shoe", "sole", "shorts", "jacket", "bob")
 OBSCURANCE_REACH_M = 0.25
-#: Number of vertices, of all layers together, that obscure others.
+#: Approximate number of vertices, of all layers together, that obscure others.
 EMITTERS = 6000
 
 
@@ -202,9 +202,9 @@ EMITTERS = 6000
 class Layer:
     """A mesh of one material.
 
-    `vertices` (N,3): metres at rest. `faces` (F,3). `below` (N,3): point of the body under each vertex. `weights`
-    (N,55): skin weights. `normal` (N,3): unit normals. `light` (N,): share of light that reaches each vertex, 1 in the
-    open. `mark` (N,): 1 on the eyeballs, else 0.
+    `vertices`: (N,3), metres at rest. `faces`: (F,3). `below`: point (N,3) of the body under each vertex. `weights`:
+    skin weights (N,55). `normal`: unit normals (N,3). `light`: share (N,) of ambient light that reaches each vertex, 1
+    for an open vertex. `mark`: (N,), 1 on the eyeballs, else 0.
     """
 
     material: str
@@ -218,7 +218,7 @@ class Layer:
 
 
 class _Sheet(NamedTuple):
-    """A layer whose normals and light are not known yet; its fields are those of `Layer`."""
+    """A layer before its normals and light are computed. The fields are those of `Layer`."""
 
     material: str
     vertices: F64
@@ -228,7 +228,7 @@ class _Sheet(NamedTuple):
 
 
 def clothing_layers(body: BodyArrays, landmarks: Landmarks, look: Look = DEFAULT) -> list[Layer]:
-    """Return all layers of the body in `look`, outer ones first. Both shoes are one layer, their soles another."""
+    """Return all layers of the body in `look`: garments, shoes, soles, skin. Both shoes are one layer."""
     sheets = [
         *(_garment(body, landmarks, name) for name in look.garments),
         *_shoes(body, landmarks),
@@ -275,7 +275,10 @@ def _nearest(points: F64, vertices: F64, count: int = 8) -> NDArray[np.int64]:
 
 
 def _lights(sheets: list[_Sheet], normals: list[F64]) -> list[F64]:
-    """Return the share of light at each sheet's vertices, which all sheets can obscure."""
+    """Return the share (N,) of ambient light that reaches the vertices of each sheet past all sheets.
+
+    `normals`: vertex normals (N,3) of each sheet.
+    """
     vertices = np.vstack([sheet.vertices for sheet in sheets])
     areas = np.concatenate([vertex_areas(sheet.vertices, sheet.faces) for sheet in sheets])
     step = -(-len(vertices) // EMITTERS)
@@ -298,9 +301,9 @@ def _mark(name: str, landmarks: Landmarks, count: int) -> F64:
     return np.asarray(landmarks.eyeball, np.float64) if name == "skin" else np.zeros(count)
 
 
-# The garments that are shells of the body: which vertices each may cover, and how far it stands off.
+# The garments that are shells of the body: the vertices that each garment may cover, and how far it stands off.
 #
-# Rule: there is one table, and a garment is placed by the body's landmarks, never by coordinates.
+# Rule: `GARMENTS` lists all of them. A garment is placed by the body's landmarks, never by coordinates.
 
 Covers = Callable[[F64, Landmarks], NDArray[np.bool_]]
 Thickness = Callable[[F64, Landmarks], tuple[F64, F64, int]]
@@ -398,7 +401,8 @@ def _bob_thickness(at: F64, landmarks: Landmarks) -> tuple[F64, F64, int]:
     return offset, 0.75 * offset, 16
 
 
-#: For each garment, the vertices that it may cover; and its offset, least offset (metres) and rounds of relaxation.
+#: For each garment, two functions of the vertices (V,3) and landmarks. The first returns (V,) whether a vertex may be
+#: covered. The second returns offsets (V,) and least offsets (V,) in metres, and the number of relaxation rounds.
 GARMENTS: dict[str, tuple[Covers, Thickness]] = {
     "trousers": (_trousers_covers, _trousers_thickness),
     "shirt": (_shirt_covers, _shirt_thickness),
@@ -409,16 +413,16 @@ GARMENTS: dict[str, tuple[Covers, Thickness]] = {
 }
 
 
-# A shoe: horizontal slices of the foot on top of each other, each convex and a little wider than the foot.
+# A shoe: a stack of horizontal slices of the foot, each convex and a little wider than the foot.
 #
-# Rule: a slice comes from the support function of the foot's vertices seen from above; the shoe is closed below and
+# Rule: a slice comes from the support function of the foot's vertices as seen from above. The shoe is closed below and
 # open at the ankle.
 
 ANGLES = 48
 MARGIN_M = 0.009
-TOP_M = 0.035  # over the ankle joint
-SOLE_M = 0.010  # under the foot
-WELT_M = 0.016  # how far the sole reaches up the foot
+TOP_M = 0.035  # height of the shoe above the ankle joint
+SOLE_M = 0.010  # thickness of the sole under the foot
+WELT_M = 0.016  # height of the sole's edge above the underside of the foot
 UPPER_STEP_M, FLANGE_M = 0.004, 0.005
 
 
@@ -447,7 +451,7 @@ def shoe(vertices: F64, ankle: F64, side: int, sole: bool) -> tuple[F64, NDArray
 
 
 def _ring(foot: F64, height: float, margin: float) -> F64:
-    """Return the slice (ANGLES,3) at `height`, wider than the vertices `foot` (N,3) by `margin`, metres."""
+    """Return the outline (ANGLES,3) of the slice at `height` around `foot` (N,3), widened by `margin`; metres."""
     flat = foot[:, [2, 0]]
     centre = 0.5 * (flat.min(axis=0) + flat.max(axis=0))
     angle = np.arange(ANGLES) * (2 * np.pi / ANGLES)
@@ -461,7 +465,11 @@ def _ring(foot: F64, height: float, margin: float) -> F64:
 
 
 def _stitch(rings: int, capped: bool) -> NDArray[np.int64]:
-    """Return faces between consecutive rings and a fan over the first one; when `capped`, also over the last one."""
+    """Return the faces (F,3) between consecutive rings, and a fan that closes the first ring.
+
+    `rings`: number of rings of ANGLES vertices; the centres of the first and last ring follow as two vertices.
+    `capped`: whether a second fan closes the last ring.
+    """
     here = np.arange(ANGLES)
     after = (here + 1) % ANGLES
     faces = []

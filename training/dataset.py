@@ -1,8 +1,8 @@
 """The data set: the samples that an avatar is trained and evaluated on, rendered to disk by several processes.
 
-Samples come from the synthetic person or from a capture; everything after that is the same for both.
+Samples show the synthetic person or the person of a capture; this module treats both alike.
 
-Rule: validation poses come from motions that no training sample uses; a sample depends only on its seed.
+Rule: validation poses come from motions that no training sample uses. A sample depends only on its seed.
 """
 
 from __future__ import annotations
@@ -30,18 +30,18 @@ from trilane.training.sample_renderer import BAND_NAMES, PoseSource, Sample, Sam
 from trilane.training.training_settings import TrainingSettings
 
 One = TypeVar("One")
-#: Share of each band among the training samples; `anywhere` is last.
+#: Share of each band among the training samples.
 TRAINING_SHARE = {"far": 0.16, "full_body": 0.34, "upper_body": 0.22, "face": 0.16, "anywhere": 0.12}
 #: Share of each tensor size among the training samples: the default size, and half its side for avatars far away.
 SIZES = {"256": 0.85, "128": 0.15}
 #: Tensor size of validation samples.
 VALIDATION_SIZE = "256"
-#: Number of samples that a process renders as one part.
+#: Number of samples in a part; a rendering process gets one part at a time.
 PART = 50
 
 
 def motion_poses(motions: Sequence[Motion]) -> PoseSource:
-    """Return a source of poses that takes each one at a random time of a random one of `motions`."""
+    """Return a source of poses: each call returns the pose at a random time of a random motion of `motions`."""
 
     def draw(rng: np.random.Generator) -> F64:
         motion = motions[int(rng.integers(len(motions)))]
@@ -51,10 +51,10 @@ def motion_poses(motions: Sequence[Motion]) -> PoseSource:
 
 
 class Planned(Protocol):
-    """A sample that was planned, of the synthetic person or of a capture.
+    """A planned sample of the synthetic person or of a capture.
 
-    `crop`: crop whose shape is the tensor's. `band`: index of the band. `picture`: number of the frame that it is cut
-    from.
+    `crop`: crop, whose shape is that of the tensor. `band`: index of the band. `picture`: number of the frame that the
+    sample shows.
     """
 
     @property
@@ -68,19 +68,19 @@ class Planned(Protocol):
 
 
 class SampleSource(Protocol[One]):
-    """Something that plans and renders samples; each rendering process opens one."""
+    """A renderer that plans and renders samples. Each rendering process opens its own."""
 
     def training_sample(self, seed: Sequence[int], band: str, size: str) -> One:
-        """Plan the sample of `seed`, in `band` and of tensor size `size`."""
+        """Return the planned sample of `seed`, in the band named `band`, with a tensor of size `size`."""
 
     def render(self, sample: One) -> tuple[F32, U8]:
-        """Return the UV image (h,w,3) and the ground truth (h,w,4) of `sample`."""
+        """Return the UV image (h,w,3) float32 (u, v, coverage) and the ground truth (h,w,4) uint8 of `sample`."""
 
 
 def clothed_source(body: Path, name: str, offsets: F32 | None) -> SampleRenderer:
-    """Open the default source: the body in the file `body`, in the look `name`, on one thread.
+    """Return a new renderer, on one thread, of a clothed body. Raises BadInputError.
 
-    The body is drawn with `offsets` (V,3). Raises BadInputError.
+    `body`: body file. `name`: name of the look. `offsets`: offsets (V,3) that the body is drawn with; None for none.
     """
     look = look_named(name)
     shaped = load_body(body).shape(look.betas)
@@ -88,12 +88,11 @@ def clothed_source(body: Path, name: str, offsets: F32 | None) -> SampleRenderer
 
 
 def plan_training(source: SampleSource[One], count: int, seed: int, track: Callable[[Any], Any] = iter) -> list[One]:
-    """Plan samples in random bands and sizes.
+    """Return `count` planned samples in random bands and tensor sizes.
 
-    `source`: plans each sample.
-    `count`: number of samples.
+    `source`: renderer that plans each sample.
     `seed`: seed of all random numbers.
-    `track`: wraps the list of samples to show progress.
+    `track`: wraps the list of bands and sizes to show progress.
     """
     rng = np.random.default_rng((seed, 0))
     bands = rng.choice(list(TRAINING_SHARE), count, p=list(TRAINING_SHARE.values()))
@@ -107,12 +106,12 @@ def plan_training(source: SampleSource[One], count: int, seed: int, track: Calla
 def plan_validation(
     renderer: SampleRenderer, per_band: int, seed: int, motions: Sequence[Motion], size: str = VALIDATION_SIZE
 ) -> list[Sample]:
-    """Plan samples for validation, all of one tensor size.
+    """Return planned samples for validation, all of one tensor size.
 
-    `renderer`: plans each sample.
+    `renderer`: renderer that plans each sample.
     `per_band`: number of samples in each band.
     `seed`: seed of all random numbers.
-    `motions`: source of the poses; no training sample uses them.
+    `motions`: motions that the poses are taken from; no training sample uses them.
     `size`: tensor size, as `shape_buckets` takes it.
     """
     source = motion_poses(motions)
@@ -130,11 +129,10 @@ def write_dataset(
     processes: int,
     track: Callable[[Any], Any] = iter,
 ) -> None:
-    """Render samples to disk, grouped by tensor shape; samples of the same frame follow each other.
+    """Render `samples` to disk, in a group for each tensor shape, sorted by frame.
 
-    `source`: opens the renderer in each process; it is sent there.
-    `samples`: samples to render.
-    `folder`: folder of the arrays, see `create_group`.
+    `source`: picklable function that opens a renderer in each process.
+    `folder`: folder of the groups, see `create_group`.
     `processes`: number of rendering processes.
     `track`: wraps the list of parts to show progress.
     """
@@ -151,7 +149,7 @@ def write_dataset(
             done.result()
 
 
-#: The source of a rendering process, opened once by `_open_source`.
+#: The renderer of this rendering process, which `_open_source` opens once.
 _source: list[SampleSource[Any]] = []
 
 
@@ -169,12 +167,13 @@ def _render_part(folder: Path, part: list[tuple[Shape, int, Planned]]) -> None:
         group.rgba[place] = rgba
 
 
-# Rendered samples on disk, and which of them a training reads in each of its steps.
+# Rendered samples on disk.
 #
-# Rule: arrays hold the rendered pixels without resampling; each shape has one folder of memory-mapped arrays.
+# Rule: arrays hold the rendered pixels without resampling. Each tensor shape has a folder of memory-mapped arrays.
 
 U16 = 65535
-#: Trailing shape and type of each array. `uv`: u and v in 1/65535. `covered`: 1 on the body. `rgba`: ground truth.
+#: Shape after (N, H, W) and dtype of each array. `uv`: u and v in 1/65535. `covered`: 1 on the body, else 0. `rgba`:
+#: ground truth, straight alpha.
 FIELDS: dict[str, tuple[tuple[int, ...], type]] = {
     "uv": ((2,), np.uint16),
     "covered": ((), np.uint8),
@@ -184,9 +183,9 @@ FIELDS: dict[str, tuple[tuple[int, ...], type]] = {
 
 @dataclass(frozen=True)
 class ShapeGroup:
-    """Samples of one tensor shape, in arrays (N, H, W, ...) as in `FIELDS`.
+    """N rendered samples of one tensor shape, in arrays (N, H, W, ...) as in `FIELDS`.
 
-    `band` (N,): index of each sample's band.
+    `band`: index (N,) of each sample's band.
     """
 
     shape: Shape
@@ -200,7 +199,10 @@ class ShapeGroup:
 
 
 def create_group(folder: Path, shape: Shape, bands: NDArray[np.int8]) -> ShapeGroup:
-    """Create arrays on disk under `folder` for the caller to fill, one sample for each of `bands`."""
+    """Create the arrays of a group on disk under `folder`, for the caller to fill.
+
+    `shape`: tensor shape (height, width). `bands`: index (N,) of each sample's band.
+    """
     place = folder / f"{shape[0]}x{shape[1]}"
     place.mkdir(parents=True, exist_ok=True)
     np.save(place / "band.npy", bands)
@@ -212,7 +214,7 @@ def create_group(folder: Path, shape: Shape, bands: NDArray[np.int8]) -> ShapeGr
 
 
 def open_groups(folder: Path, writable: bool = False) -> list[ShapeGroup]:
-    """Open all groups of the data set in `folder`, in order of their shapes."""
+    """Return all groups of the data set in `folder`, sorted by tensor shape."""
     mode: Any = "r+" if writable else "r"
     groups = []
     for place in sorted(folder.iterdir(), key=lambda path: parse_shape(path.name)):
@@ -228,14 +230,14 @@ def batches(
     repeats: Sequence[int] = (1,) * 5,
     labels: Sequence[NDArray[np.int64]] | None = None,
 ) -> Iterator[tuple[ShapeGroup, NDArray[np.int64]]]:
-    """Yield batches without end, each of one tensor shape: a group and the indices of its samples in the batch.
+    """Yield batches without end. A batch is a group and the indices of the batch's samples in that group.
 
-    `groups`: samples.
+    `groups`: groups of samples.
     `size`: approximate number of samples in a batch.
-    `rng`: shuffles the samples of each epoch.
-    `repeats`: number of times that an epoch has a sample, by the sample's band.
-    `labels`: label of each sample, (N,) for each group. A batch has one label; samples with a label below 0 are left
-    out.
+    `rng`: generator that shuffles the samples of each epoch.
+    `repeats`: how often an epoch has a sample, by the index of the sample's band.
+    `labels`: label (N,) of each sample, for each group. All samples of a batch have the same label. Samples with a
+    label below 0 are left out.
     """
     kinds = labels if labels is not None else [np.zeros(len(group), np.int64) for group in groups]
     while True:
@@ -252,16 +254,16 @@ def batches(
 
 # Which samples a training reads in each of its steps.
 #
-# Rule: this follows from the settings, the samples and the number of the step alone, so a resumed training goes on with
-# the batches that it would have read.
+# Rule: the samples of a step follow only from the settings, the data set and the number of the step. A resumed training
+# thus reads the same batches as one that was not interrupted.
 #
-# A training has up to three phases: half-size samples alone, all samples, and samples of whole bodies alone.
+# A training has up to three phases: only half-size samples, all samples, and only samples of whole bodies.
 
-#: Tensors with fewer pixels are half-size ones. Training begins with them alone because they are cheap.
+#: Tensors with fewer pixels are half-size. Training begins with half-size samples because they are cheap.
 SMALL_PIXELS = 160 * 160
-#: Bands whose samples show the whole body. The tensor is cut to the body, so the body has the same size in both bands.
+#: Bands whose samples show the whole body. Tensors are cropped to the body, so bodies are equally large in both bands.
 WHOLE_BANDS = [BAND_NAMES.index(name) for name in ("far", "full_body")]
-#: Number of zooms in one octave that batches of one zoom tell apart; distance of the rows that a zoom is measured on.
+#: Number of zoom labels per octave, and distance in pixels between the rows on which a zoom is measured.
 ZOOMS_PER_OCTAVE, ROW_STEP = 2, 8
 LEFT_OUT = -1
 
@@ -270,9 +272,9 @@ Batch = tuple[ShapeGroup, NDArray[np.int64]]
 
 @dataclass(frozen=True)
 class Phase:
-    """The steps from `first` to before `end`.
+    """The steps of a phase: from step `first`, up to but without step `end`.
 
-    `labels`: labels of all groups, as `batches` takes them.
+    `labels`: labels of the samples of all groups, as `batches` takes them.
     """
 
     first: int
@@ -281,9 +283,9 @@ class Phase:
 
 
 def batch_stream(groups: list[ShapeGroup], settings: TrainingSettings, count: int, step: int = 0) -> Iterator[Batch]:
-    """Yield the batches of a training of `count` steps, from step `step` on; a step takes `batches_per_step` of them.
+    """Yield the batches of a training of `count` steps, from step `step` on; each step has `batches_per_step` batches.
 
-    Raises BadInputError when no sample is left for some steps.
+    Raises BadInputError when a phase with steps has no sample.
     """
     per_step = settings.optimiser.batches_per_step
     for number, phase in enumerate(phases(groups, settings, count)):
@@ -294,7 +296,10 @@ def batch_stream(groups: list[ShapeGroup], settings: TrainingSettings, count: in
 
 
 def phases(groups: list[ShapeGroup], settings: TrainingSettings, count: int) -> list[Phase]:
-    """Return the phases of a training of `count` steps; some may have no step. Raises BadInputError."""
+    """Return the three phases of a training of `count` steps; a phase may have no steps.
+
+    Raises BadInputError when a phase with steps has no sample.
+    """
     labels = _labels(groups, settings)
     small = [math.prod(group.shape) < SMALL_PIXELS for group in groups]
     whole_from = math.ceil(settings.batches.full_body_from * count)
@@ -316,9 +321,9 @@ def is_whole(batch: Batch) -> bool:
 
 
 def zoom(group: ShapeGroup) -> NDArray[np.float64]:
-    """Return the zoom (N,) of each sample: tensor pixels that span one side of the UV image.
+    """Return the zoom (N,) of each sample: the number of tensor pixels over which u or v would change by 1.
 
-    It is the median over pairs of neighbouring pixels.
+    The zoom is 1 / the median distance in UV between neighbouring pixels of a row.
     """
     rows = group.uv[:, ::ROW_STEP].astype(np.int64)
     shown = group.covered[:, ::ROW_STEP] > 0
@@ -328,7 +333,7 @@ def zoom(group: ShapeGroup) -> NDArray[np.float64]:
 
 
 def _labels(groups: list[ShapeGroup], settings: TrainingSettings) -> list[NDArray[np.int64]]:
-    """Return the labels (N,) of each group: samples of a batch share one, and a label below 0 leaves a sample out."""
+    """Return the labels (N,) of the samples of each group, as `batches` takes them, from the settings."""
     options = settings.batches
     rng = np.random.default_rng((settings.seed, 3))
     found = []

@@ -1,6 +1,6 @@
-"""The texture that training starts from: the mean colour of each texel in the training pictures, and smooth fields.
+"""The texture that training starts from: three channels of mean colours, and smooth fields in the other channels.
 
-Rule: it is computed from the body and the training set alone.
+Rule: it depends only on the body and the training samples.
 """
 
 from __future__ import annotations
@@ -19,15 +19,17 @@ from trilane.training.surface import BodyArrays
 
 COLOURS = 3
 OPAQUE = 250
-#: Most samples of one shape that are read, and fewest pixels of a sample: smaller ones span too many texels.
+#: Most samples of one tensor shape that are read, and least number of pixels of a sample: a pixel of a smaller sample
+#: spans too many texels.
 MOST_SAMPLES = 250
 LEAST_PIXELS = 200 * 200
-#: A pixel that spans a larger share of the texture than this crosses a UV seam.
+#: A pixel whose UV changes by more than this crosses a UV seam.
 LARGEST_SPAN = 0.03
 LEAST_WEIGHT = 1e-4
-#: A face of less than half this area, in texels, is left out; others reach texels whose weights are this far below 0.
+#: `LEAST_AREA`: faces with a smaller double area, in texels, are left out. `BEYOND`: a face also covers texels whose
+#: barycentric weights are at least -`BEYOND`.
 LEAST_AREA, BEYOND = 1e-9, 0.25
-#: Texels around faces that are looked at together: their weights take some 20 MB.
+#: Number of texels whose barycentric weights are computed at once, in about 20 MB.
 TEXELS_AT_ONCE = 1 << 18
 
 
@@ -39,7 +41,7 @@ def first_texture(body: BodyArrays, groups: list[ShapeGroup], side: int, channel
     `body`: body at rest.
     `groups`: training samples.
     `side`: side of the texture in texels.
-    `channels`: channels of the texture, more than three.
+    `channels`: number of channels of the texture, more than three.
     """
     fields = eigenfunctions(body.vertices, body.faces, channels - COLOURS)
     image, known = lay_out(fields, body.faces, body.uv, body.uv_faces, side)
@@ -49,13 +51,13 @@ def first_texture(body: BodyArrays, groups: list[ShapeGroup], side: int, channel
 
 
 def mean_colours(groups: list[ShapeGroup], side: int, body: BodyArrays) -> NDArray[np.float64]:
-    """Return the mean colour (side, side, 3) in 0..1 of the pixels that show each texel.
+    """Return the weighted mean colour (side, side, 3) in 0..1 of the pixels that show each texel.
 
-    Texels beside seen ones, which lie between the pixels of a view, take the mean of the seen ones. All others are
-    filled along the surface of `body`.
+    A neighbour of seen texels takes their mean colour: it may lie between the pixels of every view. All other texels
+    are filled along the surface of `body`.
 
-    Clothes stand off the body, so a texel shows another point of them in every view. The mean is still sharp: near
-    views and views along the surface's normal have the largest weights.
+    Clothes stand off the body, so a texel shows a different point of the clothes in every view. The mean is still
+    sharp, because close views and views along the surface's normal have the largest weights, see `head_on`.
     """
     total, count = np.zeros((side * side, COLOURS)), np.zeros(side * side)
     for group in groups:
@@ -78,10 +80,12 @@ def mean_colours(groups: list[ShapeGroup], side: int, body: BodyArrays) -> NDArr
 
 
 def head_on(uv: NDArray[np.float64], covered: NDArray[np.bool_], side: int) -> NDArray[np.float64]:
-    """Return the weight (h,w) of each pixel of a UV image (h,w,2): 1 where the surface is large and seen head-on.
+    """Return the weight (h,w) of each pixel of a UV image (h,w,2): 1 where the surface is close and seen head-on.
 
-    Let s >= t be the singular values of the derivative of UV by pixel. The weight is (t / s)^3, times (1 / (side s))^2
-    where a pixel spans more than a texel. It is 0 across seams and at the outline, where there is no derivative.
+    Let s >= t be the singular values of the derivative of UV by pixel. The weight is (t / s)³. It is multiplied by
+    (1 / (side s))² if a pixel spans more than a texel. It is 0 across seams and at the outline, without a derivative.
+
+    `covered`: (h,w), whether a pixel shows the body. `side`: side of the texture in texels.
     """
     across, down = np.zeros_like(uv), np.zeros_like(uv)
     across[:, 1:-1] = (uv[:, 2:] - uv[:, :-2]) / 2
@@ -98,7 +102,7 @@ def head_on(uv: NDArray[np.float64], covered: NDArray[np.bool_], side: int) -> N
 
 
 def used_texels(body: BodyArrays, side: int, margin: int) -> NDArray[np.bool_]:
-    """Return the texels (side, side) that a bilinear read of the body's texture can use, grown by `margin` texels."""
+    """Return which texels (side, side) a bilinear sample of the body's texture can use, grown by `margin` texels."""
     _, known = lay_out(np.zeros((len(body.vertices), 1)), body.faces, body.uv, body.uv_faces, side)
     for _ in range(margin):
         grown = known.copy()
@@ -110,17 +114,18 @@ def used_texels(body: BodyArrays, side: int, margin: int) -> NDArray[np.bool_]:
     return known
 
 
-# Smooth fields on the body's surface, which most channels of the neural texture start from.
+# Smooth fields on the body's surface, the first values of most channels of the neural texture.
 #
-# Rule: fields are smooth on the body, so points that are close on the body start with similar values, also across UV
-# seams.
+# Rule: neighbouring points of the body have similar values, also across UV seams.
 
 
 def eigenfunctions(vertices: F64, faces: Ints, count: int) -> F64:
     """Return the `count` smoothest non-constant eigenfunctions (V,count) of the cotangent Laplacian, in -1..1 each.
 
-    `vertices` (V,3), `faces` (F,3). Pinkall and Polthier, Computing discrete minimal surfaces and their conjugates,
-    1993. Vertices outside the mesh's largest connected part (eyeballs) take the values of that part's nearest vertex.
+    Vertices outside the mesh's largest connected part (eyeballs) take the values of that part's nearest vertex. Source:
+    Pinkall and Polthier, Computing discrete minimal surfaces and their conjugates, 1993.
+
+    `vertices`: (V,3), at rest. `faces`: (F,3) indices of vertices.
     """
     laplacian, mass = cotangent_laplacian(vertices, faces)
     part = _largest_part(laplacian)
@@ -138,7 +143,7 @@ def eigenfunctions(vertices: F64, faces: Ints, count: int) -> F64:
 
 
 def cotangent_laplacian(vertices: F64, faces: Ints) -> tuple[Any, F64]:
-    """Return the sparse cotangent Laplacian (V,V), and each vertex's share of the area (V,)."""
+    """Return the sparse cotangent Laplacian (V,V) of a mesh, and the area (V,) that belongs to each vertex."""
     count = len(vertices)
     rows, columns, values = [], [], []
     mass = np.zeros(count)
@@ -163,11 +168,13 @@ def _largest_part(laplacian: Any) -> NDArray[np.int64]:
 
 # Lays values of a mesh's vertices out as an image in texture space.
 #
-# Rule: a texel under a face is interpolated from the face's corners; gaps between faces are filled on request.
+# Rule: a texel on a face is interpolated from the face's corners. Other functions fill the gaps between faces.
 
 
 def lay_out(values: F64, faces: Ints, uv: F64, uv_faces: Ints, side: int) -> tuple[F64, NDArray[np.bool_]]:
-    """Return an image (side,side,C) of the vertices' values, 0 off all faces, and the texels (side,side) on a face.
+    """Return an image (side,side,C) of the vertices' values, and which texels (side,side) are on a face.
+
+    Texels off all faces are 0.
 
     `values`: values of the vertices, (V,C).
     `faces`: indices of `values`, (F,3).
@@ -190,20 +197,23 @@ def lay_out(values: F64, faces: Ints, uv: F64, uv_faces: Ints, side: int) -> tup
         weights = _barycentric(corners[part], around[part], x, y)
         inside = np.logical_and.reduce([weight >= -BEYOND for weight in weights])
         corner_values = values[faces[face[inside]]]
-        # The last of the faces that share a texel is seen: NumPy keeps the last of repeated indices.
+        # If faces share a texel, the last face wins: NumPy keeps the last value of repeated indices.
         image[y[inside], x[inside]] = sum(w[inside, None] * corner_values[:, k] for k, w in enumerate(weights))
         covered[y[inside], x[inside]] = True
     return image, covered
 
 
 def fill_gaps(image: NDArray[Any], known: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Fill every texel of `image` (S,S,C) that is not `known` (S,S) from its surroundings (push and pull)."""
+    """Return `image` (S,S,C) with every texel that is not `known` (S,S) filled from its surroundings (push-pull)."""
     weight = known.astype(np.float64)[..., None]
     return _pulled(image * weight, weight)
 
 
 def fill_beside(image: NDArray[Any], known: NDArray[np.bool_]) -> tuple[F64, NDArray[np.bool_]]:
-    """Fill texels of `image` (S,S,C) beside `known` ones (S,S) with their mean, and return what is known then too."""
+    """Return `image` (S,S,C) with the neighbours of `known` texels (S,S) filled, and the texels (S,S) then known.
+
+    A neighbour gets the mean of the known texels among its eight neighbours.
+    """
     total = np.sum(_round_each(image * known[..., None]), axis=0)
     count = np.sum(_round_each(known.astype(np.float64)[..., None]), axis=0)
     near = np.asarray(count[..., 0] > 0)
@@ -211,12 +221,12 @@ def fill_beside(image: NDArray[Any], known: NDArray[np.bool_]) -> tuple[F64, NDA
 
 
 def grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return `mask` (S,S) with the eight neighbours of each of its texels added."""
+    """Return `mask` (S,S) grown by one texel in all eight directions."""
     return np.asarray(np.any(_round_each(mask[..., None]), axis=0)[..., 0])
 
 
 def _round_each(image: NDArray[Any]) -> list[NDArray[Any]]:
-    """Return nine images: `image` (S,S,C) and its shifts by one texel in the eight directions, 0 beyond the edge."""
+    """Return nine images: `image` (S,S,C) and its shifts by one texel in the eight directions, with 0 at the edge."""
     side = image.shape[0]
     padded = np.pad(image, ((1, 1), (1, 1), (0, 0)))
     return [padded[y : y + side, x : x + side] for y in range(3) for x in range(3)]
@@ -238,7 +248,10 @@ def _double_areas(corners: F64) -> F64:
 
 
 def _barycentric(corners: F64, counts: Ints, x: Ints, y: Ints) -> tuple[F64, F64, F64]:
-    """Return three weights (N,) of points `x`, `y` (N,): `counts` (F,) of them for each of the faces (F,3,2)."""
+    """Return the three barycentric weights (N,) of the points `x`, `y` (N,).
+
+    `corners`: corners (F,3,2) of the faces. `counts`: number (F,) of successive points that belong to each face.
+    """
     (bx, by), (cx, cy) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
     area = np.where(counts > 0, bx * cy - cx * by, 1.0)
     px, py = x - np.repeat(corners[:, 0, 0], counts), y - np.repeat(corners[:, 0, 1], counts)
@@ -247,18 +260,20 @@ def _barycentric(corners: F64, counts: Ints, x: Ints, y: Ints) -> tuple[F64, F64
     return 1 - b - c, b, c
 
 
-# Fills unknown places of a surface from known ones around them, along the surface and so across its UV seams.
+# Fills unknown places of a surface from known places, along the surface and thus across its UV seams.
 #
-# Rule: filled values are harmonic: each is the weighted mean of its neighbours on the mesh, so none lies beyond the
-# known values. Known values stay as they are.
+# Rule: filled values are harmonic: each is the weighted mean of its neighbours on the mesh, so it lies within the range
+# of the known values. Known values do not change.
 
 
 def harmonic_fill(values: F64, known: Mask, vertices: F64, faces: Ints) -> F64:
-    """Return `values` (V,C) of a mesh with the vertices that are not `known` (V,) filled by Laplace's equation.
+    """Return `values` (V,C) with the vertices that are not `known` (V,) filled by Laplace's equation on the mesh.
 
-    The known values are the boundary; the operator is the cotangent Laplacian (Pinkall and Polthier 1993) of `vertices`
-    (V,3), `faces` (F,3). A part of the mesh without a known vertex takes the values of the known vertex nearest in
-    space. Nothing changes when no vertex is known.
+    The known values are the boundary condition; the operator is the cotangent Laplacian (Pinkall and Polthier 1993). In
+    a connected part without a known vertex, each vertex takes the values of the known vertex nearest in space. If no
+    vertex is known, nothing changes.
+
+    `vertices` (V,3), `faces` (F,3): the mesh.
     """
     filled = np.array(values, np.float64)
     if not known.any():
@@ -278,9 +293,9 @@ def harmonic_fill(values: F64, known: Mask, vertices: F64, faces: Ints) -> F64:
 
 
 def fill_along_surface(image: NDArray[np.floating], unseen: Mask, body: BodyArrays) -> F64:
-    """Return `image` (S,S,C) with the texels `unseen` (S,S) filled from the other texels that the body uses.
+    """Return `image` (S,S,C) with the texels `unseen` (S,S) filled from the body's other texels.
 
-    Texels under a face are filled along the body's surface. Texels beside the faces, which only bilinear reads at seams
+    Texels on a face are filled along the body's surface. Texels off the faces, which only bilinear samples at seams
     use, are filled from the texels around them.
     """
     side = len(image)
@@ -293,10 +308,10 @@ def fill_along_surface(image: NDArray[np.floating], unseen: Mask, body: BodyArra
 
 
 def _at_vertices(image: F64, seen: Mask, body: BodyArrays) -> tuple[F64, Mask]:
-    """Return the values (V,C) of `image` at the body's vertices, and which vertices (V,) have one.
+    """Return the values (V,C) of `image` at the body's vertices, and which vertices (V,) have a value.
 
-    Only `seen` texels are read, bilinearly, at each of a vertex's places in the texture. A vertex on a seam takes the
-    mean of its places.
+    Values are bilinear samples of `seen` texels alone. A vertex on a seam has several places in the texture, and takes
+    their mean.
     """
     side, count = len(image), len(body.vertices)
     pairs = np.unique(np.column_stack([body.faces.reshape(-1), body.uv_faces.reshape(-1)]), axis=0)

@@ -1,12 +1,11 @@
-"""Error of an avatar's picture against the ground truth: PSNR, SSIM and IoU before backgrounds, and its alpha's error.
+"""Error of an avatar's picture against the ground truth: PSNR and SSIM over backgrounds, IoU, and the error of alpha.
 
-Rule: pictures are compared before each kind of background in turn, inside the box of the true mask. Before a single
-colour, a person who lets that colour through would have no error. That PSNR also counts the background inside the box,
-so a second one counts the true mask's pixels alone. Decibels and SSIM are means over the backgrounds.
+Rule: pictures are compared in front of each kind of background, inside the bounding box of the true mask. In front of a
+single colour, a person who lets that colour through would have no error. PSNR counts the background in the box too; a
+second PSNR counts only pixels of the true mask. PSNR and SSIM are means over the kinds of background.
 
-Alpha is counted in three regions. The edge is everything within `EDGE_PX` of a change of the true alpha: an outline
-that is wrong by a pixel decides there, and IoU shows that too. Inside and outside are the rest, where alpha should be 1
-and 0.
+The error of alpha is measured in three regions. The edge is everything within `EDGE_PX` of a change of the true alpha;
+an outline that is wrong by a pixel dominates there. In the other regions, inside and outside, alpha should be 1 and 0.
 """
 
 from __future__ import annotations
@@ -27,21 +26,21 @@ from trilane.avatars.manifest import BANDS
 HALF, OPAQUE = 128, 255
 SSIM_WINDOW = 7
 EDGE_PX = 2
-#: A pixel inside whose alpha is below this lets more than a tenth of the background through.
+#: A pixel inside the person whose alpha is below this counts as see-through.
 SOLID = 0.9
-#: Lower bound of the mean square, which makes 100 dB the highest PSNR.
+#: Lower bound of the mean squared error; it limits the PSNR to 100 dB.
 LEAST_SQUARE = 1e-10
 
 
 @dataclass(frozen=True)
 class ImageError:
-    """How far a picture is from the truth.
+    """The error of a picture against the ground truth.
 
-    `psnr_db`, `ssim`: figures inside the box of the true mask. `body_psnr_db`: PSNR in dB over the true mask's pixels
-    alone. `by_background`: `psnr_db` before each kind of background. `background`: share of the box that the mask does
-    not cover. `iou`: intersection over union of the masks, over the whole tensor. `alpha_inside`, `alpha_edge`,
-    `alpha_outside`: mean absolute error of alpha in that region. `see_through`: share of the inside whose alpha is less
-    than `SOLID`. `alpha_inside` and `see_through` are 0 where there is no inside.
+    `psnr_db`, `ssim`: PSNR in dB and SSIM inside the bounding box of the true mask. `body_psnr_db`: PSNR in dB over the
+    true mask's pixels. `by_background`: `psnr_db` in front of each kind of background. `background`: share of the box
+    that the true mask does not cover. `iou`: intersection over union of the masks, over the whole tensor.
+    `alpha_inside`, `alpha_edge`, `alpha_outside`: mean absolute error of alpha in that region, 0 in an empty region.
+    `see_through`: share of the inside whose alpha is less than `SOLID`, 0 if there is no inside.
     """
 
     psnr_db: float
@@ -57,7 +56,7 @@ class ImageError:
 
 
 def image_error(picture: U8, truth: U8) -> ImageError | None:
-    """Return the error of `picture` against `truth`, both (h,w,4), straight alpha; None when `truth` shows nobody."""
+    """Return the error of `picture` against `truth`, both (h,w,4) uint8, straight alpha; None if `truth` is empty."""
     mask, true_mask = picture[..., 3] >= HALF, truth[..., 3] >= HALF
     if not true_mask.any():
         return None
@@ -83,13 +82,16 @@ def image_error(picture: U8, truth: U8) -> ImageError | None:
 
 
 def over(image: U8, behind: NDArray[np.floating]) -> F64:
-    """Composite `image` (h,w,4) uint8 over `behind` (h,w,3) in 0..1 and return (h,w,3) in 0..1."""
+    """Return `image` (h,w,4) uint8 composited over `behind` (h,w,3) in 0..1, as (h,w,3) in 0..1."""
     alpha = image[..., 3:] / OPAQUE
     return np.asarray(image[..., :3] / OPAQUE * alpha + behind * (1 - alpha))
 
 
 def regions(alpha: U8) -> tuple[Mask, Mask, Mask]:
-    """Return inside, edge and outside (h,w) of a true `alpha` (h,w); border pixels are repeated beyond the picture."""
+    """Return the regions inside, edge and outside (h,w) of a true `alpha` (h,w).
+
+    Outside the picture, alpha continues with the values at the border.
+    """
     near = [np.pad(alpha, EDGE_PX, mode="edge")]
     for axis in (0, 1):
         size = alpha.shape[axis]
@@ -101,7 +103,7 @@ def regions(alpha: U8) -> tuple[Mask, Mask, Mask]:
 
 
 def _behind(truth: U8) -> Iterator[tuple[str, NDArray[np.floating]]]:
-    """Yield a background of each kind. `truth` alone decides them, so all painters stand before the same ones."""
+    """Yield the name and a background (h,w,3) of each kind. They depend only on `truth`, not on the picture."""
     rng = np.random.default_rng(zlib.crc32(truth.tobytes()))
     for kind in KINDS:
         yield kind, background(kind, (truth.shape[0], truth.shape[1]), rng)
@@ -125,10 +127,10 @@ def _psnr_db(square: F64) -> float:
 
 # Summary of the errors of many samples, as the manifest holds it.
 #
-# Rule: the worst sample stands beside every mean, by seed and number, so that it can be drawn and inspected again.
+# Rule: beside the means, the summary has seed and number of the worst sample, so that it can be drawn again.
 
 DB_DIGITS, SHARE_DIGITS = 2, 4
-#: Fields of `ImageError` whose mean says how good an avatar is.
+#: Fields of `ImageError` of which the summary has the mean over all samples.
 MEANS = (
     *("psnr_db", "body_psnr_db", "see_through", "alpha_inside", "alpha_edge", "alpha_outside"),
     *("background", "iou", "ssim"),
@@ -137,9 +139,9 @@ MEANS = (
 
 @dataclass(frozen=True)
 class SampleError:
-    """The error of one sample, and what identifies the sample.
+    """The error of one sample, with the numbers that identify the sample.
 
-    `seed`: seed of the sample's set. `number`: number of the sample in its set. `band`: name of its band.
+    `seed`: seed of the sample's set. `number`: number of the sample in that set. `band`: name of the sample's band.
     """
 
     seed: int
@@ -149,7 +151,7 @@ class SampleError:
 
 
 def summary(errors: Sequence[SampleError]) -> dict[str, Any]:
-    """Return the summary of `errors`, at least one; decibels are means over pictures.
+    """Return the summary of `errors`, at least one. The mean PSNR is a mean of decibels over samples.
 
     Keys: `psnr_db_by_band`, `body_psnr_db_by_band`, `see_through_by_band`, `iou_by_band`; `psnr_db_by_background`; the
     names in `MEANS`, which are means of the fields of `ImageError`; `least_psnr_db`, `least_body_psnr_db`; `worst`, the
@@ -202,20 +204,20 @@ def _rounded(key: str, value: float) -> float:
     return round(value, DB_DIGITS if key.endswith("_db") else SHARE_DIGITS)
 
 
-# Pictures that stand behind a person while an avatar is trained and judged: black, white, noise and scenery.
+# Backgrounds in front of which an avatar is trained and measured: black, white, noise and scenery.
 #
-# Rule: no single background judges alpha, because a person over one colour looks like a paler person who lets that
-# colour through. Every picture depends on the random generator alone.
+# Rule: alpha is never measured in front of a single background. In front of one colour, an opaque person looks the same
+# as a person of other colours who lets that colour through. Backgrounds depend only on the random generator.
 #
-# Scenery stands for photographs, because none can be had here. Leaves of random size, place and colour lie over each
-# other (Lee, Mumford, Huang, Occlusion models for natural images, 2001). Noise shades each leaf; its amplitude falls
-# with the frequency, as in photographs.
+# Scenery replaces photographs, so that none must be stored or licensed. Discs ("leaves") of random size, place and
+# colour cover each other (Lee, Mumford, Huang, Occlusion models for natural images, 2001). Noise shades the scene; its
+# amplitude falls with the frequency, as in photographs.
 
-#: Side of a scene in pixels, number of scenes, and leaves in each scene.
+#: Side of a scene in pixels, number of scenes, and number of leaves in each scene.
 SIDE, SCENES, LEAVES = 512, 8, 700
-#: Radii of leaves in pixels. Their number falls with the third power of the radius, so no size is special.
+#: Radii of leaves in pixels. The number of leaves falls with the third power of the radius: the scene is scale-free.
 LEAST_RADIUS, LARGEST_RADIUS = 4.0, 160.0
-#: Shades of a leaf, and how far its colour is from grey.
+#: Relative strength of shading, and standard deviation of a leaf's colour from grey.
 SHADE, CHROMA = 0.12, 0.12
 
 
@@ -228,7 +230,7 @@ def background(kind: str, shape: Shape, rng: np.random.Generator) -> F32:
 
 
 def backgrounds(count: int, shape: Shape, rng: np.random.Generator) -> F32:
-    """Return `count` backgrounds (count,h,w,3), whose kinds are drawn at random too."""
+    """Return `count` backgrounds (count,h,w,3) in 0..1 of random kinds."""
     return np.stack([background(str(kind), shape, rng) for kind in rng.choice(list(KINDS), count)])
 
 
@@ -237,7 +239,7 @@ def _noise(shape: Shape, rng: np.random.Generator) -> F32:
 
 
 def _scenery(shape: Shape, rng: np.random.Generator) -> F32:
-    """Return a part of a scene, possibly mirrored, with its colours in any order; the scene wraps at its edges."""
+    """Return a random part of a scene, with random mirroring and order of channels; scenes wrap at their edges."""
     scene = scenes()[int(rng.integers(SCENES))]
     rows, columns = ((int(rng.integers(SIDE)) + np.arange(side)) % SIDE for side in shape)
     part = scene[rows[:, None], columns][..., rng.permutation(3)]
@@ -255,12 +257,12 @@ KINDS: dict[str, Callable[[Shape, np.random.Generator], F32]] = {
 
 @cache
 def scenes() -> tuple[F32, ...]:
-    """Return the scenes, (SIDE,SIDE,3) in 0..1 each; they are always the same."""
+    """Return the scenes, (SIDE,SIDE,3) in 0..1 each. They are the same in every process."""
     return tuple(_scene(np.random.default_rng((SIDE, number))) for number in range(SCENES))
 
 
 def _scene(rng: np.random.Generator) -> F32:
-    """Draw leaves from the back to the front; one more leaf fills what they leave free."""
+    """Return a scene (SIDE,SIDE,3): leaves drawn from back to front over a plain colour."""
     scene = np.broadcast_to(_leaf_colour(rng), (SIDE, SIDE, 3)).astype(np.float32)
     least, most = LARGEST_RADIUS**-2, LEAST_RADIUS**-2
     radii = rng.uniform(least, most, LEAVES) ** -0.5

@@ -1,6 +1,6 @@
-"""From trained weights to an avatar's bundle: quantise network and texture, write the files.
+"""Makes an avatar's bundle from trained weights: quantises network and texture, and writes the files.
 
-Rule: this module validates nothing that it writes; `validate` measures the files themselves.
+Rule: this module does not measure the avatar's error; `validate` measures it from the written files.
 """
 
 from __future__ import annotations
@@ -35,23 +35,24 @@ from trilane.training.validate import BUILTIN_HELD_OUT, held_out_motions
 from trilane.writing import write_atomically, write_bytes
 
 INT8_MAX = 127
-#: The network is calibrated at the tensor shape that standing bodies get most often, and stored for the square one.
+#: Tensor shapes (height, width): the network is calibrated at the most frequent shape of standing bodies, and stored
+#: for a square shape.
 CALIBRATION_SHAPE = (320, 192)
 STORED_SHAPE = (256, 256)
 CALIBRATION_FRAMES = 96
 METHOD = "minmax"
-#: Files from which a person can quantise the avatar again; 20 inputs of the calibration's shape take 40 MB.
+#: Names of two files from which a person can quantise the avatar again, and the number of inputs in `FRAMES`: 20 inputs
+#: of the calibration's shape take 40 MB.
 FLOAT_NETWORK, FRAMES, WRITTEN_FRAMES = "network.onnx", "frames.npy", 20
 TEXEL_MARGIN = 3
 
 
 @dataclass(frozen=True)
 class QuantisedAvatar:
-    """An avatar in integers.
+    """A quantised avatar.
 
-    `network`: quantised network, with its `norm`. `texture`: (S,S,C) int8. `scale`: (C,) float32, scale of each
-    channel.
-    `levels`: smaller levels of the texture, as `pack_levels` packs them, or None.
+    `network`: quantised network. `texture`: (S,S,C) int8. `scale`: scale (C,) float32 of each channel. `norm`: kind of
+    the network's norms. `levels`: smaller levels of the texture, packed by `pack_levels`, or None.
     """
 
     network: Quantised
@@ -64,10 +65,12 @@ class QuantisedAvatar:
 def byte_texture(
     avatar: TrainableAvatar, shaped: ShapedBody, unseen: Mask | None = None
 ) -> tuple[NDArray[np.int8], NDArray[np.float32], NDArray[np.int8] | None]:
-    """Return the texture (S,S,C) int8, the scale (C,) of each channel, and the packed smaller levels, if any.
+    """Return the texture (S,S,C) int8, the scale (C,) of each channel, and the packed smaller levels or None.
 
-    Texels that the body does not use are 0. `unseen`, an image of any side, marks texels of the body that were never
-    trained; they are filled from trained ones.
+    Texels that the body does not use are 0.
+
+    `unseen`: image of any side that marks texels of the body that were never trained. They are filled from trained
+    texels.
     """
     body = body_arrays(shaped)
     images = [_finished(level.detach()[0].permute(1, 2, 0).numpy(), unseen, body) for level in avatar.texture.levels()]
@@ -78,7 +81,7 @@ def byte_texture(
 
 
 def _finished(image: NDArray[Any], unseen: Mask | None, body: BodyArrays) -> NDArray[Any]:
-    """Return `image` (S,S,C) with `unseen` texels filled, and 0 where the body uses none."""
+    """Return `image` (S,S,C) with `unseen` texels filled, and with 0 in texels that the body does not use."""
     if unseen is not None and unseen.any():
         image = _without_holes(image, unseen, body)
     finished: NDArray[Any] = image * used_texels(body, image.shape[0], TEXEL_MARGIN)[..., None]
@@ -86,7 +89,7 @@ def _finished(image: NDArray[Any], unseen: Mask | None, body: BodyArrays) -> NDA
 
 
 def _without_holes(image: NDArray[Any], unseen: Mask, body: BodyArrays) -> F64:
-    """Fill the `unseen` texels of `image` (S,S,C), and those beside the body's faces that lie next to them."""
+    """Return `image` (S,S,C) with `unseen` texels filled, and texels off the body's faces that lie next to these."""
     side = image.shape[0]
     nearest = np.arange(side) * len(unseen) // side
     hole = margin = unseen[np.ix_(nearest, nearest)]
@@ -96,21 +99,26 @@ def _without_holes(image: NDArray[Any], unseen: Mask, body: BodyArrays) -> F64:
 
 
 def integer_network(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> Quantised:
-    """Return the network in integers, calibrated on samples of `CALIBRATION_SHAPE`, else of the commonest shape."""
+    """Return the quantised network of `avatar`, at `STORED_SHAPE`.
+
+    It is calibrated on random samples of `CALIBRATION_SHAPE`; if `groups` has none, of the most frequent shape.
+
+    `groups`: training samples. `seed`: seed of the choice of samples.
+    """
     quantised = quantise(*_calibration(avatar, groups, seed, CALIBRATION_FRAMES), METHOD)
     return replace(quantised, network=reshaped(quantised.network, *STORED_SHAPE))
 
 
 def ranges_of(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> ByteRanges:
-    """Return the ranges that the tensors of `integer_network` would have."""
+    """Return the byte ranges that `integer_network` would give the network's tensors, from the same arguments."""
     return byte_ranges(*_calibration(avatar, groups, seed, CALIBRATION_FRAMES), METHOD)
 
 
 def write_float_network(folder: Path, avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> dict[str, str]:
-    """Write the input of `trilane avatar quantise` to `folder`: the float network, and inputs from training samples.
+    """Write the input of `trilane avatar quantise` to `folder`: the float network, and inputs to calibrate on.
 
-    Returns the names of both files, by `float_network` and `frames`. The inputs are those of `integer_network`, but
-    fewer.
+    Return the paths of both files under the keys `float_network` and `frames`. The inputs are the first of those that
+    `integer_network` uses with the same arguments.
     """
     model, frames = _calibration(avatar, groups, seed, WRITTEN_FRAMES)
     files = {"float_network": folder / FLOAT_NETWORK, "frames": folder / FRAMES}
@@ -123,7 +131,7 @@ def write_float_network(folder: Path, avatar: TrainableAvatar, groups: list[Shap
 def _calibration(
     avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int, count: int
 ) -> tuple[onnx.ModelProto, list[NDArray[np.float32]]]:
-    """Return the float network of `avatar`, and at most `count` inputs of its shape."""
+    """Return the float network of `avatar`, and at most `count` inputs (H, W, C) of the network's shape."""
     group = max(groups, key=lambda group: (group.shape == CALIBRATION_SHAPE, len(group)))
     chosen = np.random.default_rng(seed).permutation(len(group))[:count]
     return export_onnx(avatar.network, *group.shape), _inputs(avatar, group, np.sort(chosen))
@@ -132,13 +140,12 @@ def _calibration(
 def quantise_avatar(
     avatar: TrainableAvatar, shaped: ShapedBody, groups: list[ShapeGroup], seed: int, unseen: Mask | None = None
 ) -> QuantisedAvatar:
-    """Quantise network and texture.
+    """Return the quantised network and texture of `avatar`.
 
-    `avatar`: trained weights.
     `shaped`: body whose texels are stored.
     `groups`: training samples, from which calibration frames are chosen.
     `seed`: seed of that choice.
-    `unseen`: texels of the body that no sample can show, see `byte_texture`.
+    `unseen`: texels of the body that were never trained, see `byte_texture`.
     """
     texture, scale, levels = byte_texture(avatar, shaped, unseen)
     network = integer_network(avatar, groups, seed)
@@ -153,12 +160,12 @@ def write_avatar(
     provenance: dict[str, Any],
     names: dict[str, str],
 ) -> None:
-    """Write the bundle.
+    """Write the bundle of an avatar. Raises BadInputError.
 
     `folder`: folder of the bundle.
-    `person`: person whose avatar it is.
-    `quantised`: network and texture in integers.
-    `width`: width of the network; 64 is full.
+    `person`: person whom the avatar shows.
+    `quantised`: network and texture.
+    `width`: width of the network; 64 is the full network.
     `provenance`: facts about the training.
     `names`: `name` and `training_command` of the manifest.
     """
@@ -176,7 +183,7 @@ def write_avatar(
 
 
 def _inputs(avatar: TrainableAvatar, group: ShapeGroup, index: NDArray[np.int64]) -> list[NDArray[np.float32]]:
-    """Return the network's inputs (H, W, C) for samples `index` of `group`."""
+    """Return the network's inputs (H, W, C) for the samples `index` (N,) of `group`."""
     levels = [level.detach() for level in avatar.texture.levels()]
     frames = []
     for number in index:
@@ -186,16 +193,16 @@ def _inputs(avatar: TrainableAvatar, group: ShapeGroup, index: NDArray[np.int64]
     return frames
 
 
-# Rounds an avatar to the bytes of its bundle while it is trained, and keeps the rounded weights at the end.
+# Rounds an avatar to the bytes of its bundle during training, and keeps the rounded weights at the end.
 #
-# Rule: the grid is measured once, on a copy in the form in which the avatar is exported. At the end the float network
-# keeps the rounded weights: the weights before rounding paint a worse picture.
+# Rule: the grid is measured once, by a trial export of a copy of the avatar. At the end the float network keeps the
+# rounded weights: the weights before rounding give a worse picture.
 
 
 def round_to_bytes(avatar: TrainableAvatar, grid: ByteGrid, groups: list[ShapeGroup], seed: int) -> None:
-    """Round `avatar` on `grid` from now on.
+    """Activate `grid`, the byte grid of `avatar`; measure it first if necessary.
 
-    `groups`, `seed`: as in `ranges_of`.
+    `groups`, `seed`: as in `integer_network`.
     """
     if not grid.measured:
         grid.measure(ranges_of(copy.deepcopy(avatar).cpu(), groups, seed))
@@ -203,31 +210,34 @@ def round_to_bytes(avatar: TrainableAvatar, grid: ByteGrid, groups: list[ShapeGr
 
 
 def keep_rounded_weights(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> None:
-    """Replace the weights of `avatar`, which was trained with rounding, by their rounded values on the grid.
+    """Replace the weights of `avatar`, which was trained with rounding, by their rounded values.
 
-    `groups`, `seed`: as in `ranges_of`.
+    `groups`, `seed`: as in `integer_network`.
     """
     grid = ByteGrid(copy.deepcopy(avatar.network))
     grid.measure(ranges_of(copy.deepcopy(avatar).cpu(), groups, seed))
     avatar.network.load_state_dict(grid.weights(avatar.network), strict=False)
 
 
-# Inputs of a network for its calibration, drawn as the training draws its views, and others to inspect the result.
+# Inputs of a network for its calibration, with random views as in training, and inputs to evaluate the result.
 #
-# Rule: calibration inputs have every kind of training view, in the training's shares. Inputs to inspect come from
-# motions that no training uses. All have the one tensor shape at which networks are calibrated.
+# Rule: calibration inputs have every kind of training view, in the training's shares. Inputs for evaluation show poses
+# of motions that no training uses. All have the tensor shape `CALIBRATION_SHAPE`.
 
-#: Seed of the views; the training of the default avatar had another one.
+#: Seed of the views; it differs from the seed of the default avatar's training.
 SEED = 17
 
 
-def float_model(bundle: Bundle, weights: Any) -> onnx.ModelProto:
-    """Return the float network in file `weights`, for `bundle`, at the calibration's shape. Raises BadInputError."""
+def float_model(bundle: Bundle, weights: Path) -> onnx.ModelProto:
+    """Return the float network of `bundle` for inputs of `CALIBRATION_SHAPE`. Raises BadInputError.
+
+    `weights`: file of `save_network`.
+    """
     return export_onnx(float_network_of(bundle, weights), *CALIBRATION_SHAPE)
 
 
 def training_views(renderer: SampleRenderer, bundle: Bundle, views: int) -> list[F32]:
-    """Return `views` inputs (H,W,C) in random poses, with views in the training's shares."""
+    """Return `views` inputs (H,W,C) of the network of `bundle`, in random poses, with bands as often as in training."""
     rng = np.random.default_rng((SEED, 0))
     bands, sizes = list(TRAINING_SHARE), list(SIZES)
 
@@ -240,7 +250,7 @@ def training_views(renderer: SampleRenderer, bundle: Bundle, views: int) -> list
 
 
 def held_out_views(renderer: SampleRenderer, bundle: Bundle, views: int) -> list[F32]:
-    """Return `views` inputs (H,W,C) of all bands in turn, in poses of a motion that no training uses."""
+    """Return `views` inputs (H,W,C) of the network of `bundle`, of all bands in turn, in poses of a held-out motion."""
     poses = motion_poses(held_out_motions([BUILTIN_HELD_OUT]))
 
     def sample(number: int) -> Sample:
@@ -251,7 +261,10 @@ def held_out_views(renderer: SampleRenderer, bundle: Bundle, views: int) -> list
 
 
 def _tensors(renderer: SampleRenderer, bundle: Bundle, sample: Callable[[int], Sample], wanted: int) -> Iterator[F32]:
-    """Yield the network's inputs for the first `wanted` of samples 0, 1, 2, ... that have the calibration's shape."""
+    """Yield `wanted` inputs (H,W,C) of the network of `bundle`.
+
+    They are those of the first samples of `sample(0)`, `sample(1)`, ... with a tensor of `CALIBRATION_SHAPE`.
+    """
     levels = levels_of(bundle)
     found = (one for one in map(sample, count()) if one.crop.shape == CALIBRATION_SHAPE)
     for _, one in zip(range(wanted), found, strict=False):

@@ -1,12 +1,12 @@
-"""Makes the levels of a body's mesh: triangles by meshoptimizer, then vertices put back until no point moves too far.
+"""Makes the levels of a body's mesh: meshoptimizer simplifies it, then vertices are put back until no point moves far.
 
-meshoptimizer collapses edges onto vertices that exist, keeps UV seams, and weighs UV as an attribute. Its error is a
-mean over quadrics, so single texels may be far off. So the distance is measured wherever the edges of both meshes cross
-in UV, and at each vertex that was left out (`avatars/mesh_levels.py` proves it). Where it is too large, the vertex at
-the worst place of each triangle is locked, and the mesh is simplified again.
+meshoptimizer collapses edges onto existing vertices, keeps UV seams, and weighs UV as an attribute. Its error is a mean
+over quadrics, so single texels may be far off. The distance is therefore measured wherever edges of both meshes cross
+in UV, and at each left-out vertex; it is largest there (`avatars/mesh_levels.py`). Where it is too large, a vertex of
+the worst place in each triangle is locked, and the mesh is simplified again.
 
-At a seam the level's edge is a chord of the whole mesh's. A vertex that is left out there is paired with the nearest
-point of the chord, and so is what lies beyond the chord.
+At a seam, the level's edge is a chord of the whole mesh's outline in UV. A vertex that is left out there, or lies
+beyond the chord, is paired with the nearest point of the chord.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from trilane.errors import MissingPartError
 from trilane.stages.gpu.skinned_mesh import split_corners
 from trilane.training.random_views import random_pose
 
-#: Most that a level may move a point of the surface at rest and in `POSES` random poses, metres.
+#: For each level, the most that it may move a point of the surface at rest and in `POSES` random poses, metres.
 TOLERANCES_M = (0.002, 0.005, 0.015, 0.04)
 POSES = 6
-#: Weight of UV against places, when UV is scaled to metres.
+#: Weight of an error in UV, scaled to metres, relative to an error in position.
 UV_WEIGHT = 10.0
 MOST_ROUNDS = 25
-#: A mesh of 512 texels a side has so few triangles in a cell that pairs are found quickly.
+#: Cells along a side of the grid over the texture in which pairs of triangles are searched.
 CELLS = 96
 ON_EDGE = 1e-9
 CHUNK = 4000
@@ -43,10 +43,11 @@ CHUNK = 4000
 
 @dataclass(frozen=True)
 class Pairs:
-    """P points of the whole mesh, each with the level's point that shows the same texel.
+    """P pairs: a point of the whole mesh, and the level's point that shows the same texel.
 
-    `corners` (P,5), `shares` (P,5): the level's share minus the whole mesh's of each corner. The first two columns are
-    the whole mesh's. `uv_error`: as in `MeshLevel`.
+    `corners`: indices (P,5) of corners; the first two are the whole mesh's, the others the level's.
+    `shares`: (P,5), barycentric weight of each corner in the level's point minus its weight in the whole mesh's point.
+    `uv_error`: as in `MeshLevel`.
     """
 
     corners: I64
@@ -56,10 +57,12 @@ class Pairs:
 
 @dataclass
 class Corners:
-    """The corners (N) of a body's mesh, one for each distinct pair of vertex and UV, and what is known of them.
+    """The N corners of a body's mesh, one for each distinct pair of vertex and texture coordinate.
 
-    `vertex`, `uv_row` (N,): indices of the body. `uv` (N,2). `triangles` (F,3) of corners. `chart` (N,): number of the
-    piece of the texture. `places` (1 + POSES,N,3): at rest and in random poses, metres.
+    `vertex`, `uv_row`: indices (N,) of the body's vertices and texture coordinates. `triangles`: indices (F,3) of
+    corners. `uv`: (N,2). `rest`: positions (N,3) at rest, metres. `edges`: indices (E,2) of corners. `border`: indices
+    of the corners at UV seams. `chart`: number (N,) of the corner's UV chart. `places`: positions (1 + POSES,N,3) at
+    rest and in random poses, metres.
     """
 
     shaped: ShapedBody
@@ -88,11 +91,14 @@ class Corners:
 
     @property
     def extent(self) -> float:
-        """Longest side of the body's box, metres."""
+        """Longest side of the body's bounding box at rest, metres."""
         return float(np.ptp(self.rest, axis=0).max())
 
     def simplified(self, tolerance_m: float, locked: Mask) -> I64:
-        """Return the triangles (G,3) that meshoptimizer leaves; `locked` (N,) corners stay."""
+        """Return the triangles (G,3) of corners that meshoptimizer leaves.
+
+        `tolerance_m`: target error, metres. `locked`: (N,), whether a corner must stay.
+        """
         import meshoptimizer
 
         triangles = np.ascontiguousarray(self.triangles.ravel(), np.uint32)
@@ -100,7 +106,7 @@ class Corners:
         metres = np.sqrt(_area(self.rest[self.triangles]) / _area(self.uv[self.triangles]))
         attributes = np.ascontiguousarray(self.uv * metres, np.float32)
         left = np.zeros_like(triangles)
-        # The package passes these numbers to C without their types, so they are given as C's.
+        # The package passes these numbers to C without types, so they need C types.
         size = ctypes.c_size_t
         count = meshoptimizer.simplify_with_attributes(
             left,
@@ -121,7 +127,7 @@ class Corners:
         return left[:count].reshape(-1, 3).astype(np.int64)
 
     def pairs(self, level: I64) -> Pairs:
-        """Return the places at which the distance of the whole mesh and `level` (G,3) may be largest."""
+        """Return the pairs at which the distance between the whole mesh and `level` (G,3) may be largest."""
         left_out = np.setdiff1d(self.triangles, level)
         inside, is_inside = self._in_triangles(left_out, level)
         edges, uses = _edges(level)
@@ -131,7 +137,10 @@ class Corners:
         return Pairs(np.concatenate(corners), np.concatenate(shares), float(apart.max(initial=0.0)))
 
     def _in_triangles(self, left_out: I64, level: I64) -> tuple[tuple[I64, F64], Mask]:
-        """Pair each corner of `left_out` with all triangles of `level` that hold its texel; say which have one."""
+        """Return pairs of the corners `left_out` (M,) with the triangles of `level` that have the same texel.
+
+        The second result (M,) says which of the corners have such a triangle. Pairs are (corners, shares) of `Pairs`.
+        """
         point, (a, b, c) = self.uv[left_out], (self.uv[level[:, k]] for k in range(3))
         box = np.stack([a, b, c])
         row, number = _neighbours((point, point), (box.min(axis=0), box.max(axis=0)))
@@ -150,20 +159,23 @@ class Corners:
         return (np.hstack([own, own, level[number]]), np.hstack([-ones, 0 * ones, shares])), found
 
     def _crossings(self, edges: I64) -> tuple[I64, F64]:
-        """Pair the points where edges of the whole mesh and `edges` (E,2) of a level cross."""
+        """Return the pairs (corners, shares) where edges of the whole mesh and `edges` (E,2) of a level cross in UV."""
         a, b, c, d = (self.uv[ends] for ends in (*self.edges.T, *edges.T))
         row, number = _neighbours((np.minimum(a, b), np.maximum(a, b)), (np.minimum(c, d), np.maximum(c, d)))
         a, b, c, d = a[row], b[row], c[number], d[number]
         turn = _cross(b - a, d - c)
         with np.errstate(divide="ignore", invalid="ignore"):
             t, s = _cross(c - a, d - c) / turn, _cross(c - a, b - a) / turn
-        # A crossing at an end is a vertex, which is kept or paired by itself; parallel edges have no number here.
+        # A crossing at an end is a vertex, which is kept or has its own pair. Parallel edges give NaN or infinity.
         hit = (np.minimum(t, s) > ON_EDGE) & (np.maximum(t, s) < 1 - ON_EDGE)
         t, s, own, other = t[hit], s[hit], self.edges[row[hit]], edges[number[hit]]
         return np.hstack([own, other, other[:, :1]]), np.stack([t - 1, -t, 1 - s, s, 0 * s], axis=1)
 
     def _at_seams(self, corners: I64, chords: I64) -> tuple[tuple[I64, F64], F64]:
-        """Pair each of `corners` (M,) with the nearest point of a chord of its chart; say how far they are apart."""
+        """Return pairs of the seam's `corners` (M,) with the nearest points of `chords`, and their UV distances (M,).
+
+        Only chords in the corner's UV chart count. Pairs are (corners, shares) of `Pairs`. `chords`: (K,2) corners.
+        """
         if not len(corners):
             return (np.zeros((0, 5), np.int64), np.zeros((0, 5))), np.zeros(0)
         point, start = self.uv[corners][:, None], self.uv[chords[:, 0]]
@@ -179,7 +191,7 @@ class Corners:
         return (np.hstack([own, own, other, other[:, :1]]), shares), np.minimum(apart[rows, nearest], 1.0)
 
     def moved_m(self, pairs: Pairs) -> F64:
-        """Return the largest distance (P,) of each pair, metres, at rest and in the poses."""
+        """Return the distance (P,) between the points of each pair, metres: the largest at rest and in the poses."""
         square = np.zeros(len(pairs.corners))
         for places in self.places:
             apart = np.einsum("pk,pka->pa", pairs.shares, places[pairs.corners])
@@ -187,7 +199,10 @@ class Corners:
         return np.asarray(np.sqrt(square))
 
     def to_lock(self, pairs: Pairs, level: I64, moved: F64, tolerance_m: float, locked: Mask) -> Mask:
-        """Return which corners (N,) have to stay, so that the worst pairs come nearer; `locked` ones do already."""
+        """Return which corners (N,) to lock next: those of `locked`, and corners of the pairs that are too far apart.
+
+        `moved`: distance (P,) between the points of each pair, metres.
+        """
         bad = np.flatnonzero(moved > tolerance_m)
         bad = bad[np.argsort(-moved[bad])]
         element = pairs.corners[bad, 2] << 32 | pairs.corners[bad, 3]
@@ -197,7 +212,7 @@ class Corners:
         own = pairs.corners[worst, :2]
         best = np.where(kept[own], 1.0, pairs.shares[worst, :2]).argmin(axis=1)
         picked = own[np.arange(len(own)), best]
-        # Where both ends of an edge are there and yet it is far off, the corners around both meshes' are put back.
+        # If both ends of an edge are kept but a point of it moves too far, all corners around the pair are put back.
         stuck = pairs.corners[worst[kept[picked]]]
         around = self.edges[np.isin(self.edges, stuck).any(axis=1)].ravel()
         wanted = np.union1d(picked, around)
@@ -210,7 +225,7 @@ class Corners:
         return locked | np.isin(self.vertex, self.vertex[wanted])
 
     def terms(self, pairs: Pairs) -> tuple[F64, F64, F64]:
-        """Return the terms of the bound for each pair: (P,), (P,54), (P,54), metres."""
+        """Return the terms `rest` (P,), `swing` (P,54), `blend` (P,54) of the bound for each pair, see `MeshLevel`."""
         body = self.shaped.body
         weights = branch_sums(body.parents, body.weights.astype(np.float64))[self.vertex]
         lever = weights[:, 1:, None] * (self.rest[:, None] - self.shaped.joints[None, 1:])
@@ -230,17 +245,17 @@ class Corners:
         return np.concatenate(rest), np.concatenate(swing), np.concatenate(blend)
 
     def level(self, triangles: I64, pairs: Pairs) -> MeshLevel:
-        """Return the level with `triangles` (G,3), which `pairs` compare with the whole mesh."""
+        """Return the level with `triangles` (G,3). `pairs`: its pairs with the whole mesh."""
         faces, uv_faces = (rows[triangles].astype(np.int32) for rows in (self.vertex, self.uv_row))
         rest, swing, blend = self.terms(pairs)
         return MeshLevel(faces, uv_faces, *grouped(rest, swing, blend), pairs.uv_error)
 
 
 def make_mesh_levels(shaped: ShapedBody) -> Iterator[MeshLevel]:
-    """Yield the levels of the mesh of `shaped`, finest first, for `TOLERANCES_M`.
+    """Yield the levels of the mesh of `shaped`, finest first, one for each of `TOLERANCES_M`.
 
-    A level that does not keep its tolerance within `MOST_ROUNDS` rounds states the bound that it has. Raises
-    MissingPartError without meshoptimizer.
+    A level may exceed its tolerance after `MOST_ROUNDS` rounds; its bound is still correct. Raises MissingPartError
+    without meshoptimizer.
     """
     try:
         import meshoptimizer  # noqa: F401
@@ -253,9 +268,9 @@ def make_mesh_levels(shaped: ShapedBody) -> Iterator[MeshLevel]:
 
 
 def simplify_within(mesh: Corners, tolerance_m: float) -> tuple[I64, Pairs]:
-    """Return triangles (G,3) that move no point of the surface further than `tolerance_m`, and the measured places.
+    """Return triangles (G,3) that move no point of the surface further than `tolerance_m`, and their pairs.
 
-    If some points still do after `MOST_ROUNDS`, the round in which the furthest moved least is returned.
+    If no round reaches `tolerance_m`, the round with the smallest largest distance is returned.
     """
     locked = np.zeros(len(mesh.uv), bool)
     best: tuple[float, I64, Pairs] | None = None
@@ -277,7 +292,7 @@ def simplify_within(mesh: Corners, tolerance_m: float) -> tuple[I64, Pairs]:
 
 
 def _area(corners: F64) -> float:
-    """Return the area of triangles (F,3,2 or 3)."""
+    """Return the total area of triangles (F,3,2) or (F,3,3)."""
     a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     square = (a * a).sum(axis=1) * (b * b).sum(axis=1) - (a * b).sum(axis=1) ** 2
     return float(np.sqrt(np.maximum(square, 0.0)).sum() / 2)
@@ -288,16 +303,16 @@ def _cross(a: F64, b: F64) -> F64:
 
 
 def _edges(triangles: I64) -> tuple[I64, NDArray[np.intp]]:
-    """Return the edges (E,2) of `triangles` (F,3), and the number of triangles that each belongs to."""
+    """Return the edges (E,2) of `triangles` (F,3), and the number (E,) of triangles that have each edge."""
     ends = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
     distinct, uses = np.unique(ends[:, 0] << 32 | ends[:, 1], return_counts=True)
     return np.stack([distinct >> 32, distinct & 0xFFFFFFFF], axis=1), uses
 
 
 def _neighbours(first: tuple[F64, F64], second: tuple[F64, F64]) -> tuple[I64, I64]:
-    """Return the numbers (M,) and (M,) of boxes of `first` and `second` that have a cell of the texture in common.
+    """Return M pairs of boxes that share a cell of the texture: indices (M,) of `first` and indices (M,) of `second`.
 
-    A box is its lowest and its highest (u, v), (K,2) each.
+    `first`, `second`: lowest (u, v) and highest (u, v) of K boxes, (K,2) each.
     """
     row, cell = _cells(*first)
     other, its_cell = _cells(*second)

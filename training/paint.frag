@@ -1,8 +1,8 @@
 #version 330
 // Paints the clothed body: where each layer ends, its colours, and the light of a soft lamp on the camera.
 // Everything is placed by the point at rest, `v_rest` (metres), relative to landmarks of the body.
-// Definitions are of the look, in `looks.py`: colours in sRGB; HAIRLINE, FRINGE and WHORL of the hair, EAR_RING round
-// the ears; where sleeves (SLEEVE_END), what covers the legs (LEGS_END) and socks (SOCK_END) end.
+// The definitions in capitals come from the look (`Look` in `clothing.py`): colours in sRGB; HAIRLINE, FRINGE and WHORL
+// of the hair, EAR_RING round the ears; the ends of sleeves (SLEEVE_END), trouser legs (LEGS_END) and socks (SOCK_END).
 // v_colour: r is the obscurance, 1 in the open; g is 1 on the eyeballs.
 
 in vec3 v_position;

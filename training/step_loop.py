@@ -1,7 +1,7 @@
 """Training by a number of steps, in one process: the same settings give the same weights.
 
-Rule: what a step does depends only on its number, the settings and the state. A training that was ended anywhere
-therefore goes on as if it had not been ended.
+Rule: a step depends only on its number, the settings and the state. A resumed training therefore gives the same weights
+as one that was never interrupted.
 """
 
 from __future__ import annotations
@@ -33,16 +33,16 @@ from trilane.writing import write_atomically
 
 #: Share of the steps in which the learning rate rises.
 WARM_UP = 0.02
-#: Number of steps that are measured to estimate what all of them take.
+#: Number of steps that are measured to estimate the duration of a training.
 MEASURED = 4
-#: Moves the number of a step into the bits above the seed.
+#: The random seed of a step has the step's number above this many bits of the training's seed.
 SEED_BITS = 31
 
 
 def first_state(avatar: TrainableAvatar, settings: TrainingSettings, vgg: Vgg16 | None = None) -> TrainingState:
-    """Make the state of a training of `avatar` before its first step.
+    """Return the state of a training of `avatar` before the first step. `avatar` is prepared in place.
 
-    `vgg`: network of the perceptual loss; None for MS-SSIM.
+    `vgg`: network of the perceptual loss; None if the loss has none.
     """
     device = chosen_device(settings.device)
     average = copy.deepcopy(avatar.to(device)).eval()
@@ -64,10 +64,10 @@ def first_state(avatar: TrainableAvatar, settings: TrainingSettings, vgg: Vgg16 
 def steps(
     state: TrainingState, groups: list[ShapeGroup], settings: TrainingSettings, count: int
 ) -> Iterator[dict[str, float]]:
-    """Do the steps of `state` up to number `count`, and yield the terms of the loss after each, by name.
+    """Do the steps from `state.step` to `count`, and yield the terms of the loss, by name, after each step.
 
-    `state`: state of the training, which changes in place.
-    `groups`: samples of the training.
+    `state`: state of the training, changed in place.
+    `groups`: training samples.
     """
     stream = batch_stream(groups, settings, count, state.step)
     peaks = (settings.network_rate, settings.network_rate, settings.texture_rate)
@@ -85,9 +85,9 @@ def steps(
 
 
 def _step(state: TrainingState, stream: Iterator[Batch], settings: TrainingSettings, frozen: bool) -> dict[str, float]:
-    """Do one step by the mean gradient of the next batches, and return the mean terms of their losses.
+    """Do one step by the mean gradient of the next batches, and return the means of their loss terms, by name.
 
-    `frozen`: whether batch statistics stay.
+    `frozen`: whether the running statistics of batch norms stay fixed.
     """
     options, avatar = settings.optimiser, state.avatar
     state.optimiser.zero_grad(set_to_none=True)
@@ -104,10 +104,10 @@ def _step(state: TrainingState, stream: Iterator[Batch], settings: TrainingSetti
 def add_gradients(
     avatar: TrainableAvatar, batch: tuple[Tensor, Tensor, Tensor], objective: Objective, share: float = 1.0
 ) -> dict[str, float]:
-    """Add `share` of the gradients of `batch` to the gradients of `avatar`, and return the terms of the loss by name.
+    """Add `share` times the gradient of `batch` to the gradients of `avatar`, and return the loss terms by name.
 
     `batch`: UV image, coverage and target, as `load_batch` returns them.
-    `objective`: loss to minimise; its discriminators learn from every batch.
+    `objective`: loss to minimise. Its discriminators learn from `batch` too.
     """
     uv, covered, target = batch
     output = avatar(uv, covered)
@@ -117,14 +117,14 @@ def add_gradients(
 
 
 def rate_share(share: float) -> float:
-    """Return the factor of the learning rates when `share` of the training is done: a rise, then half a cosine."""
+    """Return the factor of the learning rates after `share` of the steps: a linear rise, then half a cosine."""
     if share < WARM_UP:
         return max(share / WARM_UP, 0.02)
     return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * (share - WARM_UP) / (1 - WARM_UP)))
 
 
 def set_mode(avatar: TrainableAvatar, frozen: bool) -> None:
-    """Put `avatar` into training mode. `frozen`: whether its batch statistics stay."""
+    """Put `avatar` into training mode. `frozen`: whether the running statistics of batch norms stay fixed."""
     avatar.train()
     if frozen:
         for module in avatar.modules():
@@ -133,7 +133,7 @@ def set_mode(avatar: TrainableAvatar, frozen: bool) -> None:
 
 
 def follow(average: TrainableAvatar, avatar: TrainableAvatar, keep: float) -> None:
-    """Move `average` towards `avatar`; it keeps the share `keep` of itself."""
+    """Set each weight of `average` to `keep` times itself plus 1 - `keep` times the weight of `avatar`."""
     current = avatar.state_dict()
     for name, value in average.state_dict().items():
         if value.dtype.is_floating_point:
@@ -143,7 +143,10 @@ def follow(average: TrainableAvatar, avatar: TrainableAvatar, keep: float) -> No
 def step_seconds(
     avatar: TrainableAvatar, groups: list[ShapeGroup], settings: TrainingSettings, vgg: Vgg16 | None = None
 ) -> float:
-    """Measure the mean seconds of a step on a copy of `avatar`; small samples count by their share of the steps."""
+    """Return the mean duration of a step in seconds, measured on a copy of `avatar`.
+
+    Steps with half-size samples and steps with all samples are weighted by their shares of the training.
+    """
     share = settings.small_until
     of_small = _measured(avatar, groups, settings, vgg, 1.0) if share > 0 else 0.0
     of_all = _measured(avatar, groups, settings, vgg, 0.0) if share < 1 else 0.0
@@ -157,7 +160,7 @@ def _measured(
     vgg: Vgg16 | None,
     small_until: float,
 ) -> float:
-    """Measure the mean seconds of a step, after one that warms up."""
+    """Return the mean duration in seconds of a step with this `small_until`, measured after a warm-up step."""
     going = steps(
         first_state(copy.deepcopy(avatar), settings, vgg),
         groups,
@@ -173,13 +176,13 @@ def _measured(
 
 # Where a training computes: the CPU, or a GPU that PyTorch can use.
 #
-# Rule: a device that is asked for by name is used, or an error says that it is absent; only `auto` chooses.
+# Rule: a device that is named is used, or an error says that the device is absent. Only `auto` leaves a choice.
 
 MB = 1e6
 
 
 def chosen_device(asked: str) -> torch.device:
-    """Return the device for "auto", "cpu" or "cuda". Raises MissingPartError where there is no such GPU."""
+    """Return the device for `asked`: "auto", "cpu" or "cuda". Raises MissingPartError for "cuda" without a GPU."""
     found = torch.cuda.is_available()
     if asked == "cuda" and not found:
         what = "device cuda: this PyTorch finds no NVIDIA GPU (device auto or cpu trains on the CPU)"
@@ -188,42 +191,39 @@ def chosen_device(asked: str) -> torch.device:
 
 
 def device_words(device: torch.device, threads: int) -> str:
-    """Return a name for `device` in words.
-
-    `threads`: threads of PyTorch on the CPU.
-    """
+    """Return a name of `device` for people. `threads`: number of PyTorch's threads on the CPU."""
     if device.type == "cuda":
         return f"the GPU {torch.cuda.get_device_name(device)}"
     return f"{threads} {'thread' if threads == 1 else 'threads'} of the CPU"
 
 
 def memory_words(device: torch.device) -> str:
-    """Say how much memory this process has now, and the most that it had of a GPU's."""
+    """Return words for the memory that this process has now, and the most GPU memory that it had."""
     of_cpu = f"{psutil.Process().memory_info().rss / MB:.0f} MB of memory"
     if device.type != "cuda":
         return of_cpu
     return f"{of_cpu}, {torch.cuda.max_memory_allocated(device) / MB:.0f} MB of the GPU's"
 
 
-# Adam and AdamW that leave numbers without a gradient, and their moments, as they are.
+# Adam and AdamW that do not change elements without a gradient, nor their moments.
 #
-# Rule: a texel that a batch does not show is not treated as a texel whose gradient is 0. Plain Adam would go on moving
-# it by its old momentum, let that momentum fade, and decay the texel.
+# Rule: a texel that no sample of a batch shows does not change. Plain Adam would treat its gradient as 0: it would move
+# the texel by the old momentum, let this momentum fade, and apply weight decay.
 
-#: Key of the groups of parameters that are masked.
+#: Key of a parameter group; its value says whether the group is masked.
 MASKED = "masked"
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 class _Masked(torch.optim.Optimizer):
-    """The addition of masking to a class of Adam.
+    """Mix-in that adds masking to Adam or AdamW.
 
-    In groups of parameters with `masked`, numbers whose gradient is exactly 0 take no part in a step. The count of
-    steps, which corrects the moments' bias, goes on for all of them, as in `torch.optim.SparseAdam`.
+    In masked groups of parameters, an element whose gradient is exactly 0 does not change in a step. The step count,
+    which corrects the moments' bias, grows for all elements, as in `torch.optim.SparseAdam`.
     """
 
     def step(self, closure: Callable[[], float] | None = None) -> Any:
-        """Do a step of the Adam class that this class extends, but leave the masked numbers as they are."""
+        """Do a step of Adam or AdamW that does not change masked elements."""
         groups = [group for group in self.param_groups if group.get(MASKED)]
         kept = [
             self._kept(parameter) for group in groups for parameter in group["params"] if parameter.grad is not None
@@ -235,9 +235,9 @@ class _Masked(torch.optim.Optimizer):
         return loss
 
     def _kept(self, parameter: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
-        """Return `parameter`, the places without a gradient, and the values of the parameter and its moments there.
+        """Return `parameter`, a mask of its elements without a gradient, and the values to restore at these elements.
 
-        Moments that do not exist yet begin at 0.
+        The values are those of the parameter and its moments. Moments that do not exist yet begin at 0.
         """
         unseen = parameter.grad == 0
         if self.state[parameter]:
@@ -250,18 +250,18 @@ class _Masked(torch.optim.Optimizer):
 
 
 class MaskedAdam(_Masked, torch.optim.Adam):
-    """Adam; its weight decay is part of the gradient and so is skipped where there is no gradient."""
+    """Adam with masking. Its weight decay skips masked elements too."""
 
 
 class MaskedAdamW(_Masked, torch.optim.AdamW):
-    """AdamW, whose weight decay does not touch masked numbers."""
+    """AdamW with masking. Its weight decay skips masked elements too."""
 
 
-# The optimiser of an avatar: Adam or AdamW, of three groups of parameters.
+# The optimiser of an avatar: Adam or AdamW, with three groups of parameters.
 #
-# Rule: a group shares a learning rate, a decay and moments; the table says which class steps it.
+# Rule: the parameters of a group have the same learning rate, weight decay and momenta.
 
-#: Class by kind of optimiser, and by whether texels without a gradient stay.
+#: Class by kind of optimiser, and by whether texels without a gradient stay fixed.
 CLASSES: dict[tuple[str, bool], type[torch.optim.Optimizer]] = {
     ("adamw", False): torch.optim.AdamW,
     ("adamw", True): MaskedAdamW,
@@ -271,7 +271,10 @@ CLASSES: dict[tuple[str, bool], type[torch.optim.Optimizer]] = {
 
 
 def optimiser_of(avatar: TrainableAvatar, settings: TrainingSettings) -> torch.optim.Optimizer:
-    """Make the optimiser of three groups: kernels, the network's other weights, which do not decay, and texture."""
+    """Return an optimiser with three groups: kernels, the network's other weights, and the texture.
+
+    The network's other weights have no weight decay.
+    """
     options = settings.optimiser
     kernels = [p for p in avatar.network.parameters() if p.ndim > 1]
     others = [p for p in avatar.network.parameters() if p.ndim <= 1]
@@ -291,18 +294,18 @@ def optimiser_of(avatar: TrainableAvatar, settings: TrainingSettings) -> torch.o
 
 
 def clip_gradients(module: nn.Module, options: OptimiserOptions) -> None:
-    """Limit the gradients of `module`: each number by `clip_value`, then the norm of all by `clip_norm`. In place."""
+    """Limit the gradients of `module` in place: each element by `clip_value`, then the total norm by `clip_norm`."""
     if options.clip_value:
         nn.utils.clip_grad_value_(module.parameters(), options.clip_value)
     if options.clip_norm:
         nn.utils.clip_grad_norm_(module.parameters(), options.clip_norm)
 
 
-# The whole state that a training resumes from, as one .npz file: weights, their average and Adam's moments, and the
-# same for discriminators.
+# The whole state that a training resumes from, as one .npz file: weights, their average and Adam's moments. It includes
+# weights and moments of the discriminators.
 #
-# Rule: a state that was read computes the same bits as the one that was written, so tensors keep their layout in
-# memory.
+# Rule: training from a state that was read gives the same bits as training from the state that was written. Tensors
+# therefore keep their memory layout.
 
 EXPECTED = "the state of this training"
 REMEDY = "remove it to begin again"
@@ -310,9 +313,9 @@ REMEDY = "remove it to begin again"
 
 @dataclass
 class TrainingState:
-    """State of a training: an avatar, its optimiser, its objective and the average of its weights.
+    """The state of a training.
 
-    `step`: number of steps that were done.
+    `average`: avatar with the moving average of the weights; it becomes the bundle. `step`: number of finished steps.
     """
 
     avatar: TrainableAvatar
@@ -322,7 +325,7 @@ class TrainingState:
     step: int = 0
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return all tensors by name; they are the state's own."""
+        """Return all tensors of the state by name, without copying them."""
         modules: dict[str, nn.Module] = {"avatar": self.avatar, "average": self.average}
         if self.objective.adversary is not None:
             modules["discriminators"] = self.objective.adversary.discriminators
@@ -342,7 +345,7 @@ class TrainingState:
         return next(self.avatar.parameters()).device
 
     def optimisers(self) -> dict[str, torch.optim.Optimizer]:
-        """Return all optimisers by name, each of Adam's kind."""
+        """Return the optimisers of the avatar and, if any, of the discriminators, by name."""
         adversary = self.objective.adversary
         return {"optimiser": self.optimiser} | ({} if adversary is None else {"judges": adversary.optimiser})
 
@@ -355,7 +358,7 @@ def save_state(state: TrainingState, path: Path) -> None:
 
 
 def load_state(state: TrainingState, path: Path) -> None:
-    """Set `state` to what `save_state` wrote. Raises BadInputError for the state of another training."""
+    """Fill `state` from a file of `save_state`. Raises BadInputError for the state of another training."""
     try:
         with path.open("rb") as source, np.load(source, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
@@ -378,7 +381,7 @@ def _fill(tensors: dict[str, Tensor], arrays: dict[str, NDArray[np.generic]]) ->
 
 
 def _add_moments(optimiser: torch.optim.Optimizer) -> None:
-    """Create Adam's moments as its first step would: laid out in memory as their parameters are."""
+    """Create Adam's moments as its first step would, with the memory layout of their parameters."""
     for group in optimiser.param_groups:
         for parameter in group["params"]:
             optimiser.state[parameter] = {
@@ -390,16 +393,13 @@ def _add_moments(optimiser: torch.optim.Optimizer) -> None:
 
 # How far a training's loss fell: the loss of the same samples, before the first step and after the last.
 #
-# Rule: the loss is the avatar's alone. What discriminators find is left out: it is another measure after each step. The
-# loss is computed for the weights that become the avatar, over the same backgrounds, and computing it changes nothing
-# in the training.
+# Rule: both losses are measured alike. The terms of the discriminators are left out, because discriminators change with
+# each step. The loss is that of the averaged weights, which become the bundle, over the same backgrounds. Measuring it
+# changes nothing in the training.
 
 
 def probe_loss(state: TrainingState, groups: list[ShapeGroup]) -> float:
-    """Return the mean loss of the averaged avatar of `state`, over the first samples of `groups`.
-
-    The avatar is taken as it would be written now.
-    """
+    """Return the mean loss, over the first sample of each of `groups`, of the averaged avatar of `state`."""
     judge = replace(state.objective, adversary=None)
     losses = list[float]()
     with torch.no_grad(), torch.random.fork_rng(devices=[]):

@@ -1,6 +1,6 @@
-"""The subject of a training: the default body, clothed, or the person of a capture, with offsets of clothes and hair.
+"""The subject of a training: the clothed default body or the person of a capture, with offsets of clothes and hair.
 
-Rule: only this module differs between the two; samples, training and bundle are the same.
+Rule: only this module treats the two kinds of subjects differently.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Person:
     """The person whom an avatar shows.
 
     `body`: file of the body. `betas`, `expression`: coefficients of its shape.
-    `offsets` (V,3): vectors from the skin to the drawn surface, metres at rest; None for none.
+    `offsets`: vectors (V,3) from the skin to the drawn surface, metres at rest; None if the skin is drawn.
     """
 
     body: Path
@@ -58,14 +58,14 @@ class Person:
 
 @dataclass(frozen=True)
 class Subject:
-    """The subject of a training, with everything that draws it.
+    """The subject of a training, with the renderers of its samples.
 
-    `person`, `shaped`: the person and the body. `renderer`: plans and renders samples. `opener`: opens another renderer
-    like it, also in another process; its body is drawn with the offsets that `opener` is given. `facts`: facts for the
+    `shaped`: body of `person`, with its offsets. `renderer`: plans and renders samples. `opener`: function that opens
+    another such renderer, in any process, for a body with the offsets that `opener` is given. `facts`: facts for the
     manifest.
-    `truth`: renders the person in any pose and view; None where only frames are known. `frames`: renders those frames,
-    else None. `held_out`: numbers of the frames that are kept for measuring.
-    `unseen` (S,S): texels of the body that no training frame shows; None where all can be drawn.
+    `truth`: the renderer, if it can draw the ground truth of any pose and view; None for a capture.
+    `frames`: the renderer, if it shows frames of a capture; else None. `held_out`: numbers of the held-out frames.
+    `unseen`: texels (S,S) of the body that no training frame shows; None if `truth` can show all.
     """
 
     person: Person
@@ -80,7 +80,7 @@ class Subject:
 
     @property
     def source(self) -> Callable[[], SampleSource[Any]]:
-        """A function that opens another renderer like this subject's."""
+        """A function without arguments that opens another renderer like this subject's, in any process."""
         return partial(self.opener, self.person.offsets)
 
     def with_offsets(self, offsets: F32) -> Subject:
@@ -97,9 +97,9 @@ class Subject:
 
 
 def clothed_subject(body: Path, threads: int, name: str = DEFAULT_NAME) -> Subject:
-    """Return the body in the file `body`, in the look `name`.
+    """Return the clothed body as a subject. Raises BadInputError.
 
-    `threads`: threads of a software OpenGL driver. Raises BadInputError.
+    `body`: body file. `threads`: number of threads of a software OpenGL driver. `name`: name of the look.
     """
     look = look_named(name)
     shaped = load_body(body).shape(look.betas)
@@ -110,10 +110,10 @@ def clothed_subject(body: Path, threads: int, name: str = DEFAULT_NAME) -> Subje
 
 
 def captured_subject(folder: Path, threads: int, report: Callable[[str], None]) -> Subject:
-    """Return the person of the capture in `folder`, without frames whose fits are bad and held-out frames.
+    """Return the person of the capture in `folder` as a subject. Samples show no held-out frame and no bad fit.
 
-    `threads`: threads of a software OpenGL driver. `report`: takes a line that says how many frames these are.
-    Raises BadInputError; FaultyCaptureError with all faults.
+    `threads`: number of threads of a software OpenGL driver. `report`: called with lines about the frames and texels.
+    Raises BadInputError; FaultyCaptureError with all faults of the capture.
     """
     capture = open_capture(folder)
     frames, coverage, drawn = _checked(capture, threads)
@@ -139,13 +139,19 @@ def captured_subject(folder: Path, threads: int, report: Callable[[str], None]) 
 
 
 def capture_source(capture: Capture, numbers: Sequence[int], offsets: F32 | None) -> CaptureRenderer:
-    """Open a renderer of the frames `numbers` of `capture`, on one thread; the body is drawn with `offsets` (V,3)."""
+    """Return a new renderer, on one thread, of the frames `numbers` of `capture`.
+
+    `offsets`: offsets (V,3) that the body is drawn with; None for none.
+    """
     drawn = capture if offsets is None else replace(capture, shaped=capture.shaped.with_offsets(offsets))
     return CaptureRenderer(drawn, numbers, ViewRule(), threads=1)
 
 
 def _checked(capture: Capture, threads: int) -> tuple[list[CheckedFrame], TexelCoverage, list[U8]]:
-    """Check the frames of `capture`; return them, a coverage that counted none, and each frame's packed texels."""
+    """Return the checks of all frames of `capture`, an empty coverage, and the texels that each frame shows.
+
+    The texels of a frame are packed by `np.packbits`, because a capture may have many frames.
+    """
     raster, coverage = BodyRaster(capture.shaped, threads), coverage_of(capture)
     frames, drawn = [], []
     for number in range(len(capture)):
@@ -156,42 +162,44 @@ def _checked(capture: Capture, threads: int) -> tuple[list[CheckedFrame], TexelC
 
 
 def _unseen_line(coverage: TexelCoverage) -> str:
-    """Say which share of the texels no frame shows, and on which regions of the body."""
+    """Return a line about the share of texels that no frame shows, and the regions that are never seen."""
     regions = coverage.never_seen()
     names = f", among them all of {', '.join(regions)}" if regions else ""
     share = f"{1 - coverage.share():.1%} of the body's texels are seen by no frame{names}"
     return f"{share}: filled from seen ones, along the surface"
 
 
-# How far a person's clothes and hair stand off the body: offsets of its vertices, measured where masks end.
+# How far a person's clothes and hair stand off the body: offsets of the body's vertices, measured at the masks'
+# outlines.
 #
-# Rule: an offset is measured only where the surface turns away from the camera, because the outline shows it only
-# there. Other vertices get theirs from neighbours on the surface.
+# Rule: an offset is measured only at vertices on the outline of the body, because a mask shows offsets only there.
+# Other vertices get their offsets from neighbours on the surface.
 #
 # The offsets are those of "SMPL+D" (Alldieck et al., Video Based Reconstruction of 3D People Models, CVPR 2018), but
-# they are found by reading along lines, not by gradients.
+# they are found by sampling the mask along the normals, not by gradient descent.
 
-#: Range along the surface's normal in which the mask's end is searched, and the step, metres.
+#: Range along the surface's normal in which the mask's outline is searched, and step of the search, metres.
 INWARD_M, OUTWARD_M, STEP_M = -0.03, 0.1, 0.002
-#: Largest sine of the angle between surface and ray of sight at which a vertex is at the outline.
+#: A vertex may be at the outline if the sine of the angle between its surface and the ray to the camera is below this.
 RIM = 0.2
-#: Pixels inside the outline at which the body must be drawn, and outside at which it must not be.
+#: A vertex is at the outline if the body is drawn this many pixels inside of it and not drawn as far outside.
 BESIDE_PX = 1.5
-#: Least number of pixels that a metre along the normal must span: fewer say too little.
+#: Least number of pixels that a metre along the normal must span: fewer pixels are too inaccurate.
 LEAST_PX_PER_M = 120.0
-#: Number of measurements that make a vertex certain.
+#: Number of measurements with which a vertex has the full weight.
 ENOUGH = 12
-#: Weight of a difference between neighbours, relative to that of a certain measurement.
+#: Weight of the squared difference between neighbours, relative to that of a vertex with the full weight.
 STIFFNESS = 0.6
-#: Rounds in which normals are smoothed, so that raised surfaces do not fold.
+#: Number of smoothing steps of the normals, so that raised surfaces do not fold.
 NORMAL_ROUNDS = 6
 
 
 class Outline(NamedTuple):
     """One view of the person.
 
-    `joints` (55,3,4): skinning matrices. `feature` (486,): factors of pose blend shapes, or None. `view`, `projection`
-    (4,4): the camera. `covered` (h,w) bool: where the body is drawn. `mask` (h,w) in 0..1: where the person is.
+    `joints`: skinning matrices (55,3,4). `feature`: factors (486,) of pose blend shapes, or None. `view`, `projection`:
+    camera matrices (4,4). `covered`: (h,w) bool, whether the body is drawn. `mask`: (h,w) in 0..1, coverage by the
+    person.
     """
 
     joints: NDArray[np.floating]
@@ -204,9 +212,9 @@ class Outline(NamedTuple):
 
 @dataclass(frozen=True)
 class StandOff:
-    """Offsets that were found.
+    """Measured offsets.
 
-    `offsets` (V,3): metres at rest. `measured`: share of the vertices that any outline showed.
+    `offsets`: (V,3), metres at rest. `measured`: share of the vertices with a measurement; the others are interpolated.
     """
 
     offsets: F32
@@ -214,9 +222,9 @@ class StandOff:
 
 
 def stand_off(shaped: ShapedBody, outlines: Iterable[Outline]) -> StandOff:
-    """Return the offsets of the person that `outlines` show.
+    """Return the offsets of the person in `outlines`.
 
-    `shaped`: body that the outlines are drawn with; the result includes the offsets that it has already.
+    `shaped`: body that the outlines are drawn with. The result includes the offsets that this body already has.
     """
     faces = shaped.body.faces.astype(np.int64)
     rest = shaped.vertices.astype(np.float64)
@@ -234,15 +242,17 @@ def stand_off(shaped: ShapedBody, outlines: Iterable[Outline]) -> StandOff:
 
 
 def smooth_normals(vertices: F64, faces: Ints) -> F64:
-    """Return unit normals (V,3), smoothed over neighbours."""
+    """Return unit vertex normals (V,3), smoothed over neighbours on the mesh."""
     normals = Smoother(faces, len(vertices)).smooth(vertex_normals(vertices, faces), NORMAL_ROUNDS)
     return np.asarray(normals / np.linalg.norm(normals, axis=1, keepdims=True))
 
 
 def measured_heights(shaped: ShapedBody, normals: F64, outline: Outline) -> tuple[Ints, F64, F64]:
-    """Return vertices at the outline, the distance from each to the mask's end in metres, and a weight of each.
+    """Return N vertices at the outline: indices (N,), distances (N,) to the mask's outline, weights (N,).
 
-    The distance is along `normals` (V,3). The weight is the number of pixels that a metre spans.
+    A distance is along the vertex's normal, in metres. A weight is the number of pixels that a metre along it spans.
+
+    `normals`: smoothed normals (V,3) at rest.
     """
     at, along_normal, true_normal = _posed(shaped, normals, outline)
     pixels = _Pixels(outline)
@@ -267,10 +277,10 @@ def measured_heights(shaped: ShapedBody, normals: F64, outline: Outline) -> tupl
 
 
 def smoothed(values: F64, certainty: F64, faces: Ints) -> F64:
-    """Return heights (V,) that are near `values` (V,) where `certainty` (V,) is large, and smooth everywhere.
+    """Return values x (V,) that are smooth on the mesh and close to `values` v (V,) where `certainty` c (V,) is large.
 
-    They minimise sum c (x - v)^2 + STIFFNESS sum over edges (x_i - x_j)^2. A part of the mesh without any measurement
-    gets 0.
+    They minimise sum c (x - v)² + STIFFNESS sum over edges (x_i - x_j)². A connected part of the mesh without any
+    measurement gets 0.
     """
     count = len(values)
     pairs = np.unique(np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1), axis=0)
@@ -278,31 +288,31 @@ def smoothed(values: F64, certainty: F64, faces: Ints) -> F64:
     edges = sparse.coo_matrix((ones, (pairs[:, 0], pairs[:, 1])), (count, count))
     edges = edges + edges.T
     degree = np.asarray(edges.sum(axis=1)).ravel()
-    # The small term keeps the system regular where a part of the mesh has no measurement; it draws that part to 0.
+    # The small term keeps the system regular if a part of the mesh has no measurement; it sets that part to 0.
     system = sparse.diags(certainty + STIFFNESS * degree + 1e-6) - STIFFNESS * edges
     return np.asarray(spsolve(system.tocsc(), certainty * values))
 
 
 class _Pixels:
-    """Reads the pictures of an outline at points."""
+    """Samples `covered` and `mask` of an outline at points."""
 
     def __init__(self, outline: Outline) -> None:
         self._outline = outline
         self._clip = outline.projection @ outline.view
 
     def of(self, points: F64) -> F64:
-        """Return column and row (N,2) of `points` (N,3), in pixels from the top left corner."""
+        """Return the pixel coordinates (N,2) of world `points` (N,3): x right, y down, from the top left corner."""
         height, width = self._outline.covered.shape
         clip = points @ self._clip[:, :3].T + self._clip[:, 3]
         over = clip[:, :2] / np.maximum(clip[:, 3:], 1e-6)
         return np.asarray((over * [1, -1] + 1) / 2 * [width, height])
 
     def covered(self, at: F64) -> NDArray[np.bool_]:
-        """Return whether the body is drawn at `at` (...,2)."""
+        """Return whether the body is drawn at the pixel coordinates `at` (...,2); False outside the picture."""
         return np.asarray(self._read(self._outline.covered.astype(np.float32), at, 0) > 0)
 
     def mask(self, at: F64) -> F64:
-        """Return the mask at `at` (...,2), read bilinearly; NaN beyond the picture."""
+        """Return the mask at the pixel coordinates `at` (...,2), sampled bilinearly; NaN outside the picture."""
         return self._read(self._outline.mask, at, 1, np.nan)
 
     def _read(self, image: F32, at: F64, order: int, beyond: float = 0.0) -> F64:
@@ -311,7 +321,7 @@ class _Pixels:
 
 
 def _posed(shaped: ShapedBody, normals: F64, outline: Outline) -> tuple[F64, F64, F64]:
-    """Return place, direction of `normals` and true normal of every vertex in the world, (V,3) each."""
+    """Return the posed vertices, the posed `normals` and the true normals of the posed mesh, (V,3) each, world."""
     rest = shaped.vertices.astype(np.float64)
     if outline.feature is not None and shaped.body.posedirs is not None:
         rest = rest + (shaped.body.posedirs.reshape(-1, len(outline.feature)) @ outline.feature).reshape(-1, 3)
@@ -323,9 +333,9 @@ def _posed(shaped: ShapedBody, normals: F64, outline: Outline) -> tuple[F64, F64
 
 
 def _ends(values: F64) -> tuple[F64, NDArray[np.bool_]]:
-    """Find where each row of `values` (N,K) first falls below a half, in steps, and whether it does.
+    """Return where each row of `values` (N,K) first falls below 0.5, as an index (N,), and whether it does (N,).
 
-    A row that begins below a half, or leaves the picture before falling, does not.
+    The index is interpolated. A row that begins below 0.5 or reaches NaN first does not fall.
     """
     inside = values >= 0.5
     first = np.argmin(inside, axis=1)
@@ -338,7 +348,10 @@ def _ends(values: F64) -> tuple[F64, NDArray[np.bool_]]:
 
 
 def _medians(number: Ints, value: F64, weight: F64, count: int) -> tuple[F64, F64]:
-    """Return the weighted median (V,) of each vertex's values, 0 without any, and the number of values."""
+    """Return the weighted median (V,) of each vertex's values, 0 without values, and the number (V,) of values.
+
+    `number`: vertex of each value, (N,). `value`, `weight`: (N,). `count`: number V of vertices.
+    """
     order = np.lexsort((value, number))
     number, value, weight = number[order], value[order], weight[order]
     total = np.bincount(number, weights=weight, minlength=count)
@@ -349,26 +362,27 @@ def _medians(number: Ints, value: F64, weight: F64, count: int) -> tuple[F64, F6
     return middle, np.bincount(number, minlength=count).astype(np.float64)
 
 
-# Finds the offsets of a subject: views of it are drawn and measured, then drawn again with the offsets found so far.
+# Finds the offsets of a subject: views of the subject are drawn and measured, then drawn again with the offsets that
+# were found.
 #
 # Rule: only views that training may read are used, and the same seed finds the same offsets.
 
-#: Number of measured views, and of rounds: each round draws the body with the offsets of the round before and corrects
-#: them.
+#: Number of measured views, and number of rounds. Each round draws the body with the offsets of the previous round, and
+#: corrects these offsets.
 VIEWS, ROUNDS = 300, 3
-#: Added to the seed, so that the views differ from the samples.
+#: Added to the seed, so that the views differ from the training samples.
 SEED = 7
-#: Number of views that are measured first, to estimate the cost of all.
+#: Number of views that are measured first, to estimate the duration of all.
 TRIED = 4
 
 
 def subject_with_offsets(
     subject: Subject, path: Path, seed: int, report: Callable[[str], None], track: Callable[[Any], Any] = iter
 ) -> Subject:
-    """Return `subject`, drawn with the offsets in the file `path`; they are measured and written if it is missing.
+    """Return `subject` with the offsets in the file `path`. If the file is missing, measure and write them first.
 
-    `seed`: seed of the views. `report`: takes a line that says what measuring costs. `track`: wraps the views of each
-    round to show progress.
+    `seed`: seed of the training; the views' seed follows from it. `report`: called with a line about the duration of
+    the measurement. `track`: wraps the views of each round to show progress.
     """
     if not path.exists():
         offsets = measured_offsets(subject, seed, report, track)
@@ -380,7 +394,10 @@ def subject_with_offsets(
 def measured_offsets(
     subject: Subject, seed: int, report: Callable[[str], None], track: Callable[[Any], Any] = iter
 ) -> F32:
-    """Return offsets (V,3), metres: how far the surface that the masks show stands off the skin of `subject`."""
+    """Return the offsets (V,3), metres, from the skin of `subject` to the surface that the masks show.
+
+    The parameters are those of `subject_with_offsets`.
+    """
     samples = plan_training(subject.renderer, VIEWS, seed + SEED)
     report(_cost(subject, samples))
     for _ in range(ROUNDS):
@@ -391,7 +408,7 @@ def measured_offsets(
 
 
 def _cost(subject: Subject, samples: Sequence[Any]) -> str:
-    """Say what measuring `samples` in all rounds costs, by measuring some of them."""
+    """Return a line about the duration of measuring `samples` in all rounds, estimated by measuring some of them."""
     tried = samples[:: max(1, len(samples) // TRIED)][:TRIED]
     normals = smooth_normals(subject.shaped.vertices.astype(np.float64), subject.shaped.body.faces.astype(np.int64))
     start = time.monotonic()
@@ -405,7 +422,7 @@ def _cost(subject: Subject, samples: Sequence[Any]) -> str:
 
 
 def outlines(subject: Subject, samples: Sequence[Any]) -> Iterator[Outline]:
-    """Yield an outline of `subject` for each of `samples`."""
+    """Yield the outline of `subject` in each of `samples`, which its renderer planned."""
     renderer: Any = subject.renderer
     for sample in samples:
         uv, rgba = renderer.render(sample)

@@ -1,7 +1,7 @@
 """The trained parts: a neural texture and a network, which turn a UV image into a picture, and their byte grid.
 
-Rule: in training, the network's input is rounded to as many steps as its bytes have in the pipeline. Noise, if any,
-acts in training mode alone.
+Rule: in training, the network's input is rounded to as many steps as its bytes have in the pipeline. Noise is added
+only in training mode.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ INPUT_STEPS = 127
 class TrainableAvatar(nn.Module):
     """A neural texture and the network that reads it.
 
-    `texture_noise`, `input_noise`: standard deviation of Gaussian noise on texels, and on the network's input. `grid`:
-    byte grid that rounds weights and activations while it is active, or None.
+    `texture_noise`, `input_noise`: standard deviations of the Gaussian noise on texels and on the network's input.
+    `grid`: byte grid that rounds weights and activations while it is active, or None.
     """
 
-    #: With "bfloat16" the network is computed in that format where it is safe; weights, texture and loss stay float32.
+    #: With "bfloat16", PyTorch's autocast computes the network in that format; weights, texture and loss stay float32.
     precision: Precision = "float32"
 
     def __init__(self, texture: NeuralTexture, network: UNet) -> None:
@@ -57,7 +57,7 @@ class TrainableAvatar(nn.Module):
         self.grid: ByteGrid | None = None
 
     def forward(self, uv: Tensor, covered: Tensor) -> Tensor:
-        """Turn `uv` (N,H,W,2) in 0..1 and `covered` (N,H,W) bool into pictures (N,4,H,W) in 0..1."""
+        """Return pictures (N,4,H,W) in 0..1 for `uv` (N,H,W,2) in 0..1 and `covered` (N,H,W) bool."""
         levels = [self._noisy(level, self.texture_noise) for level in self.texture.levels()]
         x = read_levels(levels, uv, covered)
         x = self._noisy(x, self.input_noise)
@@ -75,7 +75,10 @@ class TrainableAvatar(nn.Module):
 def load_batch(
     group: ShapeGroup, index: NDArray[np.int64], device: torch.device | str = "cpu"
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Read the samples `index` (N,): `uv` (N,H,W,2) in 0..1, `covered` (N,H,W) bool, target (N,4,H,W) in 0..1."""
+    """Return the samples `index` (N,) of `group`, on `device`, as uv, covered and target.
+
+    They are (N,H,W,2) in 0..1, (N,H,W) bool, and (N,4,H,W) in 0..1.
+    """
     uv = torch.from_numpy(group.uv[index].astype(np.float32) / U16)
     covered = torch.from_numpy(group.covered[index] > 0)
     target = torch.from_numpy(group.rgba[index].astype(np.float32) / 255).permute(0, 3, 1, 2)
@@ -84,20 +87,22 @@ def load_batch(
 
 # The neural texture: one image of C channels, stored as the sum of several scales.
 #
-# Rule: a coarse scale holds what neighbouring texels have in common, a finer one only the difference to it.
+# Rule: a coarse scale holds the common part of neighbouring texels; finer scales hold only differences from it.
 
 SIDES = (512, 256, 128, 64, 32)
 LIMIT = 1.0
 
 
 class NeuralTexture(nn.Module):
-    """A Laplacian pyramid that sums to `start` (S,S,C) before training; S is the greatest of `sides`.
+    """A texture that is the sum of the scales of a Laplacian pyramid.
 
-    Each scale starts as `start`, shrunk to its side, minus the next coarser image, enlarged. The sum is clipped to
-    -1..1, because the network's input has one byte range for all channels.
+    Each scale starts as `start` shrunk to the scale's side, minus the next coarser scale's image enlarged. The sum is
+    clipped to -1..1, because the network's input has one byte range for all channels.
 
-    `mip_levels`: number of smaller images, each of half the side, that start as `start`, shrunk, and are learnt
-    separately.
+    `start`: texture (S,S,C) before training; S is the largest of `sides`.
+    `sides`: sides of the scales, in texels.
+    `mip_levels`: number of smaller levels. Each has half the side of the level before, starts as `start` shrunk, and is
+    learnt separately.
     """
 
     def __init__(self, start: F32, sides: tuple[int, ...] = SIDES, mip_levels: int = 0) -> None:
@@ -132,9 +137,11 @@ def _enlarged(scale: Tensor, side: int) -> Tensor:
 
 
 def read_texture(image: Tensor, uv: Tensor, covered: Tensor) -> Tensor:
-    """Read the texture bilinearly at `uv`: the network's input (N, C, H, W), channels last in memory.
+    """Return the network's input (N, C, H, W): the texture `image` sampled bilinearly at `uv`.
 
-    `image` (1, C, S, S), `uv` (N, H, W, 2) in 0..1, `covered` (N, H, W) bool. Pixels that are not covered are 0.
+    It is channels-last in memory. Pixels that are not covered are 0.
+
+    `image`: (1, C, S, S). `uv`: (N, H, W, 2) in 0..1. `covered`: (N, H, W) bool.
     """
     n, h, w = covered.shape
     points = uv[covered] * 2 - 1
@@ -146,22 +153,22 @@ def read_texture(image: Tensor, uv: Tensor, covered: Tensor) -> Tensor:
     return filled.permute(0, 3, 1, 2)
 
 
-# Reads a texture with smaller levels as a GPU does: the more texels a pixel spans, the smaller the level.
+# Samples a texture with smaller levels as a GPU does: the more texels a pixel spans, the smaller the level.
 #
 # Rule: this is OpenGL's trilinear filter (specification 4.6, section 8.14). The level is the binary logarithm of the
-# most texels between one pixel and the next; the two levels next to it are mixed.
+# larger distance, in texels, to the next pixel along x or y. The two nearest levels are blended.
 #
-# A GPU knows a triangle's own derivatives. Here the smaller of the differences to the two neighbours stands for them,
-# so that a seam, where u and v jump, does not count.
+# A GPU has the derivatives within a triangle. Here, the smaller of the differences to the two neighbours along an axis
+# replaces the derivative, because u and v jump across a seam.
 
-#: Lower bound of the texels between pixels, below which the level is 0 anyway.
+#: Lower bound of the distance in texels, so that the logarithm is finite. The level is 0 there anyway.
 LEAST = 1e-3
 
 
 def read_levels(levels: Sequence[Tensor], uv: Tensor, covered: Tensor) -> Tensor:
-    """Return the network's input (N, C, H, W), read from several levels; `read_texture` reads a single one.
+    """Return the network's input (N, C, H, W): the texture with smaller levels, sampled at `uv`.
 
-    `levels`: (1, C, S, S), (1, C, S/2, S/2), ...; `uv` (N, H, W, 2) in 0..1; `covered` (N, H, W) bool.
+    `levels`: (1, C, S, S), (1, C, S/2, S/2), ...; at least one. `uv`: (N, H, W, 2) in 0..1. `covered`: (N, H, W) bool.
     """
     if len(levels) == 1:
         return read_texture(levels[0], uv, covered)
@@ -181,13 +188,19 @@ def levels_of(bundle: Bundle) -> list[Tensor]:
 
 
 def level_of_detail(uv: Tensor, covered: Tensor, side: int) -> Tensor:
-    """Return the level (N, H, W): 0 where the next pixel is at most a texel of `side` away, 1 where two, and so on."""
+    """Return the level (N, H, W): 0 if the next pixel is at most one texel away, 1 if it is two texels away, and so on.
+
+    `side`: side of the texture in texels.
+    """
     texels = torch.maximum(_least_step(uv, covered, 1), _least_step(uv, covered, 2)) * side
     return torch.log2(texels.clamp(min=LEAST)).clamp(min=0)
 
 
 def _least_step(uv: Tensor, covered: Tensor, axis: int) -> Tensor:
-    """Return the distance (N, H, W) of `uv` to the nearer neighbour on the body along `axis`; 0 where there is none."""
+    """Return the UV distance (N, H, W) to the nearer of the two neighbours along `axis`; 0 without a neighbour.
+
+    Only neighbours on the body count.
+    """
     size = covered.shape[axis] - 1
     ends = (uv.narrow(axis, 0, size), uv.narrow(axis, 1, size))
     both = covered.narrow(axis, 0, size) & covered.narrow(axis, 1, size)
@@ -200,13 +213,13 @@ def _least_step(uv: Tensor, covered: Tensor, axis: int) -> Tensor:
 
 # Weights of a network as an .npz file.
 #
-# Rule: a file is complete or not there; a network loads weights only from a file that has every one of them.
+# Rule: a file is complete or absent. A network loads weights only from a file that has all of its weights.
 
 SAVED_WEIGHTS = "weights that this network's training saved"
 
 
 def load_network(network: UNet, path: Path) -> UNet:
-    """Load into `network` a file that `save_network` wrote. Raises BadInputError."""
+    """Load the weights in a file of `save_network` into `network`, and return `network`. Raises BadInputError."""
     weights = _read_weights(path)
     prefix = "network."
     _fill(network, {k.removeprefix(prefix): v.float() for k, v in weights.items() if k.startswith(prefix)}, path)
@@ -220,7 +233,7 @@ def float_network_of(bundle: Bundle, weights: Path) -> UNet:
 
 
 def save_network(avatar: TrainableAvatar, path: Path) -> None:
-    """Write the network alone in half precision: a small file, precise enough to continue training from.
+    """Write the network's weights to `path` in half precision, which suffices to continue training.
 
     Raises BadInputError when `path` cannot be written.
     """
@@ -239,7 +252,10 @@ def _read_weights(path: Path) -> dict[str, Tensor]:
 
 
 def _fill(module: nn.Module, weights: dict[str, Tensor], path: Path) -> None:
-    """Load `weights` into `module`. Every weight must be there; only the counters of batches may be missing."""
+    """Load `weights` into `module`. Only `num_batches_tracked` may be missing.
+
+    Raises BadInputError about `path` for other weights than those of `module`.
+    """
     try:
         missing, unexpected = module.load_state_dict(weights, strict=False)
     except RuntimeError as error:
@@ -249,21 +265,21 @@ def _fill(module: nn.Module, weights: dict[str, Tensor], path: Path) -> None:
         raise BadInputError(path, f"no {missing[0]}" if missing else f"also {unexpected[0]}", SAVED_WEIGHTS)
 
 
-# Recovers the float network that an avatar's integers stand for, to train further where only the avatar was kept.
+# Recovers a float network from an avatar's integer network, to continue training if only the avatar was kept.
 #
-# Rule: it computes what the integer network computes, except for the rounding of activations. Batch norms, which were
-# folded into the convolutions before them, are restored with the statistics of training samples.
+# Rule: the float network computes what the integer network computes, except that activations are not rounded. Batch
+# norms, which were folded into the convolutions before them, are restored with the statistics of training samples.
 
-#: Names of the heads' two convolutions, which are exported side by side: colour first, then the mask.
+#: Names of the two exported convolutions that each join a convolution of both heads: colour channels first, then mask.
 FIRST, SECOND, COLOURS = "first", "second", 3
-#: Size and number of the batches that norms are measured on.
+#: Size and number of the batches on which the norms' statistics are measured.
 BATCH, BATCHES = 8, 8
 
 
 def network_of(bundle: Bundle, groups: list[ShapeGroup], seed: int) -> UNet:
     """Return the float network of `bundle`. Raises BadInputError.
 
-    `groups`: samples that norms are measured on. `seed`: seed of their choice.
+    `groups`: samples for the norms' statistics. `seed`: seed of the choice of batches.
     """
     entry = bundle.manifest.network
     network = UNet(entry.encoder, "batch", entry.width, entry.channels, input_skip=True)
@@ -287,7 +303,7 @@ def network_of(bundle: Bundle, groups: list[ShapeGroup], seed: int) -> UNet:
 
 
 def _inputs(bundle: Bundle, groups: list[ShapeGroup], seed: int) -> Iterator[Tensor]:
-    """Yield the inputs of the network of `bundle` for some samples, (N,C,H,W)."""
+    """Yield `BATCHES` inputs (N,C,H,W) of the network of `bundle`, for random samples of `groups`."""
     texture = torch.from_numpy(bundle.read_texture()).permute(2, 0, 1)[None]
     for group, index in islice(batches(groups, BATCH, np.random.default_rng(seed)), BATCHES):
         uv, covered, _ = load_batch(group, index)
@@ -295,7 +311,7 @@ def _inputs(bundle: Bundle, groups: list[ShapeGroup], seed: int) -> Iterator[Ten
 
 
 def _constants(model: onnx.ModelProto) -> Iterator[tuple[str, tuple[F32, F32]]]:
-    """Yield name, kernel and bias of each convolution of `model`, named as the modules of a `UNet`."""
+    """Yield (name, (kernel, bias)) of each convolution of the integer `model`, with the module names of a `UNet`."""
     stored = {name: numpy_helper.to_array(tensor) for name, tensor in constants_of(model).items()}
     made_by = {node.output[0]: node for node in model.graph.node if node.op_type == "DequantizeLinear"}
 
@@ -320,7 +336,10 @@ def _constants(model: onnx.ModelProto) -> Iterator[tuple[str, tuple[F32, F32]]]:
 
 
 def _measure_norms(network: UNet, inputs: Iterable[Tensor]) -> None:
-    """Give the norms of `network` the statistics of `inputs`, in place; before, they only add their biases."""
+    """Give the norms of `network`, in place, the statistics of `inputs`, without changing the network's output.
+
+    On entry, the norms only add their biases.
+    """
     norms = [norm for _, _, norm in convolutions(network) if norm is not None]
     sums: dict[nn.Module, list[Tensor]] = {norm: [] for norm in norms}
 
@@ -343,13 +362,16 @@ def _measure_norms(network: UNet, inputs: Iterable[Tensor]) -> None:
             norm.bias.add_(mean)
 
 
-# Paints samples with the float network, to compare the integer network with.
+# Paints samples with the float network, for comparison with the integer network.
 #
-# Rule: the texture is read at the UV image bilinearly, as in training.
+# Rule: the texture is sampled as in training.
 
 
 def float_painter(network: UNet, *levels: torch.Tensor) -> Painter:
-    """Return a painter that runs `network` on the texture of `levels` (1,C,S,S), (1,C,S/2,S/2), ..., where they are."""
+    """Return a painter that runs `network` on the texture `levels`: (1,C,S,S), (1,C,S/2,S/2), ...
+
+    The painter computes on the device of `levels`.
+    """
     network.eval()
 
     def paint(_: Sample, uv: NDArray[np.float32]) -> U8:
@@ -363,36 +385,37 @@ def float_painter(network: UNet, *levels: torch.Tensor) -> Painter:
 
 
 def float_painter_of(bundle: Bundle, weights: Path) -> Painter:
-    """Return a painter that runs the network of a file of `save_network` on the texture of `bundle`.
+    """Return a painter that runs the float network of `bundle` on the texture of `bundle`. Raises BadInputError.
 
-    Raises BadInputError.
+    `weights`: file of `save_network`.
     """
     return float_painter(float_network_of(bundle, weights), *levels_of(bundle))
 
 
-# Training with the bundle's rounding: weights and activations of a network lie on the grid of its bytes.
+# Quantisation-aware training: weights and activations of a network are rounded to the steps of its bytes.
 #
-# Rule: the grid is the quantiser's own, measured once, when the rounding begins. Gradients pass a rounding unchanged
-# and stop where a value is clipped (Bengio et al., Estimating or propagating gradients, 2013). The final export
-# measures the ranges again.
+# Rule: the byte ranges are the quantiser's, measured once, when the rounding begins. Gradients pass a rounding
+# unchanged and stop where a value is clipped (Bengio et al., Estimating or propagating gradients, 2013). The final
+# export measures the ranges again.
 #
-# The export folds each batch norm into the convolution before it. A weight is therefore rounded in its folded form,
-# times the scale of its norm, whose statistics must not change. Biases are not rounded: their steps are far finer.
+# The export folds each batch norm into the convolution before it. A weight is therefore rounded after multiplication by
+# the scale of its norm, whose statistics must not change. Biases are not rounded: their steps are far finer.
 
-#: Largest integer weight, and the largest integer of an activation.
+#: Largest integer of a weight, and of an activation.
 TOP, BYTE = WEIGHT_TOP[True], 255
-#: Modules of the two heads, by the tensor that stands for both: the export joins the heads.
+#: Modules of the two heads, by the exported tensor that has the outputs of both: the export joins the heads.
 HEADS = {"/Relu_output_0": ("colour.2", "mask.2"), "/second/Conv_output_0": ("colour.3", "mask.3")}
-#: Levels of the decoder, by the joined tensor that each reads, which is clipped once more.
+#: Levels of the decoder, by the concatenated tensor that each reads. This tensor has a byte range of its own.
 JOINED = {f"/Concat{f'_{level}' if level else ''}_output_0": f"levels.{level}" for level in range(len(DECODER))}
 NAMED = {INPUT: (INPUT,), **HEADS, **{tensor: (level,) for tensor, level in JOINED.items()}}
 
 
 class ByteGrid:
-    """The byte grid of `network`; rounding begins when `active` is set.
+    """Rounds the activations of `network` to bytes while `active` is set, and computes rounded weights.
 
-    `ends` (K,2): the real values of bytes 0 and 255 at each place that stores bytes; all 0 until measured.
-    `alike` (1,): whether weights are even multiples of powers of two.
+    `places`: names of the K places that store bytes, see `_places`.
+    `ends`: (K,2), the real values of bytes 0 and 255 at each place; all 0 until measured.
+    `alike`: (1,), 1 if weights are even multiples of powers of two.
     """
 
     def __init__(self, network: UNet) -> None:
@@ -412,13 +435,13 @@ class ByteGrid:
         return bool(self.ends.any())
 
     def measure(self, ranges: ByteRanges) -> None:
-        """Take the grid from `ranges`, which the network's export used."""
+        """Set the grid from `ranges`, the byte ranges of the network's export."""
         by_place = {place: ends for name, ends in ranges.ends.items() for place in _modules_of(name)}
         self.ends.copy_(torch.tensor([by_place[place] for place in self.places]))
         self.alike.fill_(ranges.alike)
 
     def painted(self, network: UNet, x: Tensor) -> Tensor:
-        """Return the output of `network` for `x`, with rounded weights; hooks round the activations."""
+        """Return the output of `network` for the input `x` (N,C,H,W), with rounded weights and activations."""
         output: Tensor = functional_call(network, self.weights(network), (x,))
         return output
 
@@ -440,9 +463,10 @@ class ByteGrid:
 
 
 def rounded_weights(folded: Tensor, alike: bool) -> Tensor:
-    """Round `folded` (O,I,h,w) as the bundle does: to whole multiples of one scale for each output channel.
+    """Return weights `folded` (O,I,h,w) rounded as in the bundle: to whole multiples of a scale per output channel.
 
-    Where runtimes round `alike`, the scale is a power of two and the multiples are even.
+    `folded`: weights times the scale of their batch norm. `alike`: whether the scales are powers of two and the
+    multiples even.
     """
     largest = folded.abs().amax(dim=(1, 2, 3), keepdim=True).clamp(min=1e-30)
     unit = 2 * torch.exp2(torch.ceil(torch.log2(largest / (TOP + 0.99)))) if alike else largest / TOP
@@ -450,7 +474,7 @@ def rounded_weights(folded: Tensor, alike: bool) -> Tensor:
 
 
 def _rounded_weight(weight: Tensor, scale: Tensor, alike: bool) -> Tensor:
-    """Round `weight` (O,I,h,w) so that its product with the norm's `scale` (O,), its folded form, is on the grid."""
+    """Return `weight` (O,I,h,w) changed so that its product with the norm's `scale` (O,) is rounded."""
     with torch.no_grad():
         by_channel = scale[:, None, None, None]
         change = rounded_weights(weight * by_channel, alike) / by_channel - weight
@@ -465,7 +489,7 @@ def _folded_scale(conv: nn.Conv2d, norm: nn.BatchNorm2d | None) -> Tensor:
 
 
 def convolutions(network: UNet) -> Iterator[tuple[str, nn.Conv2d, nn.BatchNorm2d | None]]:
-    """Yield each convolution with its name and the norm behind it, which always is the next module."""
+    """Yield (name, convolution, batch norm behind it or None) of each convolution of `network`."""
     named = list(network.named_modules())
     for (name, module), (_, after) in zip(named, [*named[1:], ("", None)], strict=True):
         if isinstance(module, nn.Conv2d):
@@ -473,9 +497,10 @@ def convolutions(network: UNet) -> Iterator[tuple[str, nn.Conv2d, nn.BatchNorm2d
 
 
 def _places(network: UNet) -> Iterator[str]:
-    """Yield the places that store bytes.
+    """Yield the names of the places that store bytes.
 
-    These are the input, joined tensors, rectified outputs, other norms' outputs and the heads' ends.
+    These are the input, inputs of the decoder's levels, outputs of ReLUs, outputs of norms without ReLU, and outputs of
+    the heads.
     """
     yield INPUT
     yield from list(JOINED.values())[: len(DECODER) - (not network.input_skip)]
@@ -489,7 +514,7 @@ def _places(network: UNet) -> Iterator[str]:
 
 
 def _modules_of(tensor: str) -> tuple[str, ...]:
-    """Return the places that store the exported `tensor`, by the exporter's names: `/a/b.0/b.0.1/Conv_output_0`."""
+    """Return the places that store the exported `tensor`, named by the exporter as `/a/b.0/b.0.1/Conv_output_0`."""
     if tensor in NAMED:
         return NAMED[tensor]
     name, operator = module_of(tensor), tensor.rpartition("/")[2]
@@ -500,7 +525,7 @@ def _modules_of(tensor: str) -> tuple[str, ...]:
 
 
 def module_of(exported: str) -> str:
-    """Return the module of an `exported` operator or tensor: `a.b.0.1` for `/a/b.0/b.0.1/Conv`."""
+    """Return the name of the module of an `exported` operator or tensor: `a.b.0.1` for `/a/b.0/b.0.1/Conv`."""
     path: list[str] = []
     for scope in exported.strip("/").split("/")[:-1]:
         if path and scope.startswith(f"{path[-1]}."):

@@ -1,6 +1,7 @@
 """Validates an avatar: evaluates the files of its bundle on held-out samples and writes the result into its manifest.
 
-Rule: bundle, seeds, motions, size and runtimes alone decide the figures; the digests are of the files that were read.
+Rule: the figures depend only on bundle, seeds, motions, size and runtimes. The digests are those of the files that were
+read.
 """
 
 from __future__ import annotations
@@ -43,10 +44,10 @@ from trilane.training.sample_renderer import BAND_NAMES, Sample, SampleRenderer
 
 # Evaluates an avatar on held-out samples: compares every painter's picture of a sample with the ground truth.
 #
-# Rule: the integer network is evaluated as it runs in the pipeline: it reads bytes of the packed pass, through a
-# runtime.
+# Rule: the integer network is evaluated as it runs in the pipeline: a runtime runs it on the bytes of the packed pass,
+# the GPU stage that draws the network's input.
 
-#: A function that paints the picture (h,w,4) of a sample, given the sample and its UV image (h,w,3).
+#: A function that returns the picture (h,w,4) uint8 of a sample, given the sample and its UV image (h,w,3).
 Painter = Callable[[Any, NDArray[np.float32]], U8]
 
 
@@ -57,15 +58,15 @@ class PackedRenderer(Protocol):
     mesh: SkinnedMesh
 
     def placed(self, sample: Any) -> tuple[F64, Placement]:
-        """Return the camera (4,4) of `sample`, and its body's pose, crop and place in the tensor."""
+        """Return the view matrix (4,4) of `sample`, and its body's pose, crop and place in the tensor."""
 
 
 @dataclass(frozen=True)
 class Evaluated:
-    """The result for one sample.
+    """The evaluation of one sample.
 
-    `number`: number of the sample among those that were given. `band`: name of its band. `truth`: ground truth (h,w,4).
-    `pictures`, `errors`: picture and error of each painter, by its name.
+    `number`: index of the sample in its list. `band`: name of the sample's band. `truth`: ground truth (h,w,4).
+    `pictures`, `errors`: picture and error of each painter, by the painter's name.
     """
 
     number: int
@@ -78,7 +79,7 @@ class Evaluated:
 def evaluate(
     renderer: SampleRenderer, samples: Iterable[Sample], painters: Mapping[str, Painter]
 ) -> Iterator[Evaluated]:
-    """Yield pictures and errors of `samples` by each of `painters`; samples that show no person are left out."""
+    """Yield the evaluation of each of `samples` by all `painters`; samples that show no person are left out."""
     for number, sample in enumerate(samples):
         uv, truth = renderer.render(sample)
         pictures = {name: paint(sample, uv) for name, paint in painters.items()}
@@ -91,10 +92,10 @@ def evaluate(
 def integer_painter(renderer: PackedRenderer, bundle: Bundle, runtime: str, threads: int) -> Painter:
     """Return a painter that runs the GPU unit's packed pass, then the integer network of `bundle` on `runtime`.
 
-    `renderer`: the body and its OpenGL context.
-    `bundle`: bundle whose texture and network are read.
+    `renderer`: renderer of the samples.
+    `bundle`: bundle with the texture and the network.
     `runtime`: name of the runtime.
-    `threads`: threads of the runtime.
+    `threads`: number of the runtime's threads.
     Raises BadInputError, MissingPartError.
     """
     network, texture, runs = bundle.read_network(), bundle.read_texture(), load_runtime(runtime)
@@ -120,12 +121,12 @@ def integer_painter(renderer: PackedRenderer, bundle: Bundle, runtime: str, thre
 
 
 BUILTIN_HELD_OUT = "builtin:walk-wave-turn"
-#: Seeds of a validation. There are several, because the worst of 96 samples differs by several dB from seed to seed.
+#: Seeds of a validation. The worst of the 96 samples of a seed differs by several dB from seed to seed, hence several.
 SEEDS = (1, 2, 3, 4, 5, 6, 7, 8)
 PER_BAND = 24
 #: Name of the float network's painter; the other painters have the names of runtimes.
 FLOAT = "float"
-#: A function that is called with the seed's number and each sample after its evaluation.
+#: A function that is called with the seed and the evaluation of each sample.
 Look = Callable[[int, Evaluated], None]
 
 
@@ -133,10 +134,10 @@ Look = Callable[[int, Evaluated], None]
 class ValidationPlan:
     """The plan of an avatar's evaluation.
 
-    `held_out`: motions that poses come from, `builtin:NAME` or files. `seeds`: seeds of the samples. `per_band`:
-    samples of each band for each seed. `runtimes`: names of runtimes; the first one's figures are the avatar's, the
-    others stand beside them. `size`: tensor size. `threads`: threads of a software OpenGL driver and of each runtime.
-    `revision`, `modified`: state of Trilane's checkout, where known.
+    `held_out`: motions that the poses are taken from, `builtin:NAME` or files. `seeds`: seeds of the samples.
+    `per_band`: number of samples for each band and seed. `runtimes`: names of runtimes; the figures of the first one
+    are those of the avatar. `size`: tensor size, as `shape_buckets` takes it. `threads`: number of threads of a
+    software OpenGL driver and of each runtime. `revision`, `modified`: as in `MadeWith`.
     """
 
     held_out: tuple[str, ...] = (BUILTIN_HELD_OUT,)
@@ -153,7 +154,7 @@ class ValidationPlan:
 class FloatNetwork:
     """The network before it was quantised.
 
-    `name`: its name in the manifest. `paint`: its painter.
+    `name`: name of the network in the manifest. `paint`: painter that runs the network.
     """
 
     name: str
@@ -161,12 +162,15 @@ class FloatNetwork:
 
 
 def held_out_motions(names: Iterable[str]) -> list[Motion]:
-    """Return the motions `names`. Raises BadInputError."""
+    """Return the motions `names`, each `builtin:NAME` or a file. Raises BadInputError."""
     return [load_motion(AvatarSpec(motion=name), Path.cwd()) for name in names]
 
 
 def open_renderer(bundle: Bundle, threads: int) -> SampleRenderer:
-    """Open the renderer of samples of `bundle`'s body. Raises BadInputError, MissingPartError."""
+    """Return a new renderer of samples of the clothed body of `bundle`. Raises BadInputError, MissingPartError.
+
+    `threads`: number of threads of a software OpenGL driver.
+    """
     return SampleRenderer(bundle.shaped_body(), threads, look=look_of(bundle.manifest.provenance))
 
 
@@ -179,11 +183,9 @@ def validate(
 ) -> Validation:
     """Evaluate `bundle` and return its validation.
 
-    `bundle`: bundle whose files are read.
-    `plan`: samples and runtimes.
     `renderer`: renderer from `open_renderer`.
     `float_network`: float network to evaluate too, or None.
-    `look`: called with every sample; painters have the names of runtimes and `FLOAT`.
+    `look`: called with the seed and the evaluation of every sample. Painters have the names of runtimes and `FLOAT`.
     Raises BadInputError, MissingPartError.
     """
     digests = digests_of(bundle.folder, bundle.manifest)
@@ -214,7 +216,7 @@ def validate(
 
 
 def revalidate(bundle: Bundle, validation: Validation) -> Bundle:
-    """Write `validation` into the manifest of `bundle` and return the bundle with it. Raises BadInputError."""
+    """Write `validation` into the manifest of `bundle`, and return the changed bundle. Raises BadInputError."""
     manifest = bundle.manifest.model_copy(update={"validation": validation})
     write_manifest(bundle.folder, manifest)
     return Bundle(bundle.folder, manifest)
@@ -231,7 +233,10 @@ def _made_with(plan: ValidationPlan, renderer: SampleRenderer) -> MadeWith:
 
 
 def _arranged(figures: Mapping[str, dict[str, Any]], runtimes: tuple[str, ...], float_network: str) -> dict[str, Any]:
-    """Arrange the `figures` of each painter under the keys of a validation."""
+    """Return the figures of the painters under the keys of `Validation`.
+
+    `figures`: summary of each painter's errors, by the painter's name. `float_network`: name of the float network.
+    """
     first, *others = runtimes
     own = figures[first]
     arranged: dict[str, Any] = {
@@ -250,22 +255,22 @@ def _arranged(figures: Mapping[str, dict[str, Any]], runtimes: tuple[str, ...], 
 
 
 def _origin(motion: str) -> str:
-    """Return where a motion comes from: `built in`, or the digest of its file."""
+    """Return the origin of a motion: `built in`, or `sha256` and the digest of its file."""
     return "built in" if motion.startswith("builtin:") else f"sha256 {sha256_of([Path(motion)])}"
 
 
-# The cost of smaller tensors to an avatar's quality: the same views, painted at several sizes of tensor.
+# The loss of quality by smaller tensors: the same views, painted at several tensor sizes.
 #
-# Rule: a smaller picture is enlarged to the size of the largest one as the composite does it: bilinearly, in linear
-# light, with colours multiplied by alpha. All are then compared with the same ground truth.
+# Rule: a smaller picture is enlarged to the size of the largest one as the composite stage does: bilinearly, in linear
+# light, with premultiplied alpha. All pictures are then compared with the same ground truth.
 
 DIGITS = 2
 
 
 def sizes_of(own: Shape) -> list[Shape]:
-    """Return the sizes of a network's own tensor and of the planner's smaller ones, once each, the largest first.
+    """Return the tensor shapes at which the planner may run a network, largest first, each once.
 
-    Sides are whole steps.
+    `own`: (height, width) of the network's own tensor, which is the first result. Sides are multiples of `BUCKET_STEP`.
     """
     return list(dict.fromkeys((_stepped(own[0] * side), _stepped(own[1] * side)) for side in SIDES))
 
@@ -277,11 +282,11 @@ def _stepped(side: float) -> int:
 def measure_sizes(
     bundle: Bundle, plan: ValidationPlan, renderer: SampleRenderer, look: Callable[[], None] = lambda: None
 ) -> BySize:
-    """Measure the figures of `bundle` by size of tensor.
+    """Measure the image error of `bundle` by tensor size.
 
-    `plan`: plan of the validation; views of its first seed are painted on its first runtime.
+    `plan`: plan of the validation. The views are those of its first seed, painted on its first runtime.
     `renderer`: renderer from `open_renderer`.
-    `look`: called for every view.
+    `look`: called after every view.
     Raises BadInputError, MissingPartError.
     """
     own, *smaller = sizes_of(bundle.read_network().shape[1:3])
@@ -309,12 +314,12 @@ def measure_sizes(
 
 
 def with_sizes(validation: Validation, by_size: BySize) -> Validation:
-    """Return `validation` with the figures `by_size`, measured now, added."""
+    """Return `validation` with the newly measured figures `by_size`, and a new digest."""
     return with_figures_digest(validation.model_copy(update={"by_size": by_size}))
 
 
 def enlarged(picture: U8, shape: Shape) -> U8:
-    """Enlarge `picture` (h,w,4), sRGB with straight alpha, to `shape` (height, width)."""
+    """Return `picture` (h,w,4) uint8, sRGB with straight alpha, enlarged to `shape` (height, width)."""
     alpha = picture[..., 3:] / 255.0
     planes = np.dstack([_linear(picture[..., :3] / 255.0) * alpha, alpha]).astype(np.float32)
     larger = np.dstack([_resized(planes[..., plane], shape) for plane in range(4)])
@@ -327,30 +332,33 @@ def _resized(plane: NDArray[np.float32], shape: Shape) -> NDArray[np.float32]:
 
 
 def _linear(encoded: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Decode sRGB to linear light (IEC 61966-2-1)."""
+    """Return sRGB values `encoded` in 0..1 as linear light in 0..1 (IEC 61966-2-1)."""
     return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
 
 
 def _encoded(linear: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Encode linear light as sRGB (IEC 61966-2-1)."""
+    """Return `linear` light in 0..1 as sRGB values in 0..1 (IEC 61966-2-1)."""
     return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
 
-# Sheets that compare pictures: the ground truth and what each painter made of it, side by side.
+# Sheets that compare pictures: the ground truth and each painter's picture, side by side.
 #
-# Rule: all pictures stand before the same scenery, which shows through a transparent person, and none is enlarged.
+# Rule: all pictures are in front of the same scenery, which shows through a transparent person. No picture is enlarged.
 
 SHEET_CELL = (256, 192)
 
 
 def worst_sheet(samples: Sequence[Evaluated], painters: Sequence[str]) -> NDArray[np.uint8]:
-    """Return an image (height, width, 3) uint8 with a row for each of `samples`."""
+    """Return an image (height, width, 3) uint8 with a row for each of `samples`: truth, then picture of each painter.
+
+    `painters`: names of the painters.
+    """
     rows = [(sample.truth, *(sample.pictures[name] for name in painters)) for sample in samples]
     return np.vstack([side_by_side(row) for row in rows])
 
 
 def side_by_side(pictures: Iterable[NDArray[np.uint8]]) -> NDArray[np.uint8]:
-    """Put `pictures` (h,w,4) side by side, each in a cell: (height, width, 3) uint8."""
+    """Return an image (height, width, 3) uint8 of `pictures` (h,w,4), side by side in cells of `SHEET_CELL`."""
     return np.hstack([_cell(picture) for picture in pictures])
 
 

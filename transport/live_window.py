@@ -1,11 +1,11 @@
-"""A window into a run that goes on: the newest picture out, the camera's steering in. Rule: nobody waits for anybody.
+"""A window into a running run: the newest picture comes out, the camera's steering goes in. Rule: no process waits.
 
-The window is one region of memory without a name (memfd), which every process maps. A viewer notes when it looks; the
-presenting stage copies a picture in only while somebody has looked lately. Two buffers take turns: a reader that finds
-its buffer's number changed under it reads the other.
+The window is one region of memory without a name (memfd), which every process maps. A viewer writes down the time of
+each look; the presenting stage copies a picture in only if the last look was a short time ago. There are two buffers,
+written in turns, each with a number. If the number changes while a reader copies the buffer, the reader tries again.
 
-Each number has 8 bytes at an address that is a multiple of 8, so it is read and written in one piece. A processor that
-reorders writes may show a torn picture, but cannot disturb the run.
+Each number has 8 bytes at an address that is a multiple of 8, so it is read and written in one piece. On a processor
+that reorders writes, a reader may get a torn picture, but the run is not disturbed.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from trilane.transport.packets import PAGE
 
-LOOKED_NS: Final = 500_000_000  # time after the last look from which nobody counts as looking
+LOOKED_NS: Final = 500_000_000  # a viewer counts as looking for this time after each look
 TRIES: Final = 3
 CLOSED: Final = -1
 
@@ -53,11 +53,12 @@ class Steering(NamedTuple):
 
 
 class ShownPicture(NamedTuple):
-    """A picture of `frame`.
+    """The picture of one frame.
 
+    `frame`: number of the frame.
     `media_s`: time of the scene in seconds.
-    `sampled_ns`: time at which it was sampled.
-    `pixels`: RGB picture (height, width, 3).
+    `sampled_ns`: time at which the frame's input was sampled, in ns of CLOCK_MONOTONIC.
+    `pixels`: RGB picture (height, width, 3) uint8.
     """
 
     frame: int
@@ -67,7 +68,7 @@ class ShownPicture(NamedTuple):
 
 
 def create_window(height: int, width: int) -> int:
-    """Return a descriptor of a new window for pictures of that size; raises OSError."""
+    """Return a descriptor of a new window for pictures of `height` x `width` pixels; raises OSError."""
     fd = os.memfd_create("trilane:window", os.MFD_CLOEXEC)
     try:
         os.posix_fallocate(fd, 0, PAGE + 2 * height * width * 3)
@@ -79,14 +80,14 @@ def create_window(height: int, width: int) -> int:
 
 
 def path_of(fd: int) -> Path:
-    """Return the path by which another process of this user opens the window, while this process has it open."""
+    """Return a path by which other processes of this user open the window, as long as this process has `fd` open."""
     return Path(f"/proc/{os.getpid()}/fd/{fd}")
 
 
 class LiveWindow:
     """The window behind the descriptor `fd`, which may be closed afterwards.
 
-    Raises ValueError when it is smaller than the pictures.
+    Raises ValueError when the region is too small for two pictures.
     """
 
     def __init__(self, fd: int, height: int, width: int) -> None:
@@ -106,10 +107,10 @@ class LiveWindow:
         finally:
             os.close(fd)
 
-    # for whoever looks
+    # for viewers
 
     def look(self) -> None:
-        """Ask for pictures for a while from now on."""
+        """Ask for pictures for the next `LOOKED_NS`."""
         self._head["looked_ns"] = time.monotonic_ns()
 
     def steer(self, steering: Steering) -> None:
@@ -118,7 +119,7 @@ class LiveWindow:
             self._head[name] = value
 
     def newest(self, had: int) -> ShownPicture | None:
-        """Return the newest picture; None without a picture, or when the newest one shows frame `had`."""
+        """Return the newest picture; None if there is none, if it shows frame `had`, or if it changes at each try."""
         for _ in range(TRIES):
             side = int(self._head["newest"][0]) & 1
             number = int(self._head["number"][0, side])
@@ -142,7 +143,7 @@ class LiveWindow:
         return Steering(*(float(self._head[name][0]) for name in Steering._fields))
 
     def show(self, frame: int, media_s: float, sampled_ns: int, pixels: NDArray[np.uint8]) -> None:
-        """Make `pixels` (height, width, 3) the newest picture."""
+        """Make `pixels` (height, width, 3) uint8 the newest picture."""
         side = 1 - (int(self._head["newest"][0]) & 1)
         number = int(self._head["number"][0, 1 - side])
         # Marked first: a reader that still copies this buffer then finds its number changed.

@@ -1,14 +1,14 @@
 """The messages between the scheduler and its units, and a unit's link: the job pipe and the heartbeat socket together.
 
-There is a fixed list of messages with typed fields; anything else is refused. The first byte of a message says which
-message it is. Its integer fields follow with 64 bits each. At the end comes the field of another type, packed with
-msgpack, or nothing when that field is empty. Integers are not packed with msgpack, because reading them would then take
-twice the time in a process that has just been woken. Nothing is ever pickled.
+There is a fixed list of messages with typed fields; anything else is refused. The first byte of a message tells its
+kind. The integer fields follow, with 64 bits each. A field of another type comes last, packed with msgpack; an empty
+field takes no bytes. Integers are not packed with msgpack, because reading them would then take twice the time in a
+process that has just been woken. Nothing is ever pickled.
 
-Jobs and their answers must keep their order, so they go over the job pipe. It is two pipes, one each way, in packet
-mode (O_DIRECT of pipe(2)), in which every read returns one whole message. One message wakes one process, with no thread
-between. Heartbeats have a way of their own, so that neither delays the other. Neither end ever waits for the other: a
-heartbeat that the other end does not read is dropped.
+Jobs and their answers must keep their order, so they go over the job pipe. The job pipe is two pipes, one each way, in
+packet mode (O_DIRECT of pipe(2)): every read returns one whole message. A message wakes the other process directly,
+without a thread between. Heartbeats go over a socket of their own, so that jobs and heartbeats do not delay each other.
+Neither end ever waits for the other: a heartbeat that the other end does not read is dropped.
 
 The folder of a unit's ZeroMQ socket is private. It exists only until the unit has connected, because a connection does
 not need the name of its socket. A parent that is killed before that leaves its folder behind. The next run finds that
@@ -48,10 +48,11 @@ class RunJob(NamedTuple):
     `id`: number of the job; its answer, `Done` or `Failed`, carries the same number.
     `stage`: place in the unit's list of stages, from 0.
     `frame`: number of the frame.
-    `slot_in`, `slot_out`: slots of the stage's edges, -1 where it has no such edge. Where a bypass ends, the slots of
-    the bypassed edge follow the stage's own.
-    `epoch`: epoch of `slot_out`.
-    `t_dispatch_ns`: time since which the unit has the job, in ns of CLOCK_MONOTONIC.
+    `slot_in`, `slot_out`: slots of the stage's input edge and output edge; -1 if the stage has no such edge. If a
+    bypass ends at the stage, `slot_in` counts on: the slots of the bypassed edge follow those of the input edge. If the
+    stage has several inputs, `slot_in` packs a slot of each.
+    `epoch`: epoch of the edge of `slot_out`.
+    `t_dispatch_ns`: time from which the unit has the job, in ns of CLOCK_MONOTONIC.
     `fresh`: 1 when the stage must ignore what earlier frames left behind, else 0.
     `rung`: rung of the frame's work, 0 for all of it.
     """
@@ -82,15 +83,15 @@ class Ready(NamedTuple):
 
 
 class Done(NamedTuple):
-    """From a unit: the job `id` has ended; times in ns of CLOCK_MONOTONIC.
+    """From a unit: the job `id` has ended. Points in time are ns of CLOCK_MONOTONIC, durations are ns.
 
-    `t_sampled_ns`: time at which the chain's first stage sampled the frame's input; 0 for other stages.
-    `preempted_ns`: part of the job in which the unit had no core.
-    `asleep_ns`: part of the job in which nothing of the unit worked.
-    `preempted_before_ns`: time in which it had no core between the job before and this one.
+    `t_sampled_ns`: time at which the pipeline's first stage sampled the frame's input; 0 for other stages.
+    `preempted_ns`: duration of the job's parts in which the unit had no core.
+    `asleep_ns`: duration of the job's parts in which the unit slept and no device worked for it.
+    `preempted_before_ns`: duration without a core between the previous job and this job.
     `skips`: 1 when the frame takes the pipeline's bypass, else 0.
-    `cpu_ns`, `cpu_before_ns`: CPU time of all its threads in the job, and between the job before and this one.
-    `metrics`: numbers that the stage itself reports of the job, by name.
+    `cpu_ns`, `cpu_before_ns`: CPU time of all threads of the unit in this job, and between the previous job and it.
+    `metrics`: numbers that the stage itself reports about the job, by name.
     """
 
     id: int
@@ -132,17 +133,17 @@ Message = RunJob | Ping | Close | Ready | Done | Failed | PongMessage | Closed
 #: `Failed.id` of an error outside a job: while stages are built, and while they are closed.
 BUILDING, CLOSING = -1, -2
 
-#: A message's place here is its first byte.
+#: The first byte of a message is the index of its kind here.
 _KINDS: tuple[Any, ...] = (RunJob, Ping, Close, Ready, Done, Failed, PongMessage, Closed)
-_PACKER = msgpack.Packer()  # one for the process: making one costs more than packing
+_PACKER = msgpack.Packer()  # shared by all messages: making a packer costs more than packing
 
 
 class _Form(NamedTuple):
     """How a kind of message is written as bytes.
 
     `code`: first byte of the message.
-    `integers`: format of its integer fields.
-    `rest`: type of its last field if that is no integer.
+    `integers`: format of the integer fields.
+    `rest`: type of the last field if that is no integer; else None.
     """
 
     kind: Any
@@ -182,7 +183,7 @@ def pack(message: Message) -> bytes:
 def unpack(data: bytes | memoryview) -> Message:
     """Return the message whose bytes are `data`.
 
-    Raises MessageError for bytes that are no message or a field of a wrong type.
+    Raises MessageError for bytes that are no message, or that have a field of a wrong type.
     """
     if not data or data[0] >= len(_FORMS):
         raise MessageError(f"unknown message {bytes(data[:80])!r}")
@@ -215,7 +216,7 @@ PACKETS = 16  # messages that a pipe holds; each takes a page of the 64 KiB that
 
 
 class JobPipeEnd(NamedTuple):
-    """The file descriptors of one end. Child processes inherit them only when they are passed on explicitly."""
+    """The file descriptors of one end of a job pipe. Child processes inherit only descriptors that are passed on."""
 
     reads: int
     writes: int
@@ -270,7 +271,8 @@ class JobPipe:
             return
 
     def receive(self) -> Message | None:
-        """Return the next message; None when the other end is closed, or when none has come and this end does not wait.
+        """Return the next message; None when the other end is closed. An end that does not wait also returns None if
+        no message has come.
 
         Raises MessageError for bytes that are no message.
         """
@@ -297,11 +299,11 @@ class SocketFolder:
         base = tempfile.gettempdir()
         base = base if len(base) < MAX_PATH else "/tmp"  # noqa: S108 - mkdtemp below makes a private folder in it
         remove_abandoned(Path(base))
-        while not self._is_made(base):  # another process took it for abandoned before it was locked, and removes it
+        while not self._is_made(base):  # before it was locked, another process took it for abandoned and removes it
             os.close(self._lock)
 
     def _is_made(self, base: str) -> bool:
-        """Make a folder with a lock, and return whether both are still there once it is locked."""
+        """Make a folder and lock it. Return False if another process locks or removes the folder before."""
         self.path = Path(tempfile.mkdtemp(prefix=PREFIX, dir=base))
         self._lock = os.open(self.path / LOCK, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
         with contextlib.suppress(BlockingIOError):
@@ -326,7 +328,7 @@ class SocketFolder:
 
 
 def remove_abandoned(base: Path) -> None:
-    """Remove this user's socket folders in `base` whose owner has ended; their lock is free."""
+    """Remove those of this user's socket folders in `base` whose process has ended: their locks are free."""
     for folder in base.glob(f"{PREFIX}*"):
         with contextlib.suppress(OSError):
             if folder.is_symlink() or folder.stat().st_uid != os.getuid():
@@ -350,7 +352,10 @@ class HeartbeatSocket:
     """
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], linger_ms: int = 0) -> None:
-        """Make a socket of `context`, which tries for `linger_ms` ms after its closing to deliver what was sent."""
+        """Make a socket of `context`.
+
+        `linger_ms`: milliseconds after its closing in which the socket still tries to deliver sent heartbeats.
+        """
         self.socket: zmq.Socket[bytes] = context.socket(zmq.PAIR)
         self.socket.setsockopt(zmq.LINGER, linger_ms)
         self.socket.setsockopt(zmq.MAXMSGSIZE, MAX_BYTES)
@@ -378,7 +383,7 @@ class HeartbeatSocket:
     def heartbeats(self) -> list[Message]:
         """Return all heartbeats since the last call; raises MessageError for bytes that are no message."""
         messages = []
-        while self.socket.poll(0):  # until it is empty: before that, ZeroMQ's descriptor does not become readable again
+        while self.socket.poll(0):  # ZeroMQ's descriptor becomes readable again only after the socket was empty
             messages.append(unpack(self.socket.recv(zmq.DONTWAIT)))
         return messages
 
@@ -387,10 +392,11 @@ class HeartbeatSocket:
 
 
 def context_on_cores(cores: Sequence[int]) -> zmq.Context[zmq.Socket[bytes]]:
-    """Return a ZeroMQ context for a unit, whose I/O thread runs on `cores` and preempts other work there when it wakes.
+    """Return a ZeroMQ context for a unit. Its I/O thread runs on `cores` and preempts other work there when it wakes.
 
-    On the unit's own cores that thread would wait behind the unit's next job. Call this from the thread that makes the
-    first socket. The I/O thread inherits the short time slice set here, and the caller keeps it too.
+    `cores`: cores other than the unit's own, where the I/O thread would wait behind the unit's next job.
+    Call this from the thread that makes the first socket. The I/O thread inherits the short time slice set here, and
+    the caller keeps the short slice too.
     """
     context: zmq.Context[zmq.Socket[bytes]] = zmq.Context()
     for core in cores:
@@ -400,14 +406,14 @@ def context_on_cores(cores: Sequence[int]) -> zmq.Context[zmq.Socket[bytes]]:
 
 
 class Link(HeartbeatSocket):
-    """One end of a unit's connection: heartbeats and the `job_pipe`; messages of each arrive in order or not at all."""
+    """One end of a unit's connection: the heartbeat socket and the `job_pipe`. Each keeps the order of its messages."""
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], job_pipe: JobPipe, linger_ms: int = 0) -> None:
-        """Take over `job_pipe`; `context` and `linger_ms` are those of `HeartbeatSocket`."""
+        """Take over `job_pipe`, which `close` closes. `context`, `linger_ms`: as for `HeartbeatSocket`."""
         super().__init__(context, linger_ms)
         self.job_pipe = job_pipe
 
     def close(self) -> None:
-        """Close both; heartbeats that were sent are delivered within `linger_ms`."""
+        """Close the socket and the job pipe. Sent heartbeats are still delivered within `linger_ms`."""
         super().close()
         self.job_pipe.close()

@@ -1,12 +1,12 @@
 """Lays out the packets that pass between stages, and the shared memory that they live in.
 
 One slot holds one header, then the payload; stages get views of a slot, never copies. Every header begins with
-`FRAME_FIELDS`, which the unit's loop fills in; the other fields are the pipeline's own. Everything that a later stage
-needs to know about a frame travels in its packet; no stage asks another.
+`FRAME_FIELDS`, which the unit's loop fills in; the pipeline defines the other fields. Everything that a later stage
+needs to know about a frame travels in the frame's packet; no stage asks another.
 
 Each edge has one region of memory without a name (memfd), of a fixed size. The parent makes the regions and keeps their
-descriptors; its children inherit and map them. The kernel frees a region when the last process that has it ends,
-however it ends.
+descriptors; child processes inherit the descriptors and map the regions. The kernel frees a region when the last
+process that has the region ends, by a crash too.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ from trilane.arrays import U8
 from trilane.errors import TrilaneError, reason
 
 PAGE = 4096
-#: `frame`: number from 0. `t_sampled_ns`: time on CLOCK_MONOTONIC at which the frame's input was sampled, where latency
-#: begins. `epoch`: epoch of the slot (`trilane.transport.slots`).
+#: `frame`: number of the frame, from 0. `t_sampled_ns`: time on CLOCK_MONOTONIC at which the frame's input was sampled;
+#: the latency begins then. `epoch`: epoch of the slot's edge (`trilane.transport.slots`).
 FRAME_FIELDS = (("frame", "<u8"), ("t_sampled_ns", "<i8"), ("epoch", "<u4"))
 
 
 def header_dtype(fields: Sequence[tuple[Any, ...]] = ()) -> np.dtype[Any]:
-    """Return the layout of a header: `FRAME_FIELDS`, then `fields` as `numpy.dtype` takes them."""
+    """Return the dtype of a header: `FRAME_FIELDS`, then `fields`, each as `numpy.dtype` takes it."""
     return np.dtype([*FRAME_FIELDS, *fields], align=True)
 
 
@@ -107,9 +107,9 @@ def create_region(name: str, layout: RegionLayout) -> int:
 
 
 def map_region(fd: int, layout: RegionLayout) -> list[Packet]:
-    """Return views of every slot of the region; the mapping lives as long as they do.
+    """Map the region behind the descriptor `fd`, and return a view of every slot.
 
-    Raises ValueError when the region is smaller than the layout.
+    The mapping lives as long as the views. Raises ValueError when the region is smaller than the layout.
     """
     region_bytes = os.fstat(fd).st_size
     if region_bytes < layout.total_bytes:

@@ -2,9 +2,9 @@
 
     FREE --claim--> WRITING --commit--> READY --take--> READING --release--> FREE
 
-WRITING belongs to the producer's unit, READING to the units of its readers, FREE and READY to nobody. A slot that one
-of several readers has released is READY again while no other reads it. The module is pure: it knows neither memory nor
-a clock.
+A WRITING slot belongs to the producer's unit, a READING slot to the units of its readers, a FREE or READY slot to
+nobody. If a slot has several readers, it is READY again whenever no job reads it, until the last reader has released
+it. The module is pure: it knows neither memory nor a clock.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ MAX_SLOTS = 64
 
 
 class SlotError(Exception):
-    """A transition that the table does not have: a defect of the caller, never of the user's input."""
+    """The caller asked for a transition that the table does not have: a defect of the code, not of a user's input."""
 
 
 @dataclass(frozen=True)
 class EdgeRule:
-    """An edge's policy.
+    """The rule of an edge.
 
     `slots`: number of slots.
     `mailbox`: whether a commit replaces the waiting frames.
@@ -54,7 +54,7 @@ class EdgeRule:
     yields: bool = False
 
 
-#: The rules by name; those in COUNTED may be given with a count, as NAME:N.
+#: The rules by name. A rule of COUNTED may have a number of slots, as NAME:N.
 RULES = {
     "single": EdgeRule("single", 1),
     "double": EdgeRule("double", 2),
@@ -62,11 +62,12 @@ RULES = {
     "fifo": EdgeRule("fifo", 4),
     "orphan": EdgeRule("orphan", 6, yields=True),
 }
-#: The rule of an edge for which nobody chose one.
+#: The rule of an edge unless somebody chooses another.
 DEFAULT_EDGE: Final = "double"
-#: A rule of each kind, to choose from or to compare.
+#: One edge of each rule, for a menu or a comparison.
 EDGES: Final = ("single", "double", "triple", "fifo:4", "orphan")
-COUNTED = {"fifo": 1, "orphan": 4}  # least counts; an orphan edge has two slots read, one written and one waiting
+#: Least number of slots. An orphan edge needs two slots being read, one being written and one waiting.
+COUNTED = {"fifo": 1, "orphan": 4}
 
 
 def edge_rule(text: str) -> EdgeRule:
@@ -86,7 +87,7 @@ def edge_rule(text: str) -> EdgeRule:
     return EdgeRule(name, int(count), rule.mailbox, rule.yields)
 
 
-#: Says of a frame whether it must stay where it waits.
+#: A function of a frame's number: whether the frame must keep its slot.
 Keeps = Callable[[int], bool]
 FIRST_LINE: Final = (0,)
 
@@ -98,13 +99,15 @@ def _keeps_none(_frame: int) -> bool:
 class EdgeSlots:
     """The slots behind one stage. They belong to the edge to the next stage, or to a stream with several readers.
 
-    A reader takes frame by frame and has a line of waiting slots, or it takes the newest frame alone and holds that
-    frame's slot until a newer one comes. A slot is free when the last of its readers has released it.
+    There are two kinds of readers. A reader that takes frame by frame has a line of waiting slots. A reader of the
+    newest frame holds that frame's slot until a newer frame comes. A slot is free when its last reader has released it.
 
-    `frame`: frame in each slot; -1 without one.
-    `lines`: slots that wait for each reader that takes frame by frame, oldest first.
-    `ready`: the first of the lines.
-    `newest`: slot that each reader of the newest frame holds; -1 before the first frame.
+    `state`: state of each slot.
+    `frame`: number of the frame in each slot; -1 for none.
+    `free`: the free slots; the last one is claimed next.
+    `lines`: for each reader that takes frame by frame, the slots that wait for it, oldest frame first.
+    `ready`: the first line.
+    `newest`: for each reader of the newest frame, the slot that it holds; -1 before the first frame.
     `epoch`: number that grows at each fault.
     """
 
@@ -127,7 +130,7 @@ class EdgeSlots:
         self._is_shared = lines > 1 or newest > 0
 
     def can_claim(self, keeps: Keeps = _keeps_none) -> bool:
-        """Return whether a slot is free, or may be taken from the oldest waiting frame.
+        """Return whether `claim` would find a slot: a free slot, or the slot of a waiting frame that may be evicted.
 
         `keeps`: function that says which frames must not be evicted.
         """
@@ -136,8 +139,9 @@ class EdgeSlots:
     def claim(self, frame: int, keeps: Keeps = _keeps_none) -> tuple[int, int | None]:
         """Claim a slot for `frame`; return the slot and the waiting frame that was evicted from it, or None.
 
-        Without `keeps` a frame in the last line is evicted first: frames on a bypass wait there, and no frame can need
-        them. Raises SlotError when no slot is free and none may be evicted.
+        Without `keeps`, the oldest frame of the last line is evicted first: frames on a bypass wait in that line, and
+        no later frame needs them. With `keeps`, the oldest frame of all lines that may be evicted is evicted. Raises
+        SlotError when no slot is free and no frame may be evicted.
         """
         dropped = None
         if not self.free and self.rule.yields and (oldest := self._evictable(keeps)) >= 0:
@@ -151,11 +155,11 @@ class EdgeSlots:
         return slot, dropped
 
     def commit(self, slot: int, to: Sequence[int] = FIRST_LINE, keeps: Keeps = _keeps_none) -> list[int]:
-        """Mark the slot's frame as complete, and return the frames that it replaces.
+        """Mark the slot's frame as complete, and return the frames that this frame replaces.
 
         The slot is free again at once if no reader takes its frame.
 
-        `to`: lines in which the slot waits from now on.
+        `to`: numbers of the lines in which the slot waits from now on.
         `keeps`: function that says which frames must not be replaced.
         """
         self._move("commit", slot)
@@ -175,7 +179,7 @@ class EdgeSlots:
         return replaced
 
     def _hold(self, slot: int) -> None:
-        """Let the readers of the newest frame hold the slot, and leave what they hold."""
+        """Let all readers of the newest frame hold the slot, and release the slots that they held before."""
         self._left[slot] += len(self.newest)
         for reader, held in enumerate(self.newest):
             self.newest[reader] = slot
@@ -183,7 +187,7 @@ class EdgeSlots:
                 self._leave(held)
 
     def take(self, slot: int, line: int = 0) -> None:
-        """Let the unit of the stage that the slot waits for in `line` read it from now on."""
+        """Take the slot out of `line`: from now on, a job of that line's reader reads it."""
         if not self._reading[slot] or slot not in self.lines[line]:
             self._move("take", slot)
         if self._is_shared:
@@ -191,7 +195,7 @@ class EdgeSlots:
         self.lines[line].remove(slot)
 
     def take_newest(self, reader: int) -> int:
-        """Let a job read what `reader` holds, and return its slot; -1 before the first frame."""
+        """Let a job read the slot that `reader` of the newest frame holds, and return it; -1 before the first frame."""
         slot = self.newest[reader]
         if slot >= 0:
             if not self._reading[slot]:
@@ -201,7 +205,7 @@ class EdgeSlots:
         return slot
 
     def release(self, slot: int) -> None:
-        """Note that a job has read the slot, which is free when no other reader needs it."""
+        """Note that a job has read the slot. The slot becomes free if no other reader needs it."""
         if not self._is_shared:
             self._move("release", slot)
             self._empty(slot)
@@ -214,12 +218,12 @@ class EdgeSlots:
         self._leave(slot)
 
     def abandon(self, slot: int) -> None:
-        """Free the slot, which the producer's unit will not complete."""
+        """Free a slot that the producer's unit will not complete."""
         self._move("abandon", slot)
         self._empty(slot)
 
     def drop(self, slot: int) -> int:
-        """Take a waiting frame, which no job reads, out of its slot, and return its number."""
+        """Free the slot of a waiting frame that no job reads, and return the frame's number."""
         self._move("drop", slot)
         for line in self.lines:
             if slot in line:
@@ -233,7 +237,7 @@ class EdgeSlots:
         return frame
 
     def pass_by(self, frame: int, line: int) -> None:
-        """Take `frame` out of one line, if it waits there; the other readers keep it."""
+        """Take `frame` out of `line`, if it waits there. The frame stays in the other lines."""
         for slot in self.lines[line]:
             if self.frame[slot] == frame:
                 self.lines[line].remove(slot)
@@ -241,9 +245,9 @@ class EdgeSlots:
                 return
 
     def give_back(self, slot: int, line: int = 0, keeps: Keeps | None = None) -> list[int]:
-        """Let a taken frame wait again in its old place; return it if a newer frame waits in a mailbox.
+        """Put a taken slot back into `line`, ordered by frame. Return the frames that a mailbox drops for newer ones.
 
-        `keeps`: function that says which frames must not be replaced; None: all may be.
+        `keeps`: function that says which frames must not be replaced; None: every frame may be replaced.
         """
         if self._is_shared:
             self._reading[slot] -= 1
@@ -260,7 +264,7 @@ class EdgeSlots:
         return [self.drop(each) for each in old if keeps is None or not keeps(self.frame[each])]
 
     def _evictable(self, keeps: Keeps) -> int:
-        """Return the slot whose frame a claim may evict; -1: none."""
+        """Return the slot whose frame `claim` evicts; -1 if no frame may be evicted."""
         found = -1
         for line in reversed(self.lines):
             for slot in line:
@@ -273,7 +277,7 @@ class EdgeSlots:
         return found
 
     def _leave(self, slot: int) -> None:
-        """Note that one reader of the slot needs it no more."""
+        """Note that one reader no longer needs the slot; free the slot after its last reader."""
         self._left[slot] -= 1
         if not self._left[slot]:
             self._move("drop", slot)

@@ -13,7 +13,7 @@ __all__ = ["Prediction", "Run", "RunFailedError", "load_run", "predict", "run"]
 
 
 def __getattr__(name: str) -> Any:
-    """Return a name of the interface, or `__version__`: reading it takes longer than a unit's start."""
+    """Return an object of the interface, or the version, at its first use: reading the version takes long."""
     if name in __all__:
         from importlib import import_module
 

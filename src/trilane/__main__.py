@@ -7,9 +7,9 @@ from typing import NoReturn
 
 
 def entry() -> NoReturn:
-    """Run the command line. Ctrl-C ends it at once, without a traceback, until its modules are imported."""
+    """Run the command line. While its modules are imported, Ctrl-C ends it at once, without a traceback."""
     handler = signal.getsignal(signal.SIGINT)
-    if handler is signal.default_int_handler:  # a background job of a shell ignores it
+    if handler is signal.default_int_handler:  # a shell's background job ignores SIGINT
         signal.signal(signal.SIGINT, signal.SIG_DFL)
     from trilane.apps.cli import main
 

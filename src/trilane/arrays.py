@@ -1,7 +1,7 @@
 """Names for array types in annotations, and sizes of tensors as text and as shape buckets.
 
-Rules: the name of a type states its elements, docstrings state the shape; a tensor's shape is (height, width), with
-sides that are multiples of `BUCKET_STEP`.
+Rules: the name of an array type states the elements, docstrings state the shape. A tensor's shape is (height, width),
+and both sides are multiples of `BUCKET_STEP`.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ def shape_buckets(size: str) -> list[Shape]:
     """Return the tensor shapes (height, width) that `size` allows.
 
     `HxW` gives that one shape. A single number S gives shapes of at most S² pixels, with sides in multiples of 32 and
-    an aspect within 1:4. No shape contains another: they are tall for a standing body, wide for a lying one, S x S
-    between. Raises UnexpectedValue when a side is no multiple of 32 or out of range.
+    an aspect within 1:4. No shape contains another: tall shapes suit a standing body, wide shapes a lying body. Raises
+    UnexpectedValue when a side is no multiple of 32 or out of range.
     """
     if re.fullmatch(r"\d+", size):
         return shapes_within(_check_side(int(size)) ** 2)
@@ -54,9 +54,11 @@ def shape_buckets(size: str) -> list[Shape]:
 
 
 def shapes_within(pixels: int) -> list[Shape]:
-    """Return the shapes (height, width) of at most `pixels`, at least `BUCKET_STEP`²; none contains another.
+    """Return the shapes (height, width) of at most `pixels` pixels. No shape contains another.
 
-    Their sides are multiples of `BUCKET_STEP`, the longer one at most `MOST_ASPECT` times the shorter one.
+    Sides are multiples of `BUCKET_STEP`. The longer side has at most `MOST_ASPECT` times the length of the shorter one.
+
+    `pixels`: at least `BUCKET_STEP`².
     """
     longest = math.isqrt(MOST_ASPECT * pixels)
     widest = [(h, pixels // h // BUCKET_STEP * BUCKET_STEP) for h in range(BUCKET_STEP, longest + 1, BUCKET_STEP)]
@@ -71,6 +73,6 @@ def _check_side(side: int) -> int:
 
 
 def checked_size(size: str) -> str:
-    """Return `size` itself. Raises UnexpectedValue as `shape_buckets`."""
+    """Return `size` unchanged. Raises UnexpectedValue when `shape_buckets` does."""
     shape_buckets(size)
     return size

@@ -1,7 +1,7 @@
 """A cache of results that are expensive to compute. Rule: the cache saves time and never decides anything.
 
-It lies under XDG_CACHE_HOME. An entry's name is a digest of everything that it was made from. An entry that cannot be
-read is made again, and where nothing can be written nothing is kept.
+The cache lies under XDG_CACHE_HOME. The name of an entry is a digest of everything that the entry was made from. An
+entry that cannot be read is made again. If the folder cannot be written, nothing is kept.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Arrays = Mapping[str, NDArray[Any]]
 
 
 def cache_dir(name: str) -> Path | None:
-    """Return the folder of the cache `name`; None when it cannot be written."""
+    """Return the folder of the cache `name`, made if it is missing; None when it cannot be written."""
     try:
         folder = machine.here.cache_home() / "trilane" / name
         folder.mkdir(parents=True, exist_ok=True)
@@ -39,7 +39,7 @@ def cache_dir(name: str) -> Path | None:
 def cache_entry(name: str, file: str) -> Path | None:
     """Return the path of `file` in the cache `name`; None when the cache cannot be written.
 
-    None also when something else than a file has that name, such as a pipe, on which reading would wait.
+    Also None when the path leads to something other than a file, such as a pipe: reading a pipe would wait.
     """
     folder = cache_dir(name)
     if folder is None:
@@ -49,9 +49,9 @@ def cache_entry(name: str, file: str) -> Path | None:
 
 
 def cached_arrays(name: str, sources: Iterable[NDArray[Any] | str], make: Callable[[], Arrays]) -> Arrays:
-    """Return the result of `make`, from the cache when it was made from the same `sources` before.
+    """Return the arrays that `make` computes from `sources`; take them from the cache if they are there.
 
-    `name`: name of the result, with a number that grows when the code that makes it changes.
+    `name`: name of the arrays, with a version number. The number must grow when the code of `make` changes.
     """
     entry = cache_entry(ARRAYS, f"{_digest(name, sources)}.npz")
     if entry is None:
@@ -68,7 +68,7 @@ def cached_arrays(name: str, sources: Iterable[NDArray[Any] | str], make: Callab
 
 
 def _read(entry: Path) -> Arrays | None:
-    """Return the arrays of `entry`; None when it is missing or damaged in any way, because they can be made again."""
+    """Return the arrays in the file `entry`; None when the file is missing or damaged in any way."""
     try:
         with entry.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             return {key: stored[key] for key in stored.files}

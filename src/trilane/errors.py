@@ -3,7 +3,7 @@
 Code raises these for anything a user can cause; the command line turns them into one sentence and an exit code. The
 parts of a sentence are fields: no code parses them out of a text. A remedy may be the word that a person most likely
 meant, or the command that installs what is missing, to be typed as it is. That command fits the way in which this
-Trilane was installed. It never fetches Trilane from a package index: none has it.
+Trilane was installed. It never fetches Trilane from a package index, because no index has Trilane.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from trilane.unexpected_value import UnexpectedValue
 
 
 def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:
-    """Return the remedy `did you mean 'x'?` with the word of `known` most like `word`; empty when none is near.
+    """Return the remedy `did you mean 'x'?` with the word of `known` most like `word`; empty if no word is near.
 
-    A word is also near when it is the only one that begins with `word`.
+    A word is also near if no other word of `known` begins with `word`.
 
-    `prefix`: text before the suggested word; `word` and `known` are compared without it.
+    `prefix`: text that the remedy puts before the suggested word, such as a folder.
     """
     words = list(known)
     near = get_close_matches(word, words, n=1) or _only_one([each for each in words if word and each.startswith(word)])
@@ -38,14 +38,18 @@ def _only_one(words: list[str]) -> list[str]:
 
 
 PACKAGE = Path(__file__).resolve().parent
-#: Stands for the packages where no distribution lists them: in a folder that was copied without its pyproject.toml.
+#: Used in place of the packages' names if no installed distribution lists them. The source tree is then a copied folder
+#: without its pyproject.toml.
 UNKNOWN = "(the packages that Trilane's pyproject.toml lists)"
 #: EGL and a software OpenGL driver, on Debian and Ubuntu.
 EGL_LINE = "apt-get install libegl1 libgl1-mesa-dri"
 
 
 def clone() -> Path | None:
-    """Return the source tree that this Trilane runs from, also by an editable install; None for a wheel."""
+    """Return the root of the source tree that this Trilane runs from; None if a wheel was installed.
+
+    An editable install runs from a source tree too.
+    """
     root = PACKAGE.parents[1]
     return root if PACKAGE.parent.name == "src" and (root / "pyproject.toml").is_file() else None
 
@@ -53,7 +57,7 @@ def clone() -> Path | None:
 def pip() -> str:
     """Return the command that runs this Python's pip.
 
-    It is relative when the user stands in the clone whose .venv this is.
+    Its path is relative if this Python is the clone's .venv and the clone is the working directory.
     """
     root = clone()
     if root is None or Path(sys.prefix).resolve() != root / ".venv":
@@ -67,9 +71,9 @@ def package_line(name: str) -> str:
 
 
 def install_line(extra: str = "") -> str:
-    """Return the command that installs the packages of `extra`, or without an extra, the packages that every run needs.
+    """Return the command that installs the packages of `extra`.
 
-    `extra`: one of Trilane's extras, or several joined by commas.
+    `extra`: one of Trilane's extras, or several joined by commas. Empty: the packages that every run needs.
     """
     root = clone()
     if root is not None:
@@ -87,7 +91,7 @@ def _stands_in(root: Path) -> bool:
 
 
 def _requirements(extra: str) -> Iterator[str]:
-    """Yield the requirements of the installed distribution for `extra` (for "": of every run), without the markers."""
+    """Yield what the installed distribution requires for `extra` (for "": in every run), without markers."""
     try:
         lines = importlib.metadata.requires("trilane") or []
     except importlib.metadata.PackageNotFoundError:
@@ -99,17 +103,18 @@ def _requirements(extra: str) -> Iterator[str]:
             yield requirement.strip()
 
 
-#: What the system says of a place that takes no more, and what helps then.
+#: Error numbers of a place that takes no more data, and the remedy.
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS})
 FREE_SPACE = "free space there or choose another --out"
-#: Most letters of what was found that are shown.
+#: Most characters of `found` that a message shows.
 LONGEST_FOUND = 500
 
 
 def reason(error: Exception) -> str:
-    """Return the reason of `error` as part of a sentence: an OSError without number and path, else its own text.
+    """Return why `error` happened, as part of a sentence.
 
-    A limit on the length of files is named.
+    For an OSError this is the system's text without number and path, with the limit on file sizes if that was reached.
+    For any other error it is the error's own text.
     """
     if not isinstance(error, OSError):
         return str(error)
@@ -119,7 +124,7 @@ def reason(error: Exception) -> str:
 
 
 def remedy(error: OSError, otherwise: str) -> str:
-    """Return what helps against a limit on the length of files, if that is what `error` is about, else `otherwise`."""
+    """Return the command that lifts the limit on file sizes if `error` comes from that limit, else `otherwise`."""
     return "ulimit -f unlimited" if _is_of_limit(error) else otherwise
 
 
@@ -134,7 +139,7 @@ def _file_limit() -> int:
 class TrilaneError(Exception):
     """A failure with a message for people. Exit code 1: the run failed.
 
-    `details`: lines that follow the message where a single one is not enough.
+    `details`: further lines to print after the message.
     """
 
     exit_code = 1
@@ -165,10 +170,10 @@ class BadInputError(TrilaneError):
 
     @classmethod
     def of_os_error(cls, where: str | Path, error: OSError, expected: str, remedy: str = "") -> BadInputError:
-        """Return the error for what the system said when `where` was opened, read or written.
+        """Return the error to raise after the system refused to open, read or write `where`.
 
         `where`: file or folder.
-        `error`: error of the system; its reason is what was found.
+        `error`: error of the system; its reason becomes `found`.
         `expected`, `remedy`: sentence parts.
         """
         return cls(where, reason(error), expected, remedy)
@@ -190,14 +195,16 @@ class UnwrittenError(TrilaneError):
 
 
 class UnitLostError(TrilaneError):
-    """A unit cannot go on, but a new process in its place can: the unit ends, and the scheduler restarts it."""
+    """A unit's process cannot go on, but a new process can. The process ends, and the scheduler restarts the unit."""
 
 
 class MissingPartError(TrilaneError):
     """The environment lacks something. Exit code 3.
 
-    `what`: what is missing. `install`: line to type. `extra`: Trilane's extra, or several joined by commas, in place of
-    `install`.
+    `what`: sentence part that says what is missing.
+    `install`: command that installs it.
+    `extra`: Trilane's extra that contains it, or several joined by commas. If `install` is empty, the command installs
+    these extras.
     """
 
     exit_code = 3
@@ -211,9 +218,9 @@ class MissingPartError(TrilaneError):
 
 
 def require(checks: Iterable[Callable[[], object]]) -> None:
-    """Call all `checks`, and raise one MissingPartError with everything that they miss and one line that installs it.
+    """Call all `checks`, and raise one MissingPartError for all missing parts, with one command that installs them.
 
-    Each check raises a MissingPartError with an `extra` for what it misses.
+    A check whose part is missing raises a MissingPartError with an `extra`.
     """
     missing: list[MissingPartError] = []
     for check in checks:

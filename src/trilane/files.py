@@ -1,8 +1,8 @@
 """Input files are opened with suspicion: sizes are read from headers before memory is taken, nothing is unpickled.
 
-Any defect of a file becomes one BadInputError that names it. The first bytes tell what a file is, not its ending;
-signatures come from the format's own specification, or from libmagic's list. A format that Trilane does not read comes
-with a way to convert it.
+Any defect of a file becomes one BadInputError that names the file. A file's first bytes tell its format, not its
+suffix. Signatures come from the format's own specification, or from libmagic's list. Each format that Trilane does not
+read has a remedy, such as a way to convert it. `expected` is always the sentence part that says what a file should be.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ _ARRAYS = "save its arrays with NumPy: np.savez(FILE, poses=..., trans=..., moca
 class Signature:
     """A known file format.
 
-    `name`: name with its article. `group`: one of the words above. `remedy`: how the file is made usable.
+    `name`: name with its article. `group`: `PICTURE`, `VIDEO`, `ARRAY`, `PICKLE`, `ARCHIVE` or `FOREIGN`. `remedy`: how
+    to make such a file usable.
     """
 
     name: str
@@ -92,14 +93,14 @@ _PATTERNS = tuple((re.compile(pattern, re.DOTALL), signature) for pattern, signa
 
 
 def signature_of(path: Path) -> Signature | None:
-    """Return the format of the regular file `path`; None if its head shows none. Raises OSError if it is unreadable."""
+    """Return the format of the regular file `path`; None if it is unknown. Raises OSError if the file is unreadable."""
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
     return signature_of_head(head)
 
 
 def signature_of_head(head: bytes) -> Signature | None:
-    """Return the format of a file that begins with `head`, which is up to HEAD_BYTES long."""
+    """Return the format of a file that begins with `head`, up to HEAD_BYTES bytes; None if it is unknown."""
     return next((signature for pattern, signature in _PATTERNS if pattern.match(head)), None)
 
 
@@ -142,7 +143,7 @@ def require_file(path: Path, expected: str, if_empty: str = "") -> int:
 
 
 def instead_of_file(path: Path) -> str:
-    """Say what `path` is, which is no regular file."""
+    """Return a sentence part that says what `path` is, if it is no regular file."""
     if path.is_dir():
         return "a folder"
     try:
@@ -203,9 +204,9 @@ def read_npy(path: Path, expected: str) -> NDArray[Any]:
 
 
 def read_npz(path: Path, keys: Collection[str], expected: str) -> dict[str, NDArray[Any]]:
-    """Return the arrays of the `keys` that the `.npz` file has; other members are not opened. Raises BadInputError.
+    """Return those arrays of the `.npz` file that `keys` name, without opening others. Raises BadInputError.
 
-    Together they may have at most MAX_ARRAY_BYTES, and a header each.
+    A key without an array is left out. The arrays may have at most MAX_ARRAY_BYTES bytes together.
     """
     require_file(path, expected)
     try:
@@ -222,7 +223,7 @@ def read_npz(path: Path, keys: Collection[str], expected: str) -> dict[str, NDAr
 
 
 def npz_names(path: Path, expected: str) -> list[str]:
-    """Return the names of the arrays in an `.npz` file, in its order; none is opened. Raises BadInputError."""
+    """Return the names of the arrays in an `.npz` file, in the file's order. Raises BadInputError."""
     require_file(path, expected)
     try:
         refuse_other(path, expected, ARRAY, ARCHIVE)
@@ -233,9 +234,12 @@ def npz_names(path: Path, expected: str) -> list[str]:
 
 
 def npz_pickles(path: Path, keys: Collection[str], most: int, expected: str) -> dict[str, bytes]:
-    """Return the unread pickles of the `keys` whose arrays in an `.npz` file hold Python objects. Raises BadInputError.
+    """Return the bytes of those arrays of an `.npz` file that hold Python objects. Raises BadInputError.
 
-    `most`: most bytes that they may have together.
+    The bytes are the `.npy` header and the pickle, which stays pickled.
+
+    `keys`: names of the arrays to look at.
+    `most`: most bytes that the result may have in all.
     """
     require_file(path, expected)
     found: dict[str, bytes] = {}
@@ -252,7 +256,6 @@ def npz_pickles(path: Path, keys: Collection[str], most: int, expected: str) -> 
 
 
 def _pickle_in(where: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, most: int) -> bytes | None:
-    """Return the pickle of a member that holds objects; None for any other, which is not read."""
     with archive.open(info) as file:
         if not _holds_objects(file):
             return None
@@ -262,9 +265,9 @@ def _pickle_in(where: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, most
 
 
 def npy_pickle(path: Path, most: int, expected: str) -> bytes | None:
-    """Return the unread pickle of a `.npy` file that holds Python objects; None for any other. Raises BadInputError.
+    """Return the bytes of a `.npy` file that holds Python objects; None for any other file. Raises BadInputError.
 
-    `most`: most bytes that it may have.
+    `most`: most bytes that the file may have.
     """
     size = require_file(path, expected)
     try:
@@ -316,7 +319,7 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDAr
 
 
 def read_header(where: Path | str, file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return shape, Fortran order and type of the array whose `.npy` header comes next in `file`.
+    """Return shape, whether the order is Fortran's, and dtype of the array whose `.npy` header comes next in `file`.
 
     Raises BadInputError on pickled objects and unknown versions, one of DAMAGED on a broken header.
     """
@@ -330,17 +333,14 @@ def read_header(where: Path | str, file: IO[bytes]) -> tuple[tuple[int, ...], bo
 
 
 def _header(file: IO[bytes], version: tuple[int, int]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return the shape, Fortran order and type by the header that comes next in `file`.
-
-    Raises one of DAMAGED on a broken one.
-    """
+    """Return what `read_header` returns, from the rest of a header of this `version`. Raises one of DAMAGED."""
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of headers written by Python 2
+            warnings.simplefilter("ignore", UserWarning)  # about headers that Python 2 wrote
             return _HEADERS[version](file)
     except DAMAGED:
         raise
-    except Exception as error:  # NumPy sorts and unpacks the literal before it knows what that holds
+    except Exception as error:  # NumPy sorts and unpacks the literal before it checks the literal's type
         raise ValueError(f"a damaged header: {error}") from error
 
 
@@ -351,7 +351,7 @@ def _read_array(file: IO[bytes]) -> NDArray[Any]:
 
 
 def _checked_bytes(where: Path | str, file: IO[bytes], expected: str) -> int:
-    """Return the number of data bytes that the header announces; leave `file` at their start."""
+    """Return the number of data bytes that the header announces; leave `file` at the first data byte."""
     shape, _, dtype = read_header(where, file)
     if any(side < 0 for side in shape):
         raise BadInputError(where, f"shape {shape}", expected)
@@ -362,7 +362,7 @@ def _checked_bytes(where: Path | str, file: IO[bytes], expected: str) -> int:
 
 
 def whole_number(digits: str) -> int | float:
-    """Return a whole number of a JSON document; infinity for one that no float can hold."""
+    """Return the value of `digits`, a whole number of a JSON document; ±infinity if no float can hold it."""
     return int(digits) if len(digits) < LONGEST_WHOLE else math.copysign(math.inf, -1 if digits.startswith("-") else 1)
 
 

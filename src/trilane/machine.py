@@ -4,12 +4,12 @@ Only this module asks, so a test can put another machine in place of `here`. Ruf
 file (`banned-api` in pyproject.toml). Two things are asked elsewhere, each in one place: OpenGL by
 `trilane.stages.gpu.opengl`, and clocks by the code that measures, because a clock is read in every job.
 
-Whether a failure comes from a **lack of memory** is decided here too, by the need of a run and its limits. Rule: a
-shortage is reported only where a limit is below what a run takes, or where the kernel has ended a process for it. The
-figures are measured (docs/limits.md); a larger scene, avatar or background takes more.
+This module also decides whether a failure comes from a **lack of memory**. Rule: a shortage is reported only if a limit
+is below what a run takes, or if the kernel has ended a process for lack of memory. The needs of a run are measured
+(docs/limits.md); a larger scene, avatar or background takes more.
 
-A process is **woken soon** by a message where the kernel does what is asked; a refusal changes only the speed. Linux
-makes a woken thread wait until the time slice of the running one ends, about 3 ms. The woken thread need not wait if it
+This module also asks the kernel to **wake soon** a process that a message waits for; a refusal changes only the speed.
+Linux makes a woken thread wait until the time slice of the running thread ends, about 3 ms. It need not wait if it
 asks for a shorter slice (EEVDF since Linux 6.12; older kernels ignore the request). With another process busy on the
 same core, the measured 99th percentile of the wake-up went from 3.4 ms to 0.2 ms. This matters most for ZeroMQ's I/O
 threads. A unit that has sent a message begins its next job at once. The thread that carries the message then waits on
@@ -45,7 +45,7 @@ _LIBC.syscall.restype = ctypes.c_long
 
 
 class Machine:
-    """The machine below `root`, the folder that holds the kernel's folders `proc` and `sys`."""
+    """This machine. `root`: folder that holds the kernel's folders `proc` and `sys`; a test gives its own."""
 
     def __init__(self, root: Path = Path("/")) -> None:
         self.proc = root / "proc"
@@ -64,7 +64,7 @@ class Machine:
         return platform.machine()
 
     def cpu_fields(self) -> dict[str, str]:
-        """Return the fields of the first core in /proc/cpuinfo; empty where that cannot be read."""
+        """Return the fields of the first core in /proc/cpuinfo, by name; empty if that file cannot be read."""
         try:
             text = (self.proc / "cpuinfo").read_text(encoding="utf-8", errors="replace")
         except OSError:
@@ -73,11 +73,8 @@ class Machine:
         return {key.strip(): value.strip() for key, _, value in pairs}
 
     def cpu_flags(self) -> frozenset[str]:
-        """Return the first core's instruction sets by the kernel's names.
-
-        x86 calls the field `flags`, ARM `Features`.
-        """
-        fields = self.cpu_fields()
+        """Return the instruction sets of the first core, as the kernel names them."""
+        fields = self.cpu_fields()  # x86 calls the field `flags`, ARM `Features`
         return frozenset((fields.get("flags") or fields.get("Features") or "").split())
 
     def cpu_model(self) -> str:
@@ -85,7 +82,7 @@ class Machine:
         return self.cpu_fields().get("model name") or platform.processor() or self.architecture()
 
     def clock_ghz(self) -> float:
-        """Return the highest clock of the cores in GHz, else the present one; 0 where the kernel gives none."""
+        """Return the cores' highest clock in GHz; if that is unknown the present clock, if both are unknown 0."""
         frequency = psutil.cpu_freq()
         return (frequency.max or frequency.current) / 1e3 if frequency else 0.0
 
@@ -117,12 +114,12 @@ class Machine:
         return int(psutil.virtual_memory().available)
 
     def memory_limit_bytes(self) -> int | None:
-        """Return the least memory limit of this process's control group and of those above it; None without one."""
+        """Return the lowest memory limit of this process's control group and its parents; None if none limits it."""
         limits = [int(text) for file in self._limit_files() if (text := _text_of(file)).isdecimal()]
         return min((limit for limit in limits if limit < self.memory_bytes()), default=None)
 
     def _limit_files(self) -> Iterator[Path]:
-        """Yield the files of these limits, by version 2 and version 1 of control groups."""
+        """Yield the files with the memory limits of this process's control groups, of version 2 and version 1."""
         for line in _text_of(self.proc / "self/cgroup").splitlines():
             _, kind, path = line.split(":", 2)
             if kind in ("", "memory"):
@@ -131,14 +128,14 @@ class Machine:
                 yield from (self.sys / "fs/cgroup" / kind / part / name for part in (group, *group.parents))
 
     def oom_kills(self) -> int:
-        """Return how many processes the kernel has ended since it began because memory ran out; 0 where untold."""
+        """Return how many processes the kernel has ended since its start because memory ran out; 0 if unknown."""
         lines = (line.split() for line in _text_of(self.proc / "vmstat").splitlines())
         return next((int(words[1]) for words in lines if words[0] == "oom_kill"), 0)
 
     def open_counter(self, attributes: bytes, flags: int) -> int:
-        """Return a descriptor of an event that is counted for this thread: perf_event_open(2). Raises OSError.
+        """Return a file descriptor that counts an event of this thread, by perf_event_open(2). Raises OSError.
 
-        `attributes`: a `perf_event_attr`. `flags`: flags of the system call.
+        `attributes`: bytes of a `perf_event_attr`. `flags`: flags of the system call.
         """
         number = PERF_EVENT_OPEN.get(self.architecture())
         if number is None:
@@ -151,11 +148,11 @@ class Machine:
         return file
 
     def read_counter(self, file: int, size: int) -> bytes:
-        """Return the kernel's reading of an opened counter."""
+        """Return up to `size` bytes that the kernel gives for the counter behind the descriptor `file`."""
         return os.read(file, size)
 
     def system(self) -> str:
-        """Return the kernel, its version and the C library's."""
+        """Return the names and versions of the kernel and the C library."""
         return platform.platform()
 
     def python(self) -> str:
@@ -167,7 +164,10 @@ class Machine:
         return platform.node()
 
     def program(self, name: str, first: Path | None = None) -> str | None:
-        """Return the path of a program in the folder `first` or on PATH; None where there is none."""
+        """Return the path of the program `name`; None if it is not installed.
+
+        `first`: folder to search before the folders of PATH.
+        """
         path = os.environ.get("PATH", os.defpath)
         return shutil.which(name, path=path if first is None else f"{first}{os.pathsep}{path}")
 
@@ -188,7 +188,7 @@ class Machine:
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 
     def now(self) -> datetime:
-        """Return date and time in UTC."""
+        """Return the date and time in UTC."""
         return datetime.now(UTC)
 
 
@@ -197,16 +197,16 @@ here = Machine()
 
 
 def last_level_bytes(cores: Iterable[int]) -> int:
-    """Return the size in bytes of the largest last-level cache of `cores`, as the kernel states it.
+    """Return the size in bytes of the largest last-level cache of `cores`; 0 if the kernel states none.
 
-    It is 0 where the kernel states none, so that nothing fits. On a virtual machine it may be the whole host's.
+    The kernel of a virtual machine may state the cache of the whole host.
     """
     folder = here.sys / "devices/system/cpu"
     return max((_cache_bytes(folder / f"cpu{core}" / "cache") for core in cores), default=0)
 
 
 def moved_of_kept(kept_bytes: int) -> int:
-    """Return the part of `kept_bytes` that each frame reads from memory again: all if they exceed the cache, or none.
+    """Return how many of `kept_bytes` each frame reads from memory again: all if they exceed the cache, else 0.
 
     `kept_bytes`: bytes that a stage keeps from frame to frame, such as a network's weights.
     """
@@ -214,7 +214,7 @@ def moved_of_kept(kept_bytes: int) -> int:
 
 
 def _text_of(file: Path) -> str:
-    """Return the text of a file of the kernel, without its last line's end; "" where it cannot be read."""
+    """Return the text of a file of the kernel, without white space at its ends; "" if the file cannot be read."""
     try:
         return file.read_text(encoding="utf-8", errors="replace").strip()
     except OSError:
@@ -235,11 +235,12 @@ def _bytes(text: str) -> int:
 
 
 MB: Final = 1 << 20
-#: Addresses of the largest process of a default run: unit dsp, with OpenVINO.
+#: Address space of the largest process of a default run: unit dsp, with OpenVINO.
 ADDRESS_BYTES: Final = 1700 * MB
-#: Addresses without which no run can begin: no OpenGL driver loads. NumPy ends a process that has fewer than half.
+#: Address space that any process of a run needs. With less, no OpenGL driver loads. With less than half of it, NumPy
+#: ends the process.
 LEAST_ADDRESS_BYTES: Final = 512 * MB
-#: Memory without which the kernel ends the processes of the smallest run: tensors of 64x64, pictures of 160x120.
+#: Memory of the smallest run: tensors of 64x64, pictures of 160x120. With less, the kernel ends processes of the run.
 LEAST_RUN_BYTES: Final = 255 * MB
 #: Memory of all processes of a default run, with shared pages counted once.
 RUN_BYTES: Final = 600 * MB
@@ -249,7 +250,7 @@ _KILLS = here.oom_kills()
 
 
 def require_memory(part: int = 1) -> None:
-    """Raise TrilaneError when a limit is below a `part`th of what the smallest run takes."""
+    """Raise TrilaneError when a limit on memory is below what the smallest run takes, divided by `part`."""
     if (limit := _address_limit()) < LEAST_ADDRESS_BYTES // part:
         found = f"found a limit of {limit // MB} MB of addresses (ulimit -v)"
         expected = f"expected at least {ADDRESS_BYTES // MB} MB for a run"
@@ -263,7 +264,8 @@ def require_memory(part: int = 1) -> None:
 def shortage() -> str:
     """Return the evidence that memory is short, as part of a sentence; "" without evidence.
 
-    Call it after a failure that a lack of memory may have caused: a run of small tensors may need less than the limit.
+    Call it only after a failure that a lack of memory may have caused: a run of small tensors passes under limits that
+    count as evidence here.
     """
     if (limit := _address_limit()) < ADDRESS_BYTES:
         needed = f"a run's largest process takes {ADDRESS_BYTES // MB} MB: ulimit -v unlimited"
@@ -275,7 +277,7 @@ def shortage() -> str:
 
 
 def ended_by_system() -> str:
-    """Return that the kernel has ended a process since this one began, as part of a sentence; "" where it has not."""
+    """Return a sentence part if the kernel has ended a process for lack of memory since this one began, else ""."""
     if here.oom_kills() <= _KILLS:
         return ""
     free = f"{here.free_bytes() // MB} MB are free now"

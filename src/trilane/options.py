@@ -35,13 +35,13 @@ NOTHING: Final = "none"
 class Option:
     """Facts about an option that its field's type does not state.
 
-    `spelling`: option on the command line where it is not the field's name, such as `--latch`.
-    `synonyms`: other spellings of it.
-    `is_argument`: whether the command line takes it without a name.
+    `spelling`: name on the command line, such as `--latch`; empty if it follows from the field's name.
+    `synonyms`: other names on the command line.
+    `is_argument`: whether the command line takes the value without a name.
     `unit`: unit of a number, as a plural noun.
-    `words`: the only words that the field accepts; it accepts any text where empty.
-    `offered`: words that the dashboard's control offers beside what it finds here; None where the dashboard has no
-    control.
+    `words`: the only words that the field accepts; if empty, the field accepts any text.
+    `offered`: words that the dashboard's control offers besides what this machine has; None if the dashboard has no
+    control for the option.
     """
 
     spelling: str = ""
@@ -52,17 +52,17 @@ class Option:
     offered: tuple[str, ...] | None = None
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Let the field refuse a text which is none of `words`."""
+        """Make the field refuse a text outside `words`."""
         return one_of(*self.words).__get_pydantic_core_schema__(source, handler) if self.words else handler(source)
 
 
 def option_of(field: FieldInfo) -> Option:
-    """Return the field's `Option`; an empty one where it has none."""
+    """Return the field's `Option`; a default one if the field has none."""
     return next((each for each in field.metadata if isinstance(each, Option)), Option())
 
 
 def kind_of(field: FieldInfo) -> Any:
-    """Return the field's type without None, limits and elements: str, int, float, bool, Path or tuple."""
+    """Return the bare type of the field: str, int, float, bool, Path or tuple. None and limits are left out."""
     kind: Any = field.annotation
     while get_origin(kind) in (Annotated, Union, UnionType):
         kind = next(each for each in get_args(kind) if each is not NoneType)
@@ -70,7 +70,7 @@ def kind_of(field: FieldInfo) -> Any:
 
 
 def element_of(field: FieldInfo) -> Any:
-    """Return the type of a tuple's elements."""
+    """Return the type of the elements of a field that is a tuple."""
     kind: Any = field.annotation
     while get_origin(kind) is not tuple:
         kind = get_args(kind)[0]
@@ -78,7 +78,7 @@ def element_of(field: FieldInfo) -> Any:
 
 
 def limits_of(field: FieldInfo) -> tuple[float | None, float | None]:
-    """Return the least and the largest number that the field may be; None where there is no limit."""
+    """Return the least and the largest number that the field accepts; None for each limit that is absent."""
     least, most = (
         next((getattr(one, key) for one in field.metadata if hasattr(one, key)), None) for key in ("ge", "le")
     )
@@ -86,7 +86,7 @@ def limits_of(field: FieldInfo) -> tuple[float | None, float | None]:
 
 
 def text_of(value: object) -> object:
-    """Turn paths and whole numbers (sizes), which programs may give, into text."""
+    """Return a path or a whole number (a size) as text, and any other value unchanged."""
     return str(value) if isinstance(value, PurePath) or type(value) is int else value
 
 
@@ -94,19 +94,19 @@ def texts_of(value: object) -> object:
     return tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
 
 
-#: What is found and expected where a path is empty: Path would turn it into the working directory.
+#: Found and expected, for the error about an empty path: Path would turn it into the working directory.
 EMPTY_PATH: Final = ("an empty path", "a file or a folder")
 
 
 def path_of(value: object) -> object:
-    """Turn a text into a path. Raises UnexpectedValue for an empty one."""
+    """Return a text as a path, and any other value unchanged. Raises UnexpectedValue for an empty text."""
     if not isinstance(value, str):
         return value
     return Path(_not_empty(value))
 
 
 def paths_of(value: object) -> object:
-    """Turn one file, or several, into paths. Raises UnexpectedValue for an empty one."""
+    """Return one file or several files as a tuple of paths. Raises UnexpectedValue for an empty text."""
     several = [value] if isinstance(value, str | PurePath) else value
     return tuple(map(path_of, several)) if isinstance(several, Iterable) else value
 
@@ -143,7 +143,7 @@ class Options(BaseModel):
 
     @classmethod
     def checked(cls, values: Mapping[str, Any], *, as_typed: bool = False) -> Self:
-        """Check `values`, by the fields' names. Raises BadInputError for the first that its field does not allow.
+        """Return the options with `values`, by field name. Raises BadInputError for the first value that is refused.
 
         `as_typed`: whether the error names the option of the command line in place of the field.
         """
@@ -158,12 +158,12 @@ class Options(BaseModel):
 
     @classmethod
     def spelling(cls, name: str) -> str:
-        """Return the option of field `name` on the command line."""
+        """Return the name of field `name` on the command line, such as `--latch`."""
         return option_of(cls.model_fields[name]).spelling or f"--{name.replace('_', '-')}"
 
     @classmethod
     def value_of(cls, name: str, word: str) -> Any:
-        """Return the value of field `name` for which the dashboard says `word`. Raises BadInputError."""
+        """Return the value that `word`, chosen on the dashboard, stands for in field `name`. Raises BadInputError."""
         field = cls.model_fields[name]
         try:
             return None if word == NOTHING else TypeAdapter(kind_of(field)).validate_python(word)
@@ -171,11 +171,11 @@ class Options(BaseModel):
             raise BadInputError(name, repr(word), expected(field)) from None
 
     def changed(self, **values: Any) -> Self:
-        """Return the same options with other `values`. Raises BadInputError as `checked`."""
+        """Return a copy of the options with `values`, by field name. Raises BadInputError as `checked` does."""
         return self.checked({**dict(self), **values})
 
     def as_json(self) -> dict[str, Any]:
-        """Return every option by its field's name, as the report has it."""
+        """Return the value of every option as JSON, by field name. The report holds these values."""
         return {name: _as_json(value) for name, value in self}
 
 
@@ -186,7 +186,7 @@ def _as_json(value: object) -> object:
 
 
 def expected(field: FieldInfo) -> str:
-    """Say what a field's value must be, from its type, range and unit."""
+    """Return what a field's value must be, such as `a whole number, 1 or more`, from its type, range and unit."""
     kind, unit = kind_of(field), option_of(field).unit
     if kind not in (int, float):
         return {str: "text", bool: "true or false", tuple: "a list of texts", Path: "a path"}[kind]

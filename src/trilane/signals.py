@@ -1,6 +1,6 @@
-"""The signals that end a command, and how they end it: as Ctrl-C does, so that what was begun is finished or removed.
+"""The signals that end a command. They end it as Ctrl-C does, so that begun files are finished or removed.
 
-Rule: this imports nothing of Trilane; it is the first thing that a command does.
+Rule: this module imports nothing of Trilane, because a command imports it before anything else.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import NoReturn
 
-#: Signals that end a command. SIGXCPU comes where a limit of CPU time is reached (`ulimit -t`).
+#: Signals that end a command. The kernel sends SIGXCPU when a limit of CPU time is reached (`ulimit -t`).
 ENDING = (
     signal.SIGINT,
     signal.SIGTERM,
@@ -25,8 +25,8 @@ ENDING = (
 
 
 def _raise(number: int, _frame: FrameType | None) -> NoReturn:
-    """Say which signal came, which nobody has typed, and end as Ctrl-C does."""
-    with contextlib.suppress(OSError):  # of a terminal that was closed
+    """Write the signal's name to stderr, then raise KeyboardInterrupt as Ctrl-C does."""
+    with contextlib.suppress(OSError):  # the terminal may be closed
         os.write(2, f"interrupted by {signal.Signals(number).name}\n".encode())
     raise KeyboardInterrupt(number)
 
@@ -34,7 +34,7 @@ def _raise(number: int, _frame: FrameType | None) -> NoReturn:
 def that_end() -> list[signal.Signals]:
     """Return SIGINT, SIGTERM, and the other signals of ENDING that the caller neither ignores nor handles.
 
-    A command that was started by `nohup` or as a shell's background job ignores some.
+    A command that was started by `nohup` or as a shell's background job ignores some of them.
     """
     always = (signal.SIGINT, signal.SIGTERM)
     return [number for number in ENDING if number in always or signal.getsignal(number) in (signal.SIG_DFL, _raise)]
@@ -42,7 +42,7 @@ def that_end() -> list[signal.Signals]:
 
 @contextlib.contextmanager
 def interrupting() -> Iterator[None]:
-    """Let each signal that ends a command, but for SIGINT, end it as Ctrl-C does, and say its name."""
+    """Let the other signals of `that_end` do what SIGINT does inside the `with` block: raise KeyboardInterrupt."""
     before = {number: signal.signal(number, _raise) for number in that_end() if number != signal.SIGINT}
     try:
         yield

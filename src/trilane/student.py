@@ -30,7 +30,10 @@ def student_tails(t: float, freedom: float) -> float:
 
 @lru_cache(maxsize=256)
 def student_quantile(freedom: float, confidence: float = CONFIDENCE) -> float:
-    """Return what Student's t exceeds, above or below, with probability 1 - `confidence`; found by bisection."""
+    """Return the two-sided quantile of Student's t: |t| exceeds it with probability 1 - `confidence`.
+
+    `freedom`: degrees of freedom, a whole number or inf. The quantile is found by bisection.
+    """
     low, high = 0.0, 1e3
     for _ in range(80):
         middle = (low + high) / 2

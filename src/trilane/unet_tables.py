@@ -16,7 +16,7 @@ DECODER = (256, 128, 64, 64, 64)
 #: Channels of the colour head and of the mask head.
 HEADS = (3, 1)
 NORMS = ("batch", "instance", "group")
-#: Number of groups in a group norm; with fewer channels, their greatest common divisor with it.
+#: A group norm of C channels has gcd(C, NORM_GROUPS) groups.
 NORM_GROUPS = 8
 #: ResNet18: channels of the stem, then (channels, stride) of the four stages, two residual blocks each.
 RESNET18_STEM = 64
@@ -27,7 +27,7 @@ RESNET18_STAGES = ((64, 1), (128, 2), (256, 2), (512, 2))
 class MobileBlock:
     """One inverted residual block: 1x1 to `expanded` channels, depthwise `kernel`, 1x1 to `channels`.
 
-    `activation`: `relu`, `relu6` or `hardswish`. `squeeze`: whether it has squeeze-and-excitation.
+    `activation`: `relu`, `relu6` or `hardswish`. `squeeze`: whether the block has squeeze-and-excitation.
     """
 
     kernel: int
@@ -43,7 +43,7 @@ class MobileEncoder:
     """An encoder of inverted residual blocks.
 
     `stem`: channels of the first 3x3 convolution. `activation`: activation of the stem and of the last layer. `rows`:
-    blocks in order. `last`: channels of the last 1x1 convolution.
+    blocks, from first to last. `last`: channels of the last 1x1 convolution.
     """
 
     stem: int
@@ -53,17 +53,16 @@ class MobileEncoder:
 
 
 def squeeze_channels(channels: int) -> int:
-    """Return the channels inside a squeeze-and-excitation.
-
-    They are a quarter of `channels`, rounded to a multiple of 8, at least 8.
-    """
+    """Return the channels inside a squeeze-and-excitation: `channels` / 4, rounded to a multiple of 8, at least 8."""
     return max(8, (channels // 4 + 4) // 8 * 8)
 
 
 def _repeated(spec: Sequence[tuple[int, int, int, int, int]], before: int) -> tuple[MobileBlock, ...]:
-    """Return rows from (kernel, expansion factor, channels, repeats, stride).
+    """Return the blocks that `spec` describes by rows (kernel, expansion factor, channels, repeats, stride).
 
-    `before`: channels that enter the first row.
+    The first block of a row has the row's stride, the others stride 1.
+
+    `before`: channels that enter the first block.
     """
     rows = []
     for kernel, expansion, channels, repeats, stride in spec:
@@ -85,7 +84,8 @@ _MOBILENET_V2 = MobileEncoder(
     ),
     last=1280,
 )
-#: Its own last layer of 1280 would make the network larger than the published 6.1 M; ResNet18's 512 makes it 6.0 M.
+#: EfficientNet-Lite's own last layer of 1280 channels would make the avatar's network larger than the published 6.1 M
+#: parameters. With the 512 channels of ResNet18 the network has 6.0 M.
 _EFFICIENTNET_LITE0 = MobileEncoder(
     stem=32,
     activation="relu6",

@@ -25,6 +25,9 @@ class UnexpectedValue(ValueError):  # noqa: N818 - the value is at fault, as in 
 
 
 def unexpected_in(details: Mapping[str, Any]) -> UnexpectedValue | None:
-    """Return the error that a validator raised, from one of the `errors()` of a pydantic ValidationError; else None."""
+    """Return the UnexpectedValue that a validator raised; None for an error of another kind.
+
+    `details`: one of the `errors()` of a pydantic ValidationError.
+    """
     cause = details.get("ctx", {}).get("error")
     return cause if isinstance(cause, UnexpectedValue) else None

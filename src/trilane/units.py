@@ -33,14 +33,15 @@ PERFORMANCE_PROFILES = tuple(profile.value for profile in PerformanceProfile)
 BURST = PerformanceProfile.BURST.value
 SUSTAINED = PerformanceProfile.SUSTAINED_HIGH_PERFORMANCE.value
 
-#: Name of this machine's hardware profile, and of a run's clock that is this machine's.
+#: Name of this machine's hardware profile, and name of this machine's clock.
 HOST = "host"
 HOST_CLOCK = "host"
 
-#: Stages of the avatar's pipeline before and after the network's, and the unit of each.
+#: Stages of the avatar's pipeline, each with its unit: before the network's stage, that stage, and after it.
 BEFORE_INFER: tuple[tuple[str, UnitName], ...] = (("pose", "cpu"), ("raster", "gpu"))
 INFER: tuple[str, UnitName] = ("infer", "dsp")
 AFTER_INFER: tuple[tuple[str, UnitName], ...] = (("composite", "gpu"), ("present", "cpu"))
+#: The stage at whose end a frame's latency ends.
 LATENCY_TO = "composite"
 #: Frames that need no new picture of the avatars skip the stages between these two.
 BYPASS = ("pose", "composite")
@@ -50,5 +51,5 @@ MEASURED = "measured in this run"
 COMPUTED = "computed"
 #: Source of a ratio of a measured figure to a computed one.
 COMPARED = "measured in this run, over computed"
-#: Stands for a figure that is not this avatar's.
+#: Source of a figure that nobody has for this avatar.
 NO_FIGURES = "no figures"

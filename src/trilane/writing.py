@@ -24,10 +24,10 @@ REMOVED = "it was removed while it was written"
 
 @contextmanager
 def write_atomically(path: Path, remedy: str = "") -> Iterator[Path]:
-    """Yield a name to write to, with the suffix of `path`; it becomes `path` when the block ends without an error.
+    """Yield a temporary path to write to. When the block ends without an error, that file is renamed to `path`.
 
-    No file has the name yet, and no two calls get the same one. A device or a pipe (/dev/stdout) is itself the name.
-    Raises BadInputError with `remedy` when the file cannot be written; an OSError about another file passes.
+    The temporary path is new and has the suffix of `path`. If `path` is a device or a pipe (/dev/stdout), `path` itself
+    is yielded. Raises BadInputError with `remedy` if the file cannot be written; an OSError about another file passes.
     """
     draft = path.parent / f"{PREFIX}{secrets.token_hex(8)}{path.suffix}"
     try:
@@ -44,10 +44,7 @@ def write_atomically(path: Path, remedy: str = "") -> Iterator[Path]:
 
 
 def require_writable(path: Path) -> None:
-    """Find out before long work whether `write_atomically` can write `path`, an existing file or none.
-
-    Raises BadInputError when it cannot.
-    """
+    """Raise BadInputError, before long work, when `write_atomically` cannot write `path`."""
     with _os_errors_about(path), tempfile.TemporaryFile(prefix=PREFIX, dir=path.parent):
         pass
 
@@ -66,10 +63,10 @@ def write_bytes(path: Path, content: bytes, remedy: str = "") -> None:
 
 @contextmanager
 def write_folder(folder: Path) -> Iterator[Path]:
-    """Yield an empty folder to write files to; they move into `folder` when the block ends without an error.
+    """Yield an empty folder to write files to. The files move into `folder` when the block ends without an error.
 
-    Each file of `folder` is whole at any moment, but they change one after the other; other files in it stay. Raises
-    BadInputError when a file cannot be written; an OSError about a file elsewhere passes.
+    Each file of `folder` is whole at any moment, but the files are replaced one after the other. Files with other names
+    stay. Raises BadInputError when a file cannot be written; an OSError about a file elsewhere passes.
     """
     with _os_errors_about(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -85,9 +82,9 @@ def write_folder(folder: Path) -> Iterator[Path]:
 
 @contextmanager
 def _os_errors_about(path: Path, remedy: str = "", own: Sequence[Path] = ()) -> Iterator[None]:
-    """Raise BadInputError about `path` for an OSError in the block.
+    """Turn an OSError of the block into a BadInputError about `path`.
 
-    `own`: if given, an OSError that names a file outside these places passes unchanged.
+    `own`: files and folders that the block writes. If given, an OSError that names a file elsewhere passes unchanged.
     """
     try:
         yield
@@ -113,7 +110,7 @@ def _is_stream(path: Path) -> bool:
 
 
 def _flush(file: Path) -> None:
-    """Bring the content of `file` to the disk, so that a name never stands for less than the whole."""
+    """Force the content of `file` to the disk: after a power failure, a renamed file must not be incomplete."""
     fd = os.open(file, os.O_RDONLY)
     try:
         os.fsync(fd)

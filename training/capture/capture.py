@@ -1,7 +1,7 @@
 """A capture: frames of one person, each with its mask and the fit of the body, and the camera that took them.
 
-Rule: a `Capture` is whole. All faults of a folder are found before anything starts and are listed together. Layout on
-disk: docs/captures.md.
+Rule: a `Capture` has no faults. All faults of a folder are found before anything starts, and are listed together.
+docs/captures.md describes the files.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from trilane.unexpected_value import UnexpectedValue
 
 #: Least number of frames: one for each side of a person.
 LEAST_FRAMES = 4
-#: Least value of a mask's pixel that counts as the person's.
+#: Least value of a mask's pixel that shows the person.
 HALF = 128
 EXPECTED_FITS = "a folder of .npz files named like the frames, or one .npz"
 BODY = "body.npz"
@@ -49,8 +49,9 @@ Track = Callable[[Sequence[int]], Iterable[int]]
 class Capture:
     """A capture without faults.
 
-    `fits`: fit of each frame. `views` (4,4): view matrix of each frame. `mask_of`: number of each frame's mask.
-    `shaped`: body, whose shape is the mean of the fits' shapes. `body_file`: file from which it was read.
+    `file`: content of capture.toml. `body_file`: file from which the body was read. `shaped`: body with the shape
+    `betas`, `expression`, which are means over the fits. `fits`: fit of each frame. `views`: view matrix (4,4) of each
+    frame. `mask_of`: for each frame, the number of its mask in `masks`.
     """
 
     folder: Path
@@ -79,19 +80,22 @@ class Capture:
         return self.frames.names
 
     def picture(self, number: int) -> U8:
-        """Return frame `number` (h,w,4) with its mask as straight alpha.
+        """Return frame `number` (h,w,4), with its mask as straight alpha.
 
-        Raises UnexpectedValue when a file has changed since the capture was opened.
+        Raises UnexpectedValue for a file that has become unreadable since the capture was opened.
         """
         return np.dstack([self.frames.read(number), self.masks.read(self.mask_of[number])])
 
     def directions(self) -> list[tuple[float, float]]:
-        """Return yaw and height of each frame's camera, degrees, as `camera_direction` defines them."""
+        """Return (yaw, height) of each frame's camera in degrees, see `camera_direction`."""
         return directions(self.shaped, self.fits, self.views)
 
 
 def directions(shaped: ShapedBody, fits: Sequence[Fit], views: Sequence[F64]) -> list[tuple[float, float]]:
-    """Return yaw and height of each of the cameras `views` (4,4) that see `fits` of a body, see `camera_direction`."""
+    """Return (yaw, height) in degrees of the camera of each of `fits`, see `camera_direction`.
+
+    `shaped`: body that was fitted. `views`: view matrix (4,4) of each camera.
+    """
     root = shaped.joints[0]
     return [camera_direction(fit.pose, root + fit.place, view) for fit, view in zip(fits, views, strict=True)]
 
@@ -100,8 +104,7 @@ def open_capture(folder: Path, track: Track = iter) -> Capture:
     """Open the capture in `folder` and check every picture and fit.
 
     `track`: wraps the numbers of the frames to show progress.
-    Raises BadInputError for a capture.toml that cannot be read, FaultyCaptureError with all faults of the files that it
-    names.
+    Raises BadInputError for a capture.toml that cannot be read, FaultyCaptureError with all faults of the other files.
     """
     return _Opening(folder, read_capture_file(folder)).opened(track)
 
@@ -152,7 +155,10 @@ class _Opening:
             self.faults.append(Fault(self.file.frames, count, expected))
 
     def _matched(self, frames: Pictures, masks: Pictures) -> list[int]:
-        """Return the number of each frame's mask: by name in folders, else by place; -1 where there is none."""
+        """Return the number of each frame's mask; -1 and a fault for a frame without one.
+
+        If frames and masks both lie in folders, they are matched by file name, else by number.
+        """
         if isinstance(frames, PictureFolder) and isinstance(masks, PictureFolder):
             by_stem = {Path(name).stem: number for number, name in enumerate(masks.names)}
             found = [by_stem.get(Path(name).stem, -1) for name in frames.names]
@@ -165,7 +171,7 @@ class _Opening:
         return found
 
     def _look(self, frames: Pictures, masks: Pictures | None, mask_of: Sequence[int], track: Track) -> None:
-        """Read every picture once."""
+        """Read every frame and its mask, and add a fault for each unusable one."""
         shape = self.file.camera.shape
         for number in track(range(len(frames.names))):
             frame = self._read(frames, number, f"{self.file.frames}/{frames.names[number]}", shape)
@@ -189,7 +195,7 @@ class _Opening:
         return picture
 
     def _fits(self, names: Sequence[str], body: Body) -> list[Fit]:
-        """Return the fits that could be read."""
+        """Return the fits that could be read, and add the faults of the others. `names`: names of the frames."""
         path, fits = self.folder / self.file.fits, []
         one = self._try(lambda: _fits_of_file(path, len(names))) if path.is_file() else None
         if not path.is_dir() and one is None:
@@ -214,9 +220,9 @@ class _Opening:
             return None
 
     def _require_sides(self, seen: Sequence[tuple[float, float]], frames: int) -> None:
-        """Add a fault where a side of the person is shown by no frame.
+        """Add a fault for the sides of the person that no frame shows.
 
-        `seen`: yaw and height of each camera whose fit could be read. `frames`: number of frames.
+        `seen`: (yaw, height) of each camera whose fit could be read. `frames`: number of frames.
         """
         shown = frames_by_side([yaw for yaw, _ in seen])
         missing = [side for side, count in shown.items() if not count and side not in self.file.missing_views]
@@ -228,13 +234,16 @@ class _Opening:
 
 
 def _mean(rows: Sequence[F64]) -> F64:
-    """Return the mean of rows of coefficients; a row that lacks a coefficient counts as 0 there."""
+    """Return the mean of rows of coefficients; coefficients that a shorter row lacks count as 0."""
     longest = max(len(row) for row in rows)
     return np.asarray(np.mean([np.pad(row, (0, longest - len(row))) for row in rows], axis=0))
 
 
 def _fits_of_file(path: Path, count: int) -> list[Mapping[str, NDArray[Any]]]:
-    """Return the arrays of each frame from one file; shape arrays may hold for all frames. Raises BadInputError."""
+    """Return the arrays of each frame's fit from one file of `count` frames. Raises BadInputError.
+
+    An array of `SHAPE` with one dimension applies to all frames.
+    """
     arrays = read_npz(path, NAMES, EXPECTED_FITS)
     shared = {name: arrays.pop(name) for name in SHAPE if name in arrays and arrays[name].ndim < 2}
     for name, array in arrays.items():
@@ -245,18 +254,21 @@ def _fits_of_file(path: Path, count: int) -> list[Mapping[str, NDArray[Any]]]:
 
 # The sides from which a capture shows the person: the direction of the camera in the body's own axes.
 #
-# Rule: directions are relative to the root joint; +Z is the way that the body faces, +X its left.
+# Rule: directions are relative to the root joint; the body faces +Z, and its left is +X.
 
-#: Angle about the body, in degrees, from which the camera sees each side: 0 from the front, 90 from the body's left.
+#: Yaw in degrees of a camera that looks straight at each side.
 SIDES = {"front": 0.0, "left": 90.0, "back": 180.0, "right": -90.0}
-#: Width of a step in the table of directions, degrees.
+#: Width of a bin in the histogram of the cameras' yaws, degrees.
 STEP_DEG = 30
 
 
 def camera_direction(pose: F64, root: F64, view: F64) -> tuple[float, float]:
-    """Return the camera's yaw (0 front, 90 left, in -180..180) and height above the body's own horizon, degrees.
+    """Return (yaw, height) of a camera in the body's own axes, degrees.
 
-    `pose`: (55,3). `root`: place of the posed root joint, (3,). `view`: matrix (4,4) from the world of both to the
+    The yaw is 0 in front of the body and 90 on its left, in -180..180. The height is the angle above the body's
+    horizontal plane.
+
+    `pose`: axis-angle (55,3). `root`: place of the posed root joint, (3,). `view`: matrix (4,4) from the world to the
     camera.
     """
     eye = np.linalg.inv(view)[:3, 3]
@@ -265,27 +277,27 @@ def camera_direction(pose: F64, root: F64, view: F64) -> tuple[float, float]:
 
 
 def side_of(yaw_deg: float) -> str:
-    """Return the side that a camera at `yaw_deg` sees most of."""
+    """Return the side of the body, a name of `SIDES`, that is nearest to a camera at `yaw_deg`."""
     return min(SIDES, key=lambda side: abs((yaw_deg - SIDES[side] + 180) % 360 - 180))
 
 
 def frames_by_side(yaws_deg: Sequence[float]) -> dict[str, int]:
-    """Return the number of frames that show each side."""
+    """Return the number of frames that show each side, by name, from the yaw of each frame's camera."""
     sides = [side_of(yaw) for yaw in yaws_deg]
     return {side: sides.count(side) for side in SIDES}
 
 
 def widest_gap_deg(yaws_deg: Sequence[float]) -> float:
-    """Return the widest gap between the frames' directions about the body, degrees; 360 for one frame."""
+    """Return the widest gap, in degrees, between neighbouring cameras about the body; 360 for one camera."""
     turns = np.sort(np.asarray(yaws_deg) % 360)
     return float(np.diff(turns, append=turns[0] + 360).max())
 
 
 # Fits: pose, place and shape of the body in each frame, from .npz files with the names of SMPL-X or AMASS.
 #
-# Rule: a fit holds the arguments of the `smplx` library; every array is checked, and each defect is a fault of its own.
+# Rule: a fit holds the arguments of the `smplx` library. Every array is checked, and each defect is a separate fault.
 
-#: For each part of the pose, its place among the 165 numbers and the names that files have for it.
+#: For each part of the pose, its range (start, stop) among the 165 numbers, and the names that files have for it.
 PARTS: dict[tuple[int, int], tuple[str, ...]] = {
     (0, 3): ("global_orient", "root_orient"),
     (3, 66): ("body_pose", "pose_body"),
@@ -302,9 +314,9 @@ PLACE = ("transl", "trans")
 CAMERA = {"camera_rotation": 9, "camera_translation": 3}
 SHAPE = ("betas", "expression")
 NAMES = (*WHOLE, *(name for names in PARTS.values() for name in names), *PLACE, *SHAPE, *CAMERA)
-#: Sizes of other bodies' arrays, and what they are in words for people.
+#: Sizes of pose arrays of other body models, in words for people.
 OTHER_BODIES = {69: "23 joints: the SMPL layout", 72: "24 joints: the SMPL layout", 66: "22 joints", 63: "21 joints"}
-#: Joints of a whole pose, by its number of columns in SMPL-H and SMPL-X.
+#: For whole poses of 156 numbers (SMPL-H) and 165 numbers (SMPL-X): the joints, in the order of the numbers.
 COLUMNS = {width: WIDTHS[width][0] for width in (156, 165)}
 REMEDY = "convert the fits to SMPL-X"
 
@@ -316,8 +328,8 @@ class Fit:
     """The fit of one frame.
 
     `pose`: axis-angle (55,3), radians. `place`: translation (3,) added to the root joint, metres.
-    `betas`, `expression`: coefficients of the shape. `rotation` (3,3), `translation` (3,): the frame's own camera, or
-    None.
+    `betas`, `expression`: coefficients of shape and expression. `rotation` (3,3), `translation` (3,): the frame's own
+    camera; None if the frame has the camera of capture.toml.
     """
 
     pose: F64
@@ -329,9 +341,9 @@ class Fit:
 
 
 def read_fit(where: str, arrays: Arrays, body: Body, flat_hand_mean: bool) -> tuple[Fit | None, list[Fault]]:
-    """Return the fit in the `arrays` of one frame, or None, and its faults.
+    """Return the fit in the `arrays` of one frame, None if it has faults, and the faults.
 
-    `where`: name of the file. `body`: body that gives hand components and the mean hand. `flat_hand_mean`: whether the
+    `where`: name of the file. `body`: body with the hand components and the mean hand. `flat_hand_mean`: whether the
     fit's hands already include the mean hand.
     """
     faults: list[Fault] = []
@@ -354,7 +366,7 @@ def read_fit(where: str, arrays: Arrays, body: Body, flat_hand_mean: bool) -> tu
 
 
 def _numbers(where: str, array: NDArray[Any], faults: list[Fault]) -> F64:
-    """Return `array` as a row of numbers; one with anything but finite numbers is a fault, and gives zeros."""
+    """Return `array` as a flat row; if it has anything but finite numbers, add a fault and return zeros."""
     if array.dtype.kind not in "fiu":
         faults.append(Fault(where, f"dtype {array.dtype}", "numbers"))
         return np.zeros(array.size)
@@ -373,7 +385,7 @@ def _require_size(where: str, row: F64, size: int, faults: list[Fault]) -> bool:
 
 
 def _pose(where: str, values: Mapping[str, F64], body: Body, faults: list[Fault]) -> F64:
-    """Return the pose (165,) from the whole pose's array or from its parts; only root and body are required."""
+    """Return the pose (165,) from an array of the whole pose, or from its parts; add a fault without root or body."""
     for name in WHOLE:
         if name in values:
             return _whole(f"{where}[{name}]", values[name], faults)

@@ -1,7 +1,7 @@
 """`capture.toml`: where a capture's frames, masks and fits lie, and the camera that took them.
 
-Rule: only types and ranges are checked here, and every defect of the file is listed; `capture.py` checks the files that
-it names.
+Rule: this module checks the types and ranges of capture.toml, and lists every defect. `capture.py` checks the content
+of the other files.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from trilane.unexpected_value import UnexpectedValue
 
 # The faults of a capture: they are listed together, so that a person fixes all of them before trying again.
 #
-# Rule: a fault names the file, what was found and what was expected; faults that differ only in the file are one entry.
+# Rule: a fault names the file, what was found and what was expected. Faults that differ only in the file share a line.
 
-#: Most files that one entry of the list names; the number of the others follows.
+#: Most files that one line names; the number of further files follows.
 MOST_NAMED = 12
 
 
@@ -51,7 +51,7 @@ class Fault:
 
 
 class FaultyCaptureError(BadInputError):
-    """A capture with faults. Exit code 2; its details list all `faults`."""
+    """A capture with faults. Exit code 2. The `details` list all `faults`."""
 
     def __init__(self, folder: str, faults: Sequence[Fault]) -> None:
         count = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
@@ -64,7 +64,7 @@ class FaultyCaptureError(BadInputError):
 
 
 def fault_lines(faults: Sequence[Fault]) -> list[str]:
-    """Return a line for each kind of fault, with the files that have it, in the order in which they were found."""
+    """Return a line for each kind of fault, with its files. Kinds and files are in the order of `faults`."""
     kinds: dict[tuple[str, str, str], list[str]] = {}
     for fault in faults:
         kinds.setdefault((fault.found, fault.expected, fault.remedy), []).append(fault.where)
@@ -81,15 +81,15 @@ EXPECTED = "a capture file (TOML): docs/captures.md"
 NEAR_M, FAR_M = 0.05, 100.0
 Side = Literal["front", "left", "back", "right"]
 Row = Annotated[tuple[Finite, Finite, Finite], LISTED]
-#: Turns a camera that looks along +Z with y down, as OpenCV's, into one that looks along -Z with y up.
+#: Rotation from the axes of an OpenCV camera (y down, looks along +Z) to those of an OpenGL camera (y up, along -Z).
 OPENGL_FROM_OPENCV: F64 = np.diag([1.0, -1.0, -1.0])
 
 
 class CameraTable(Table):
-    """The camera. Its lens is that of `scene/lens.py`: pixels are counted from the picture's top left corner.
+    """The camera. `fx`, `fy`, `cx`, `cy` are those of `Lens` in `scene/lens.py`, in pixels from the top left corner.
 
-    `axes`: convention of the camera's axes. `rotation` (rows), `translation`: transform from the world of the fits to
-    the camera, metres; without them, fits are in camera axes.
+    `axes`: convention of the camera's axes. `rotation` (rows of the matrix), `translation` (metres): transform from the
+    world of the fits to the camera. By default, fits are in camera axes.
     """
 
     width: int = Field(ge=64, le=2 * MAX_SIDE)
@@ -109,17 +109,17 @@ class CameraTable(Table):
 
     @property
     def lens(self) -> Lens:
-        """Lens that made the frames."""
+        """Lens of the frames."""
         return Lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
     def projection(self) -> F64:
-        """Return the OpenGL clip matrix (4,4) of a frame."""
+        """Return the OpenGL projection matrix (4,4) of the frames."""
         return self.lens.projection(NEAR_M, FAR_M)
 
     def view(self, rotation: Any = None, translation: Any = None) -> F64:
         """Return the matrix (4,4) from the world of the fits to the OpenGL camera.
 
-        `rotation`, `translation`: a frame's own camera, which replaces this table's.
+        `rotation` (3,3), `translation` (3,): a frame's own camera; None: the camera of this table.
         """
         axes = OPENGL_FROM_OPENCV if self.axes == "opencv" else np.eye(3)
         view = np.eye(4)
@@ -129,11 +129,11 @@ class CameraTable(Table):
 
 
 class CaptureFile(Table):
-    """The content of `capture.toml`. Names of files are relative to its folder.
+    """The content of `capture.toml`. File names are relative to the folder of the capture.
 
     `body`: `default` or a body file. `frames`, `masks`: a folder of pictures or a video. `fits`: a folder with a .npz
-    for each frame, or one .npz for all. `flat_hand_mean`: false where the body's mean hand has to be added to the fits'
-    hands. `missing_views`: sides of the person that need no frame.
+    for each frame, or one .npz for all frames. `flat_hand_mean`: whether the fits' hands already include the body's
+    mean hand. `missing_views`: sides of the person that need no frame.
     """
 
     schema_: Literal[1] = Field(default=1, alias="schema")
@@ -147,7 +147,10 @@ class CaptureFile(Table):
 
 
 def read_capture_file(folder: Path) -> CaptureFile:
-    """Read `capture.toml` of `folder`. Raises BadInputError; FaultyCaptureError with every defect of its keys."""
+    """Return the content of `capture.toml` in `folder`.
+
+    Raises BadInputError for a file that is no TOML, FaultyCaptureError with every defect of the keys.
+    """
     path = folder / NAME
     try:
         values = tomllib.loads(read_text(path, EXPECTED))
@@ -160,7 +163,7 @@ def read_capture_file(folder: Path) -> CaptureFile:
 
 
 def _fault(details: dict[str, Any]) -> Fault:
-    """Turn one of the `errors()` of a ValidationError into a fault."""
+    """Return the fault for `details`, one of the `errors()` of a pydantic ValidationError."""
     where = f"{NAME}: {'.'.join(map(str, details['loc']))}"
     if details["type"] == "missing":
         return Fault(where, "nothing", "a value", "add the key")
@@ -173,12 +176,12 @@ def _fault(details: dict[str, Any]) -> Fault:
 
 # Pictures of a capture: a folder of files, or a video.
 #
-# Rule: a picture is read as it is stored; one of another kind is refused and never converted. A video is decoded
-# forwards, so a reader that goes in order decodes it once.
+# Rule: a picture is read as it is stored. A picture of a wrong mode is refused, never converted. A video is decoded
+# forwards; reading its pictures in order decodes each of them once.
 
 ENDINGS = (".png", ".jpg", ".jpeg")
 VIDEO_ENDINGS = (".mp4", ".mkv", ".mov", ".avi", ".webm")
-#: What the picture of a mode holds, in words for people.
+#: Modes of Pillow in words for people.
 MODES = {
     "L": "one channel (grey)",
     "1": "one channel (black and white)",
@@ -188,8 +191,8 @@ MODES = {
     "RGBA": "four channels (RGBA)",
     "CMYK": "four channels (CMYK)",
 }
-#: For each kind of picture, the modes that it is stored in, what is expected, how to fix it, and PyAV's format of a
-#: video.
+#: For each kind of picture: allowed modes of Pillow, expected and remedy of the error about another mode, and the PyAV
+#: format into which a video's pictures are decoded.
 FRAME, MASK = "frame", "mask"
 STORED: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     FRAME: (
@@ -205,7 +208,7 @@ STORED: dict[str, tuple[tuple[str, ...], str, str, str]] = {
 class Pictures(Protocol):
     """Frames or masks of a capture.
 
-    `names`: name of each picture, in their order.
+    `names`: name of each picture, in the order of their numbers.
     """
 
     names: tuple[str, ...]
@@ -215,7 +218,10 @@ class Pictures(Protocol):
 
 
 def open_pictures(path: Path, kind: str) -> Pictures:
-    """Open the pictures at `path`, a folder or a video. Raises BadInputError when there are none."""
+    """Open the pictures at `path`, a folder or a video. Raises BadInputError when there are no pictures.
+
+    `kind`: `FRAME` or `MASK`.
+    """
     expected = f"a folder of {kind}s ({', '.join(ENDINGS)}) or a video ({', '.join(VIDEO_ENDINGS)})"
     if path.is_dir():
         names = sorted(each.name for each in path.iterdir() if each.suffix.lower() in ENDINGS)
@@ -230,13 +236,13 @@ def open_pictures(path: Path, kind: str) -> Pictures:
 
 
 class PictureFolder:
-    """Pictures that are files of `folder`."""
+    """Pictures that are the files `names` in `folder`."""
 
     def __init__(self, folder: Path, names: tuple[str, ...], kind: str) -> None:
         self.folder, self.names, self._kind = folder, names, kind
 
     def read(self, number: int) -> U8:
-        """Return a picture as `Pictures.read` does."""
+        """Return picture `number`, see `Pictures.read`."""
         modes, expected, remedy, _ = STORED[self._kind]
         try:
             with Image.open(self.folder / self.names[number]) as image:
@@ -250,7 +256,7 @@ class PictureFolder:
 
 
 class PictureVideo:
-    """Pictures that are frames of a video; it is decoded once to count them."""
+    """Pictures that are frames of a video. The constructor decodes the whole video to count the frames."""
 
     def __init__(self, path: Path, kind: str) -> None:
         self._path, self._kind = path, kind
@@ -261,7 +267,7 @@ class PictureVideo:
             raise BadInputError(path, "a video without frames", f"a video of {kind}s")
 
     def read(self, number: int) -> U8:
-        """Return a picture as `Pictures.read` does; going back opens the video again."""
+        """Return picture `number`, see `Pictures.read`. A smaller number than before opens the video again."""
         if number < self._next or not self._next:
             self._stream, self._next = self._frames(), 0
         frame = None
@@ -274,7 +280,7 @@ class PictureVideo:
         return np.asarray(frame.to_ndarray(format=form))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state for another process, which opens the video itself."""
+        """Return the state to pickle. Another process that unpickles it opens the video itself."""
         return self.__dict__ | {"_stream": iter(()), "_next": 0}
 
     def _frames(self) -> Iterator[Any]:

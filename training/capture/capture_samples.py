@@ -1,7 +1,7 @@
 """Samples of a capture for training: random views of its frames, cropped as the pipeline crops.
 
 Rule: the UV image is drawn with the view's own camera, and the ground truth is resampled once from the whole frame.
-Both are empty where the frame ends. A sample depends only on its seed.
+Both are empty outside the frame. A sample depends only on its seed.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from trilane.training.random_views import BANDS, OUTPUT_ROWS, SCREENS, Crop, Cro
 from trilane.training.sample_renderer import ANYWHERE_BAND, BAND_NAMES, LEAST_PIXELS, UvRaster
 from trilane.training.surface import vertex_areas
 
-#: Number of draws of a view before an error says that no frame has one.
+#: Number of random views that are tried before an error says that no frame has a usable view.
 TRIES = 1000
-#: Number of frames that are kept decoded, because samples of one frame follow each other.
+#: Number of frames that are kept decoded, because successive samples often use the same frame.
 KEPT = 4
 #: One frame of this many successive ones is held out.
 HELD_OUT_EVERY = 10
@@ -38,11 +38,11 @@ HELD_OUT_EVERY = 10
 
 @dataclass(frozen=True)
 class CaptureSample:
-    """A sample to render.
+    """A planned sample of a capture.
 
-    `picture`: number of the frame. `crop`: crop whose projection draws the body, before it is mirrored.
-    `by` (3,3): map from the frame's pixels to the tensor's. `mirrored`: whether `by` mirrors, see `unmirrored`. `band`:
-    an index into BAND_NAMES, or ANYWHERE_BAND.
+    `picture`: number of the frame. `crop`: crop whose projection draws the body; if `mirrored`, the drawn columns must
+    be reversed afterwards, see `unmirrored`. `by`: map (3,3) from the frame's pixels to the tensor's pixels; it
+    includes the mirroring. `band`: an index into BAND_NAMES, or ANYWHERE_BAND.
     """
 
     picture: int
@@ -58,10 +58,9 @@ class CaptureRenderer:
     def __init__(self, capture: Capture, numbers: Sequence[int], rule: ViewRule, threads: int | None = None) -> None:
         """Open the context.
 
-        `capture`: capture whose frames are shown.
-        `numbers`: numbers of these frames.
-        `rule`: how views are drawn.
-        `threads`: threads of a software OpenGL driver.
+        `numbers`: numbers of the frames of `capture` that samples may show.
+        `rule`: limits of the random views.
+        `threads`: number of threads of a software OpenGL driver.
         Raises MissingPartError without OpenGL.
         """
         self.capture, self._numbers, self._rule = capture, list(numbers), rule
@@ -73,10 +72,10 @@ class CaptureRenderer:
         self._kept: OrderedDict[int, U8] = OrderedDict()
 
     def training_sample(self, seed: Sequence[int], band: str, size: str) -> CaptureSample:
-        """Plan the sample of `seed`: draw frames and views until enough of the body is on the screen.
+        """Return the planned sample of `seed`: the first random view with enough of the body on the screen.
 
         `band`: a name of BANDS, or `anywhere`. `size`: tensor size, as `shape_buckets` takes it.
-        Raises BadInputError when no frame has such a view.
+        Raises BadInputError when `TRIES` random views have too little of the body.
         """
         rng = np.random.default_rng(seed)
         for _ in range(TRIES):
@@ -87,7 +86,7 @@ class CaptureRenderer:
         raise BadInputError(self.capture.folder, found, "frames that show the whole person")
 
     def whole_sample(self, number: int, size: str) -> CaptureSample | None:
-        """Return frame `number` unaugmented, cropped to the person; None where nothing of the body is in it."""
+        """Return a sample of frame `number` without augmentation, cropped to the person; None if no body is in it."""
         capture = self.capture
         posed, view, frame = self._raster.posed(capture.fits[number]), capture.views[number], capture.shape
         crop = self._cropper.crop(posed, View(view, self._projection, frame[1] / frame[0]), shape_buckets(size))
@@ -97,7 +96,7 @@ class CaptureRenderer:
         return CaptureSample(number, crop, by, False, ANYWHERE_BAND)
 
     def placed(self, sample: CaptureSample) -> tuple[F64, Placement]:
-        """Return the camera (4,4) of a sample that is not mirrored, and its body as the packed pass draws it."""
+        """Return the view matrix (4,4) of a sample without mirroring, and the placement of its body for the raster."""
         pose, crop = self._raster.body_pose(self.capture.fits[sample.picture]), sample.crop
         placement = Placement(pose.joints, crop.projection, (0, 0, *crop.shape), pose.feature)
         return self.capture.views[sample.picture], placement
@@ -121,7 +120,7 @@ class CaptureRenderer:
         return CaptureSample(number, crop, whole, mirrored, BAND_NAMES.index(band) if band in BANDS else ANYWHERE_BAND)
 
     def render(self, sample: CaptureSample) -> tuple[F32, U8]:
-        """Return the UV image (h,w,3) float32 of u, v, coverage, and the ground truth (h,w,4) uint8, straight alpha."""
+        """Return the UV image (h,w,3) float32 (u, v, coverage) and the ground truth (h,w,4) uint8, straight alpha."""
         capture, crop = self.capture, sample.crop
         view = capture.views[sample.picture]
         uv = self._raster.uv(capture.fits[sample.picture], view, crop.projection, crop.shape)
@@ -139,7 +138,10 @@ class CaptureRenderer:
 
 
 def held_out_frames(count: int, bad: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Split `count` frames without the `bad` ones into training frames and every tenth, which training never reads."""
+    """Return the numbers of the training frames and of the held-out frames, which are every tenth.
+
+    `count`: number of all frames. `bad`: numbers of frames to leave out of both.
+    """
     good = [number for number in range(count) if number not in set(bad)]
     held_out = good[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY]
     return [number for number in good if number not in set(held_out)], held_out
@@ -147,7 +149,7 @@ def held_out_frames(count: int, bad: Sequence[int]) -> tuple[list[int], list[int
 
 # The body of a capture as the pipeline rasterises it: UV images of its fits.
 #
-# Rule: mesh, skinning and raster are the pipeline's; a body that has pose blend shapes is drawn with them.
+# Rule: mesh, skinning and raster are those of the pipeline. A body with pose blend shapes is drawn with them.
 
 
 class BodyRaster:
@@ -156,7 +158,7 @@ class BodyRaster:
     def __init__(self, shaped: ShapedBody, threads: int | None = None) -> None:
         """Open the context.
 
-        `threads`: threads of a software OpenGL driver. Raises MissingPartError without OpenGL.
+        `threads`: number of threads of a software OpenGL driver. Raises MissingPartError without OpenGL.
         """
         self.ctx = open_context(threads)
         self._blended = shaped.body.posedirs is not None
@@ -182,32 +184,31 @@ class BodyRaster:
         return self._raster.render(pose.joints, view, projection, shape, pose.feature)
 
     def uv_of(self, capture: Capture, number: int) -> F32:
-        """Return the UV image of frame `number` of `capture`, as large as the frame."""
+        """Return the UV image (h,w,3) of frame `number` of `capture`, with the size of the frame."""
         return self.uv(capture.fits[number], capture.views[number], capture.file.camera.projection(), capture.shape)
 
 
 # Affine maps from a frame to a tensor's picture, and the same maps applied to the camera: camera-space augmentation.
 #
-# Rule: a single map, in pixels, resamples the ground truth from its full resolution. The same map, brought into clip
-# space, moves the camera that rasterises the body. So both agree for any camera matrix, any turn, scale, flip and
-# shift, and any aspect; the body is rasterised for each view and never resampled.
+# Rule: a single map, in pixels, resamples the ground truth from its full resolution. The same map, converted to clip
+# space, changes the projection that rasterises the body. Picture and body thus agree for any camera matrix, any turn,
+# scale, flip and shift, and any aspect ratio. The body is rasterised for each view and never resampled.
 #
-# The thesis (section 3.3, formulas 3.18 to 3.20) turns and scales the extrinsics and moves the principal point, which
-# is the same only for lenses with fx = fy. After projection the map is exact for every lens.
+# The thesis (section 3.3, formulas 3.18 to 3.20) turns and scales the extrinsics and moves the principal point. That is
+# equivalent only for lenses with fx = fy. A map that is applied after the projection is exact for every lens.
 #
-# Pixels: x to the right, y down, from the picture's corner; the middle of the first pixel is (0.5, 0.5).
+# Pixels: x to the right, y down, from the picture's top left corner; the centre of the first pixel is (0.5, 0.5).
 
 NO_FLIP = (False, False)
 
 
 @dataclass(frozen=True)
 class Augmentation:
-    """The changes to a frame before it is a sample.
+    """The changes that make a sample of a frame.
 
-    `centre` (x, y): point of the frame, in its pixels, that moves to the middle of the target. `turn_rad`: turn about
-    that point, clockwise as the picture is seen, radians. `scale` (x, y): target pixels for a pixel of the frame along
-    its rows and columns, before the turn. `flip` (left-right, upside-down): mirroring before the turn. `shift` (x, y):
-    shift after the turn, in pixels of the target.
+    `centre` (x, y): point of the frame, in pixels, that moves to the middle of the target. `turn_rad`: clockwise turn
+    about that point, radians. `scale` (x, y): target pixels per frame pixel along x and y, before the turn. `flip`
+    (left-right, upside-down): mirroring before the turn. `shift` (x, y): shift after the turn, in target pixels.
     """
 
     centre: tuple[float, float]
@@ -229,14 +230,16 @@ def image_map(augmentation: Augmentation, target: Shape) -> F64:
 
 
 def moved(points: ArrayLike, by: F64) -> F64:
-    """Return `points` (..., 2), in pixels, moved by the map `by` (3,3)."""
+    """Return `points` (..., 2), in pixels, after the affine map `by` (3,3)."""
     return np.asarray(points, np.float64) @ by[:2, :2].T + by[:2, 2]
 
 
 def augmented_projection(projection: ArrayLike, by: F64, frame: Shape, target: Shape) -> F64:
-    """Return a camera's `projection` (4,4) after the map `by` (3,3), from pictures of shape `frame` to `target`.
+    """Return the projection (4,4) of a camera whose picture is that of `projection` after the map `by`.
 
-    Depth does not change, and only a flip changes the sense in which triangles turn.
+    Depth does not change, and only a flip reverses the winding of triangles.
+
+    `by`: affine map (3,3) from pixels of a picture of shape `frame` to pixels of a picture of shape `target`.
     """
     plane = _ndc_from_pixels(target) @ by @ np.linalg.inv(_ndc_from_pixels(frame))
     after = np.eye(4)
@@ -245,7 +248,10 @@ def augmented_projection(projection: ArrayLike, by: F64, frame: Shape, target: S
 
 
 def map_between(before: ArrayLike, after: ArrayLike, frame: Shape, target: Shape) -> F64:
-    """Return the map (3,3) by which `augmented_projection` makes `after` (4,4) from `before` (4,4): its inverse."""
+    """Return the map (3,3) with which `augmented_projection` turns the projection `before` (4,4) into `after` (4,4).
+
+    `frame`, `target`: (height, width) of the pictures of `before` and of `after`.
+    """
     clip = np.asarray(after, np.float64) @ _inverse(np.asarray(before, np.float64))
     plane = np.eye(3)
     plane[:2, :2], plane[:2, 2] = clip[:2, :2], clip[:2, 3]
@@ -253,7 +259,7 @@ def map_between(before: ArrayLike, after: ArrayLike, frame: Shape, target: Shape
 
 
 def projected(points: ArrayLike, clip: F64, shape: Shape) -> F64:
-    """Return the pixels (..., 2) of `points` (..., 3) in a picture of `shape`.
+    """Return the pixel coordinates (..., 2) of world `points` (..., 3) in a picture of `shape`.
 
     `clip`: projection @ view, (4,4).
     """
@@ -263,10 +269,10 @@ def projected(points: ArrayLike, clip: F64, shape: Shape) -> F64:
 
 
 def unmirrored(by: F64, target: Shape) -> tuple[F64, bool]:
-    """Return `by` without its mirroring, and whether columns drawn with it must be reversed afterwards.
+    """Return the map `by` (3,3) without its mirroring, and whether drawn columns must be reversed afterwards.
 
-    A mirrored camera would turn triangles over, and rasters leave out triangles that face away. Pixel centres lie
-    symmetrically, so reversing the columns is exact.
+    A mirroring camera would reverse the winding of triangles, and the raster would cull the wrong ones. Reversing the
+    columns of the drawn picture is exact, because pixel centres lie symmetrically.
     """
     if np.linalg.det(by[:2, :2]) > 0:
         return by, False
@@ -275,17 +281,20 @@ def unmirrored(by: F64, target: Shape) -> tuple[F64, bool]:
 
 
 def seen_of_frame(by: F64, frame: Shape, target: Shape) -> Mask:
-    """Return the target's pixels (h,w) whose centre lies inside the frame; nothing is known of the others."""
+    """Return which of the target's pixels (h,w) have their centre inside the frame.
+
+    `by`: map (3,3) from the frame's pixels to the target's pixels.
+    """
     rows, columns = np.mgrid[: target[0], : target[1]] + 0.5
     x, y = np.moveaxis(moved(np.stack([columns, rows], axis=-1), _inverse(by)), -1, 0)
     return np.asarray((x >= 0) & (x < frame[1]) & (y >= 0) & (y < frame[0]))
 
 
 def resampled(rgba: U8, by: F64, target: Shape) -> U8:
-    """Return the picture (h,w,4) of shape `target` that `by` (3,3) makes of `rgba` (H,W,4), both with straight alpha.
+    """Return `rgba` (H,W,4) after the map `by` (3,3), as a picture (h,w,4) of shape `target`; both have straight alpha.
 
-    Each side is first shrunk to the mean of its pixels, by the greatest whole number that the map allows. The result is
-    read bilinearly once; outside of `rgba` it is 0, 0, 0, 0. Colours are weighted by alpha.
+    Where the map shrinks, whole blocks of pixels are first averaged. The result is then sampled bilinearly once. It is
+    0, 0, 0, 0 outside `rgba`. Colours are weighted by alpha.
     """
     whole = Image.fromarray(rgba, "RGBA").convert("RGBa")
     columns, rows = (max(1, int(1 / length)) for length in np.linalg.norm(by[:2, :2], axis=0))
@@ -296,7 +305,7 @@ def resampled(rgba: U8, by: F64, target: Shape) -> U8:
 
 
 def _ndc_from_pixels(shape: Shape) -> F64:
-    """Return the map (3,3) from pixels of a picture of `shape`, y down, to normalised device coordinates, y up."""
+    """Return the map (3,3) from pixels of a picture of `shape`, y down, to NDC, y up."""
     return np.array([[2.0 / shape[1], 0.0, -1.0], [0.0, -2.0 / shape[0], 1.0], [0.0, 0.0, 1.0]])
 
 
@@ -304,15 +313,15 @@ def _inverse(matrix: F64) -> F64:
     return np.asarray(np.linalg.inv(matrix), np.float64)
 
 
-# Points of the body that close-ups are centred on: vertices, drawn so that all parts of the surface are equally
+# Points of the body at which random views are centred: random vertices, so that all parts of the surface are equally
 # probable.
 #
-# Rule: a vertex is drawn by its share of the surface's area. SMPL-X has about as many vertices in the head as
-# elsewhere. To make up for that, the thesis (section 3.3) weights joints by the volume about them; areas do so exactly.
+# Rule: the probability of a vertex is its share of the surface's area. SMPL-X has about as many vertices in the head as
+# in the rest of the body. The thesis (section 3.3) therefore weights joints by the volume about them; areas are exact.
 
 
 class VertexCentres:
-    """Draws vertices by their area, among those that a band's joints move most; `anywhere` is the whole body."""
+    """Chooses random vertices, with probabilities by area, among the vertices that a band's joints move most."""
 
     def __init__(self, shaped: ShapedBody) -> None:
         self._shaped = shaped
@@ -320,36 +329,40 @@ class VertexCentres:
         self._joint = shaped.body.weights.argmax(axis=1)
 
     def shares(self, band: str) -> F64:
-        """Return the probability (V,) of each vertex in `band`; they sum to 1."""
+        """Return the probability (V,) of each vertex in `band`, a name of `BANDS` or `anywhere`; the sum is 1."""
         names = BANDS[band][0] if band in BANDS else JOINT_NAMES
         area = self._area * np.isin(self._joint, [JOINT_INDEX[name] for name in names])
         return np.asarray(area / area.sum())
 
     def draw(self, rng: np.random.Generator, band: str, posed: Posed) -> F64:
-        """Draw a point (3,), world metres, of `posed` for a view of `band`: a name of `BANDS`, or `anywhere`."""
+        """Return a random vertex (3,) of the body `posed`, world metres.
+
+        `band`: band of the view, a name of `BANDS` or `anywhere`.
+        """
         vertex = int(rng.choice(len(self._area), p=self.shares(band)))
         weights = self._shaped.body.weights[vertex : vertex + 1].astype(np.float64)
         matrix = blend_matrices(weights, posed.matrices.reshape(JOINTS, 12).astype(np.float64)).reshape(3, 4)
         return np.asarray(matrix[:, :3] @ self._shaped.vertices[vertex] + matrix[:, 3])
 
 
-# Random views of a frame of a capture: the part of it that becomes the screen, by the bands of zoom of `random_views`.
+# Random views of a frame of a capture: the part of the frame that becomes the screen, by the bands of `random_views`.
 #
-# Rule: a view is a map of the frame's pixels, applied to its camera as well (`image_map`). Bands say how many metres
-# fill the screen's height, so they mean the same as for the synthetic person. A frame is enlarged by at most a stated
-# factor.
+# Rule: a view is an affine map of the frame's pixels (`image_map`), applied to the frame's camera too. A band states
+# how many metres fill the screen's height, so the bands mean the same as for the synthetic person. A frame is enlarged
+# by at most `most_enlarged`.
 
-#: Range of metres over the screen's height in band `anywhere`, as in `random_view`.
+#: Least and most metres over the screen's height in band `anywhere`, as in `random_view`.
 ANYWHERE_M = (0.4, 2.5)
 
 
 @dataclass(frozen=True)
 class ViewRule:
-    """How views are drawn.
+    """Limits of random views.
 
-    `turn_deg`: largest turn. `squeeze`: largest share by which rows are scaled more or less than columns. `flip_share`:
-    share of views whose left and right are exchanged. `shift`: largest distance of the centre from the screen's middle,
-    as a share of its height. `most_enlarged`: most pixels of the screen for a pixel of the frame, along a side.
+    `turn_deg`: largest turn, degrees. `squeeze`: largest relative difference between the scales along x and y.
+    `flip_share`: share of views with left and right exchanged. `shift`: largest distance along x or y between the
+    view's centre and the screen's middle, as a share of the screen's height. `most_enlarged`: most screen pixels per
+    frame pixel, along a side.
     """
 
     turn_deg: float = 8.0
@@ -377,7 +390,7 @@ class SampleCamera:
 
 
 def screen_shape(rng: np.random.Generator) -> Shape:
-    """Return (height, width) of a random screen of `OUTPUT_ROWS` rows."""
+    """Return (height, width) of a screen of `OUTPUT_ROWS` rows with a random aspect ratio of `SCREENS`."""
     return OUTPUT_ROWS, round(OUTPUT_ROWS * SCREENS[rng.integers(len(SCREENS))])
 
 
@@ -390,9 +403,10 @@ def zoomed_view(
     rule: ViewRule,
     screen: Shape,
 ) -> F64 | None:
-    """Return a random map (3,3) of `band` from the frame to a screen; None when its centre is not in the frame.
+    """Return a random map (3,3) from the frame's pixels to the screen's; None if its centre is outside the frame.
 
-    `band`: a name of `BANDS`, or `anywhere`. `posed`: body in the frame. `screen`: (height, width).
+    `band`: band of the view, a name of `BANDS` or `anywhere`. `posed`: body in the frame. `centres`: chooses the
+    vertex at the view's centre. `screen`: (height, width).
     """
     least, most = BANDS[band][1:] if band in BANDS else ANYWHERE_M
     point = centres.draw(rng, band, posed)

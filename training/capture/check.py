@@ -1,4 +1,4 @@
-"""Checks a capture: whether the body lies where the masks are, from where the person is seen, and what is never seen.
+"""Checks a capture: how well the body covers the masks, from which sides the person is seen, and what is never seen.
 
 Rule: the body is drawn as training draws it. Bad fits are reported by frame, and no frame is changed.
 """
@@ -21,11 +21,11 @@ from trilane.training.capture.capture_samples import BodyRaster
 from trilane.training.first_texture import LEAST_WEIGHT, grown, head_on, lay_out
 from trilane.training.surface import BodyArrays, body_arrays, vertex_normals
 
-#: Below a half, body and mask have less in common than the two have alone, taken together.
+#: Least IoU of a good fit. Below a half, the common area of body and mask is smaller than the rest of their union.
 LEAST_IOU = 0.5
-#: A frame is an outlier when its IoU lies below the median by more than this many deviations, and by at least
-#: `LEAST_DROP`. The deviation is the median absolute one, scaled to a normal distribution's; `LEAST_DROP` is what rough
-#: outlines cause.
+#: A frame is an outlier if its IoU is below the median by more than `OUTLYING` deviations and more than `LEAST_DROP`.
+#: The deviation is the median absolute deviation, times `NORMAL_MAD` to estimate a standard deviation. Rough outlines
+#: of masks cause drops of up to `LEAST_DROP`.
 OUTLYING, NORMAL_MAD = 4.0, 1.4826
 LEAST_DROP = 0.05
 
@@ -34,9 +34,9 @@ LEAST_DROP = 0.05
 class CheckedFrame:
     """The agreement of a frame's body and mask.
 
-    `iou`: intersection over union of the drawn body and the mask. `outside`: share of the drawn body that the mask does
-    not cover.
-    Clothes and hair make the mask larger than the body, so a good fit has a small `outside`, and an IoU below 1.
+    `number`: number of the frame. `iou`: intersection over union of the drawn body and the mask. `outside`: share of
+    the drawn body that the mask does not cover.
+    Clothes and hair make the mask larger than the body. A good fit thus has a small `outside`, and an IoU below 1.
     """
 
     number: int
@@ -45,7 +45,7 @@ class CheckedFrame:
 
 
 def check_frames(capture: Capture, raster: BodyRaster, coverage: TexelCoverage) -> Iterator[CheckedFrame]:
-    """Yield the check of each frame of `capture`; `coverage` counts the texels that it shows."""
+    """Yield the check of each frame of `capture`, and add the texels that the frame shows to `coverage`."""
     for number in range(len(capture)):
         frame, uv, mask = checked_frame(capture, raster, number)
         coverage.add(coverage.drawn(uv, mask))
@@ -60,14 +60,17 @@ def checked_frame(capture: Capture, raster: BodyRaster, number: int) -> tuple[Ch
 
 
 def checked(number: int, drawn: Mask, mask: Mask) -> CheckedFrame:
-    """Return the check of frame `number`, whose body is `drawn` (h,w) and whose person is `mask` (h,w)."""
+    """Return the check of frame `number`.
+
+    `drawn`: (h,w), whether a pixel shows the drawn body. `mask`: (h,w), whether a pixel shows the person.
+    """
     together, both = int((drawn | mask).sum()), int((drawn & mask).sum())
     bodys = int(drawn.sum())
     return CheckedFrame(number, both / max(together, 1), 1 - both / bodys if bodys else 1.0)
 
 
 def bad_frames(frames: Sequence[CheckedFrame]) -> list[CheckedFrame]:
-    """Return the frames whose fit is off, worst first: an IoU below `LEAST_IOU`, or far below that of the others."""
+    """Return the frames with a bad fit, worst first: their IoU is below `LEAST_IOU`, or far below the median."""
     ious = np.array([frame.iou for frame in frames])
     median = float(np.median(ious))
     deviation = NORMAL_MAD * float(np.median(np.abs(ious - median)))
@@ -82,9 +85,9 @@ def coverage_of(capture: Capture) -> TexelCoverage:
 
 # Regions of a body's surface, by name, for reports on what a capture shows.
 #
-# Rule: every vertex is in one region; all are found from the body at rest: its joints, skin weights and normals.
+# Rule: every vertex is in exactly one region. Regions follow from the body at rest: joints, skin weights and normals.
 
-#: For each region, prefixes of the joints that move its vertices most; the first region that fits counts.
+#: For each region, prefixes of the names of the joints that move its vertices most. The first matching region counts.
 BY_JOINT = {
     "face and head": ("head", "jaw", "left_eye", "right_eye", "neck"),
     "left hand": ("left_wrist", *(f"left_{finger}" for finger in ("index", "middle", "pinky", "ring", "thumb"))),
@@ -96,10 +99,10 @@ BY_JOINT = {
 }
 SOLES, ARMPITS, CROWN = "soles", "armpits", "top of head"
 REGIONS = (*BY_JOINT, SOLES, ARMPITS, CROWN)
-#: Least vertical part of a normal that points down or up: within 45 degrees of the vertical.
+#: A unit normal points up or down if its vertical part exceeds this: within 45 degrees of the vertical.
 STEEP = 0.7
-#: Share of the head's height that is its top; reach of an armpit about the shoulder, as a share of the upper arm's
-#: length.
+#: `CROWN_SHARE`: share of the head's height that counts as its top. `ARMPIT_REACH`: radius of an armpit about the
+#: shoulder joint, as a share of the upper arm's length.
 CROWN_SHARE, ARMPIT_REACH = 0.25, 0.5
 
 
@@ -137,12 +140,12 @@ def _on_crown(body: BodyArrays, regions: NDArray[np.int64]) -> Mask:
     return np.asarray(head & (body.vertices[:, 1] > high - CROWN_SHARE * (high - low)))
 
 
-# Which texels of the body a capture shows: each pixel of a UV image that lies on the mask sees its texel.
+# Which texels of the body a capture shows: each pixel of a UV image that lies on the mask shows its texel.
 #
-# Rule: a texel counts as seen where its surface was seen less steeply than at the outline. Regions that no frame shows
-# are named, because their colours are filled from their surroundings.
+# Rule: a texel counts as seen only if it was seen at less grazing an angle than at the outline. Regions that no frame
+# shows are named, because their colours are filled from their surroundings.
 
-#: Largest share of seen texels in a region that counts as never seen.
+#: A region counts as never seen if at most this share of its texels is seen.
 HARDLY = 0.05
 #: Side of the texture on which coverage is counted, in texels.
 SIDE = 256
@@ -163,9 +166,9 @@ class TexelCoverage:
         self._drawn |= drawn
 
     def drawn(self, uv: F32, mask: Mask) -> Mask:
-        """Return the texels (S,S) that a frame's pixels lie on.
+        """Return which texels (S,S) a frame shows.
 
-        `uv` (h,w,3): UV image of the frame. `mask` (h,w): mask of the person.
+        `uv`: UV image (h,w,3) of the frame. `mask`: (h,w), whether a pixel shows the person.
         """
         shown = (head_on(uv[..., :2].astype(np.float64), uv[..., 2] > 0, self._side) > LEAST_WEIGHT) & mask
         texel = np.minimum((uv[..., :2][shown] * self._side).astype(np.int64), self._side - 1)
@@ -175,7 +178,7 @@ class TexelCoverage:
 
     @property
     def seen(self) -> Mask:
-        """Texels (S,S) of the body that were seen, or lie beside a seen one: a pixel spans a texel or two."""
+        """Texels (S,S) of the body that were seen, and their neighbours: a pixel may span two texels."""
         return np.asarray(grown(self._drawn) & self.used)
 
     @property
@@ -196,7 +199,7 @@ class TexelCoverage:
         return shares
 
     def never_seen(self) -> list[str]:
-        """Return the regions of which hardly any texel was seen."""
+        """Return the names of the regions whose share of seen texels is at most `HARDLY`."""
         return [name for name, share in self.share_by_region().items() if share <= HARDLY]
 
 
@@ -206,7 +209,10 @@ class TexelCoverage:
 
 
 def require_fits(capture: Capture, frames: Sequence[CheckedFrame], sheet: object) -> None:
-    """Raise FaultyCaptureError, which points to `sheet`, when most bodies are not where the masks are."""
+    """Raise FaultyCaptureError when the median IoU is below `LEAST_IOU`. Its remedy tells the user to look at `sheet`.
+
+    `sheet`: file, or words for the pictures that show the fits.
+    """
     median = float(np.median([frame.iou for frame in frames]))
     if median < LEAST_IOU:
         found = f"bodies that overlap the masks by a median IoU of {median:.2f}"
@@ -218,9 +224,11 @@ def require_fits(capture: Capture, frames: Sequence[CheckedFrame], sheet: object
 def capture_facts(
     capture: Capture, frames: Sequence[CheckedFrame], bad: Sequence[CheckedFrame], coverage: TexelCoverage
 ) -> dict[str, Any]:
-    """Return the facts of a check.
+    """Return the result of a check as JSON values.
 
     Keys: `capture`, `frames`, `size`, `betas`, `fit`, `bad`, `views`, `texels`; see docs/captures.md.
+
+    `frames`: checks of all frames. `bad`: checks of the frames with bad fits.
     """
     ious, outside = ([getattr(frame, name) for frame in frames] for name in ("iou", "outside"))
     return {
@@ -240,18 +248,22 @@ def capture_facts(
 
 
 def texel_facts(coverage: TexelCoverage) -> dict[str, Any]:
-    """Return the facts of a coverage.
+    """Return a coverage as JSON values.
 
-    `seen`: share of the body's texels. `regions`: share of each region's texels. `never_seen`: regions hardly seen.
+    Keys: `seen`, share of the body's texels that are seen; `regions`, the same share of each region; `never_seen`,
+    names of the regions that are hardly seen.
     """
     names = coverage.never_seen()
     return {"seen": coverage.share(), "regions": coverage.share_by_region(), "never_seen": names}
 
 
 def view_facts(directions: Sequence[tuple[float, float]]) -> dict[str, Any]:
-    """Count frames by side and by direction, from the (yaw, height) of cameras in degrees.
+    """Return counts of the frames' cameras as JSON values.
 
-    `by_yaw`: number of frames in steps of `STEP_DEG` from behind over the right, the front and the left.
+    Keys: `by_side`, number of frames that show each side; `by_yaw`, number of frames in each step of `STEP_DEG` from
+    yaw -180 (behind) over the right, the front and the left; `widest_gap_deg`; `height_deg`, least and greatest height.
+
+    `directions`: (yaw, height) of each frame's camera, degrees.
     """
     yaws = [yaw for yaw, _ in directions]
     heights = [height for _, height in directions]
@@ -266,7 +278,7 @@ def view_facts(directions: Sequence[tuple[float, float]]) -> dict[str, Any]:
 
 # A sheet that shows how the fits of a capture lie over its frames.
 #
-# Rule: over the frame, the drawn body is red and the rest of the mask is blue; each cell says its frame and IoU.
+# Rule: the drawn body is tinted red, and the part of the mask without body blue. Each cell names its frame and IoU.
 
 COLUMNS, MOST_CELLS = 4, 16
 CELL_WIDTH = 320
@@ -274,7 +286,7 @@ BODY_COLOUR, MASK_COLOUR = (255.0, 0.0, 0.0), (0.0, 64.0, 255.0)
 
 
 def chosen(frames: Sequence[CheckedFrame], bad: Sequence[CheckedFrame]) -> list[CheckedFrame]:
-    """Choose frames for the sheet: the worst of the `bad` ones for at most half of it, then others at even steps."""
+    """Return the frames for the sheet: the worst of `bad`, at most half of the cells, then others at even steps."""
     worst = list(bad[: MOST_CELLS // 2])
     others = [frame for frame in frames if frame not in bad]
     room = min(MOST_CELLS - len(worst), len(others))
@@ -282,7 +294,10 @@ def chosen(frames: Sequence[CheckedFrame], bad: Sequence[CheckedFrame]) -> list[
 
 
 def overlaid(picture: U8, uv: F32) -> U8:
-    """Draw the body of the UV image (h,w,3) over a frame with its mask as alpha (h,w,4), and return (h,w,3)."""
+    """Return a frame (h,w,3) with its drawn body and its mask in colour.
+
+    `picture`: frame (h,w,4) with its mask as alpha. `uv`: UV image (h,w,3) of the frame's body.
+    """
     result = picture[..., :3].astype(np.float64)
     drawn, mask = uv[..., 2] > 0, picture[..., 3] >= HALF
     for where, colour in ((drawn, BODY_COLOUR), (mask & ~drawn, MASK_COLOUR)):
@@ -291,7 +306,7 @@ def overlaid(picture: U8, uv: F32) -> U8:
 
 
 def sheet(cells: Sequence[tuple[str, U8]]) -> Image.Image:
-    """Arrange pictures (h,w,3) of one size in rows, each under its line of text."""
+    """Return one image of all `cells` in rows; each cell is a line of text and a picture (h,w,3) of the same size."""
     height, width = cells[0][1].shape[:2]
     size = (CELL_WIDTH, max(1, round(CELL_WIDTH * height / width)))
     columns = min(COLUMNS, len(cells))

@@ -1,7 +1,7 @@
-"""A capture of the default body, clothed: as many frames as wanted, in random poses, from all sides.
+"""Writes a synthetic capture of the clothed default body: any number of frames, in random poses, from all sides.
 
-Rule: a frame depends only on the seed and its number. The noise on fits and masks is stated, and the truth is kept
-beside them as a capture of its own.
+Rule: a frame depends only on the recipe and its number. If fits and masks have noise, the capture states the noise, and
+a second capture in the folder `truth` has the exact fits and masks.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ TRUTH = "truth"
 FOV_Y_DEG = 40.0
 PITCH_DEG = (-12.0, 4.0, 30.0)
 ROLL_DEG = 1.0
-#: Largest deviation of a frame from its even place, as a share of the turn between two frames: small enough that four
-#: frames show all sides.
+#: Largest random turn of a frame's camera from its even place about the body, as a share of the turn between two
+#: frames. It is small enough that four frames show all sides.
 JITTER = 0.3
-#: Largest share of the frame's half sides that the person reaches over; the least is this over `MOST_FARTHER`.
+#: Largest share of the picture that the person fills along a side. The camera may be `MOST_FARTHER` times as far away.
 FILLED = 0.94
 MOST_FARTHER = 1.3
 FAST_PNG = 1
-#: Size in pixels of the patches in which the outline of an imperfect mask moves alike, and of the background's patches.
+#: Distances in pixels between the random values that move a mask's outline, and between those of the background.
 MASK_PATCH_PX, BACKGROUND_PATCH_PX = 24, 160
-#: A blurred straight outline falls to a tenth of its height at this many standard deviations.
+#: A straight edge after a Gaussian blur has a tenth of its height at this many standard deviations.
 TENTH_AT = 1.2816
 
 
@@ -47,10 +47,10 @@ TENTH_AT = 1.2816
 class Recipe:
     """What a synthetic capture shows.
 
-    `frames`: number of pictures. `shape`: (height, width) of a picture. `seed`: seed of all of them.
-    `fit_deg`: largest turn of each joint of a fit about a random axis, degrees. `fit_mm`: largest move of the body
-    along each axis, millimetres. `mask_px`: largest move of a mask's outline, pixels. `look`: look of the person, a
-    name of `LOOKS`.
+    `frames`: number of frames. `shape`: (height, width) of a frame. `seed`: seed of all random numbers. `look`: look of
+    the person, a name of `LOOKS`.
+    The noise: `fit_deg`, largest turn of each joint of a fit about a random axis, degrees; `fit_mm`, largest move of
+    the body along each axis, millimetres; `mask_px`, largest move of a mask's outline, pixels.
     """
 
     frames: int
@@ -79,9 +79,9 @@ class Recipe:
 
 @dataclass(frozen=True)
 class SyntheticFrame:
-    """One frame and its truth.
+    """One frame with its mask and its fit.
 
-    `frame` (h,w,3), `mask` (h,w). `pose` (55,3), `place` (3,): pose and place as a fit has them, in the camera's OpenCV
+    `frame`: (h,w,3). `mask`: (h,w). `pose` (55,3), `place` (3,): pose and place as in `Fit`, in the camera's OpenCV
     axes.
     """
 
@@ -95,7 +95,10 @@ class SyntheticCapture:
     """Draws the frames of a recipe, with an OpenGL context of its own."""
 
     def __init__(self, shaped: ShapedBody, recipe: Recipe) -> None:
-        """Put clothes on `shaped`, whose shape is the look's, and open the context. Raises MissingPartError."""
+        """Open the context and put the clothes of the recipe's look on `shaped`. Raises MissingPartError.
+
+        `shaped`: body with the shape of the recipe's look.
+        """
         self._recipe, self._root = recipe, shaped.joints[0]
         self._renderer = SampleRenderer(shaped, look=look_named(recipe.look))
         self._projection = recipe.lens.projection(NEAR_M, FAR_M)
@@ -116,7 +119,7 @@ class SyntheticCapture:
         return SyntheticFrame(frame, rgba[..., 3].copy(), *in_camera(pose, self._root, view))
 
     def noisy(self, number: int, exact: SyntheticFrame) -> SyntheticFrame:
-        """Return `exact`, which is frame `number`, with the recipe's noise on its fit and its mask."""
+        """Return frame `number` with the recipe's noise on its fit and its mask; `exact` is the frame without noise."""
         recipe = self._recipe
         rng = np.random.default_rng((recipe.seed, 5, number))
         pose = turned_at_random(rng, exact.pose, recipe.fit_deg)
@@ -126,10 +129,10 @@ class SyntheticCapture:
 
 
 def framing_view(rng: np.random.Generator, yaw: float, points: F64, projection: F64) -> F64:
-    """Return the view (4,4) of a camera at `yaw` whose picture holds all `points` (N,3) and is nearly filled by them.
+    """Return the view matrix (4,4) of a camera at `yaw`, radians, whose picture is nearly filled by `points` (N,3).
 
-    Let (x, y, z) be a point relative to the aim, in camera axes, and t the tangent of half the picture's angle. The
-    point is in the picture from a distance of |x| / t + z on.
+    Let (x, y, z) be a point relative to the aim, in camera axes, and t the tangent of half the field of view. The point
+    is in the picture if the camera's distance from the aim is at least |x| / t + z.
     """
     aim = (points.min(axis=0) + points.max(axis=0)) / 2
     pitch = np.radians(rng.triangular(*PITCH_DEG))
@@ -143,9 +146,10 @@ def framing_view(rng: np.random.Generator, yaw: float, points: F64, projection: 
 
 
 def in_camera(pose: F64, root: F64, view: F64) -> tuple[F64, F64]:
-    """Return the pose (55,3) and the place (3,) in OpenCV camera axes of a body that stands in the world in `pose`.
+    """Return a body's pose (55,3) and place (3,) in OpenCV camera axes.
 
-    `root`: root joint at rest, (3,), about which the body turns and to which the place is added. `view`: matrix (4,4).
+    `pose`: pose (55,3) of the body in the world, where its place is 0. `root`: root joint at rest, (3,), about which
+    the body turns. `view`: matrix (4,4) from the world to the OpenGL camera.
     """
     to_camera = OPENGL_FROM_OPENCV @ view[:3]  # the matrix is its own inverse
     turned = pose.copy()
@@ -154,16 +158,16 @@ def in_camera(pose: F64, root: F64, view: F64) -> tuple[F64, F64]:
 
 
 def turned_at_random(rng: np.random.Generator, pose: F64, most_deg: float) -> F64:
-    """Return `pose` (55,3) with each joint turned about a random axis by up to `most_deg`."""
+    """Return `pose` (55,3) with each joint turned about a random axis by a random angle up to `most_deg`."""
     axes = rng.standard_normal((JOINTS, 3))
     turns = axes / np.linalg.norm(axes, axis=1, keepdims=True) * np.radians(rng.uniform(0, most_deg, (JOINTS, 1)))
     return np.asarray(rotvec_from_matrix(rodrigues(turns) @ rodrigues(pose)))
 
 
 def moved_outline(rng: np.random.Generator, mask: U8, most_px: float) -> U8:
-    """Return `mask` (h,w), 255 or 0, with its outline moved in or out by up to `most_px`, patch by patch.
+    """Return `mask` (h,w), 255 or 0, with its outline moved in or out by up to `most_px` pixels.
 
-    The mask is blurred and cut at a level that differs from place to place, from a tenth to nine tenths.
+    The mask is blurred, then cut at a level from 0.1 to 0.9 that varies smoothly over the picture.
     """
     blurred = np.asarray(Image.fromarray(mask).filter(ImageFilter.GaussianBlur(most_px / TENTH_AT)), np.float64) / 255
     level = 0.5 + 0.4 * _patches(rng, (mask.shape[0], mask.shape[1]), MASK_PATCH_PX, 1)[..., 0]
@@ -171,14 +175,14 @@ def moved_outline(rng: np.random.Generator, mask: U8, most_px: float) -> U8:
 
 
 def _patches(rng: np.random.Generator, shape: Shape, side: int, channels: int) -> F64:
-    """Return random values (h,w,channels) in -1..1, `side` pixels apart and smooth between."""
+    """Return random values (h,w,channels) in -1..1 that vary smoothly, with a new value about every `side` pixels."""
     coarse = rng.uniform(-1, 1, (channels, shape[0] // side + 2, shape[1] // side + 2)).astype(np.float32)
     planes = [np.asarray(Image.fromarray(plane).resize(shape[::-1], Image.Resampling.BILINEAR)) for plane in coarse]
     return np.stack(planes, axis=-1).astype(np.float64)
 
 
 def write_capture(folder: Path, capture: SyntheticCapture, recipe: Recipe) -> Iterator[int]:
-    """Write the frames of `recipe` to `folder`, which is empty, and yield the number of each written frame."""
+    """Write the capture of `recipe` to the empty `folder`, and yield the number of each written frame."""
     for part in ("frames", "masks", "fits", *((f"{TRUTH}/masks", f"{TRUTH}/fits") if recipe.is_noisy else ())):
         (folder / part).mkdir(parents=True)
     (folder / NAME).write_text(capture_text(recipe, "frames"), encoding="utf-8")
@@ -199,7 +203,7 @@ def _write_shot(folder: Path, number: int, shot: SyntheticFrame, recipe: Recipe)
 
 
 def fit_arrays(pose: F64, place: F64, betas: F64) -> dict[str, Any]:
-    """Return a fit under the names of SMPL-X, float32: `pose` (55,3), `place` (3,), `betas` (10,)."""
+    """Return the float32 arrays of a fit by their SMPL-X names, from `pose` (55,3), `place` (3,), `betas` (10,)."""
     row = pose.reshape(-1)
     parts: dict[str, Floats] = {
         "global_orient": row[:3],
@@ -216,7 +220,7 @@ def fit_arrays(pose: F64, place: F64, betas: F64) -> dict[str, Any]:
 
 
 def capture_text(recipe: Recipe, frames: str) -> str:
-    """Return `capture.toml` of a synthetic capture whose frames lie at `frames`."""
+    """Return the text of `capture.toml`. `frames`: folder of the frames, relative to the file's folder."""
     lens = recipe.lens
     noise = f"fits up to {recipe.fit_deg:g} degrees and {recipe.fit_mm:g} mm, masks up to {recipe.mask_px:g} pixels off"
     return f"""\
@@ -241,14 +245,14 @@ cy = {float(lens.cy)!r}
 
 @dataclass(frozen=True)
 class DrawingCost:
-    """The measured cost of a frame: `seconds` and `disk_bytes`."""
+    """The measured cost of a frame: `seconds` to draw and encode it, and `disk_bytes` of its files."""
 
     seconds: float
     disk_bytes: int
 
 
 def measured_cost(capture: SyntheticCapture, recipe: Recipe) -> DrawingCost:
-    """Measure what a frame of `recipe` costs: one is drawn and written to memory, after another that warms up."""
+    """Measure the cost of a frame of `recipe`: draw one frame to warm up, then draw and encode another in memory."""
     capture.frame(0)
     start = time.monotonic()
     exact = capture.frame(recipe.frames // 2)

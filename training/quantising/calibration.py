@@ -1,8 +1,8 @@
 """Calibration: the range of each tensor of a network on real frames, and the scales that follow from it.
 
-Rule: ranges are measured. They are narrowed where bytes cannot show the difference, widened where a norm over the
-picture reads them, and made equal where an operator only moves bytes. Where all runtimes can round alike, each range
-becomes 256 steps of a power of two.
+Rule: ranges are measured, then changed in four cases. The logits' range is narrowed to what bytes can show. The range
+of a tensor that a norm over the picture reads is widened. The inputs and the output of a Concat get one range. If all
+runtimes can round alike, each range becomes 256 steps of a power of two.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ class _OneFrame(CalibrationDataReader):
 
 
 def measure(path: Path, frames: Sequence[NDArray[np.float32]], method: str, operators: Sequence[str]) -> Any:
-    """Return the ranges of the tensors, ONNX Runtime's TensorsData.
+    """Return the ranges of the tensors on `frames`, ONNX Runtime's TensorsData.
 
     `path`: file of the float network; a second file is written beside it.
-    `frames`: (H, W, C) float32, fed one by one, so that memory does not grow with their number.
+    `frames`: (H, W, C) float32 each. They are fed one by one, so that memory does not grow with their number.
     `method`: a name of `METHODS`.
     `operators`: types of the operators whose inputs and outputs are measured.
     Raises BadInputError for an unknown method or tensors that are not finite.
@@ -74,7 +74,10 @@ def measure(path: Path, frames: Sequence[NDArray[np.float32]], method: str, oper
 
 
 def limit_logits(model: onnx.ModelProto, ranges: Any) -> None:
-    """Narrow the range of the last sigmoid's input to `LOGIT_LIMIT`. Raises BadInputError when there is no sigmoid."""
+    """Narrow the range of the last sigmoid's input to ±`LOGIT_LIMIT`, in place.
+
+    Raises BadInputError if the last node is no sigmoid.
+    """
     last = next((node for node in model.graph.node if node.output[0] == model.graph.output[0].name), None)
     if last is None or last.op_type != "Sigmoid":
         raise BadInputError("quantise", f"output made by {last and last.op_type}", "a Sigmoid")
@@ -84,9 +87,9 @@ def limit_logits(model: onnx.ModelProto, ranges: Any) -> None:
 
 
 def saturated(frames: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float32]]:
-    """Return `frames` with every value moved to the end of their common range on its side of 0; 0 stays.
+    """Return `frames` with each positive value replaced by their largest value, each negative one by the smallest.
 
-    These are the bytes of the strongest contrast that the network's input can hold.
+    These are the pictures of the strongest contrast that the network's input can hold.
     """
     low, high = min(frame.min() for frame in frames), max(frame.max() for frame in frames)
     ends = np.float32(min(low, 0)), np.float32(max(high, 0))
@@ -94,17 +97,19 @@ def saturated(frames: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float32]
 
 
 def norm_inputs(model: onnx.ModelProto) -> set[str]:
-    """Return the tensors that norms over the picture read, and the tensors from which these were moved."""
+    """Return the tensors that norms over the picture read, directly or through operators of `MOVES`."""
     makers = {out: node for node in model.graph.node for out in node.output}
     norms = (node for node in model.graph.node if node.op_type == "InstanceNormalization")
     return {source for node in norms for source in _sources(node.input[0], makers)}
 
 
 def widen(ranges: Any, names: set[str], wider: Any) -> None:
-    """Extend the ranges of tensors `names`, in place, to the ranges in `wider`.
+    """Extend the ranges of the tensors `names`, in place, to include their ranges in `wider`.
 
-    A norm divides by the picture's own deviation, so its input carries the same picture at any contrast. Clipped at the
-    contrast of usual frames, a stronger picture would become a different one.
+    A norm divides by the picture's own deviation, so its output is the same at any contrast. If its input were clipped
+    at the contrast of usual frames, pictures of stronger contrast would change.
+
+    `ranges`, `wider`: ONNX Runtime's TensorsData.
     """
     for name in names & set(ranges.keys()):
         ranges[name].lowest = np.minimum(ranges[name].lowest, wider[name].lowest)
@@ -112,11 +117,11 @@ def widen(ranges: Any, names: set[str], wider: Any) -> None:
 
 
 def share_ranges(model: onnx.ModelProto, ranges: Any) -> None:
-    """Give the inputs and the output of each Concat one range, so that it moves bytes and rounds nothing. In place.
+    """Give the inputs and the output of each Concat one range, in place, so that the Concat rounds nothing.
 
-    Otherwise runtimes that fuse a Concat into the layers before it would clamp at other values than runtimes that do
-    not. A Concat is left as it is when the common range would be signed and one of its tensors is rectified: that
-    tensor would lose its clamp at 0.
+    With different ranges, runtimes that fuse a Concat into the layers before it would clamp at other values than
+    runtimes that do not fuse. If the common range would include negative values and a tensor is rectified, the ranges
+    of that Concat stay: the tensor would lose its clamp at 0.
     """
     makers = {out: node for node in model.graph.node for out in node.output}
     for node in model.graph.node:
@@ -133,7 +138,7 @@ def share_ranges(model: onnx.ModelProto, ranges: Any) -> None:
 
 
 def _sources(name: str, makers: dict[str, onnx.NodeProto]) -> Iterator[str]:
-    """Yield `name`, and the tensors from which operators of `MOVES` made it."""
+    """Yield `name`, then the tensors from which it was made by operators of `MOVES` alone."""
     yield name
     while name in makers and makers[name].op_type in MOVES:
         name = makers[name].input[0]
@@ -146,28 +151,29 @@ def _sources(name: str, makers: dict[str, onnx.NodeProto]) -> Iterator[str]:
 # Weights are even and biases odd, so every sum is odd and never half way between two bytes. It then makes no difference
 # how a runtime rounds halves.
 #
-# A scale covers only the share `COVER` of the measured range when that halves the step; values beyond it are clipped.
+# A range need cover only the share `COVER` of the measured range; values outside are clipped. A smaller range often
+# halves the step.
 
 COVER = 0.75
 BYTE = 255
 #: Operators that round nothing when their inputs and their output have the same scale.
 SHARING = (*MOVES, "Concat", "Add")
-#: A network of these operators alone can round alike. Other operators (norms over the picture, means, products) round
-#: inside, and runtimes differ in how they do so.
+#: Only a network of these operators can round alike on all runtimes. Other operators (norms over the picture, means,
+#: products) round intermediate values, and runtimes differ in how they round them.
 ALIKE = {*SHARING, "Conv", "Relu", "Sigmoid", "Constant", "Identity"}
 #: Largest integer weight, by `reduce_range`; all weights are even.
 WEIGHT_TOP = {True: 64, False: 126}
-#: Least size of an accumulator's unit, in steps of its output, with which float32 represents every sum exactly.
+#: Least unit of a layer's integer sum, in steps of the layer's output, with which float32 represents every sum exactly.
 FINEST = 2.0**-16
-#: Greatest size of that unit, in the same steps. At a half, all odd sums would be half way between bytes; above a
-#: quarter, HTP was seen to give another picture.
+#: Greatest unit of a layer's integer sum, in steps of the layer's output. At ½, all odd sums would be half way between
+#: bytes; above ¼, HTP was seen to give another picture.
 COARSEST = 0.25
-#: Largest bias in units of the accumulator, so that float32 represents every sum exactly.
+#: Largest bias in units of the layer's integer sum, so that float32 represents every sum exactly.
 LARGEST_BIAS = 2.0**22
 
 
 class CannotRoundAlikeError(ValueError):
-    """A layer's weights are so large that a unit of its sum exceeds `COARSEST` steps of its output."""
+    """A layer's weights are so large that the unit of its integer sum exceeds `COARSEST` steps of its output."""
 
 
 def may_round_alike(model: onnx.ModelProto) -> bool:
@@ -176,10 +182,12 @@ def may_round_alike(model: onnx.ModelProto) -> bool:
 
 
 def power_of_two_ranges(model: onnx.ModelProto, ranges: Any) -> None:
-    """Change each range of `ranges`, ONNX Runtime's TensorsData, to 256 steps of a power of two, in place.
+    """Change each range of `ranges`, in place, to 256 steps whose size is a power of two.
 
-    Tensors that are moved, joined or added get the same step, so that a Concat and an Add round nothing. Ranges of
-    rectified tensors begin at 0.
+    The inputs and the output of an operator of `SHARING` get the same step, so that the operator rounds nothing. Ranges
+    of rectified tensors begin at 0.
+
+    `ranges`: ONNX Runtime's TensorsData.
     """
     cut = {name: _cut(name, ranges[name], model) for name in ranges.keys()}  # noqa: SIM118 - no dict
     for members in _groups(model, cut):
@@ -191,11 +199,14 @@ def power_of_two_ranges(model: onnx.ModelProto, ranges: Any) -> None:
 
 
 def power_of_two_weights(model: onnx.ModelProto, ranges: Any, reduce_range: bool) -> dict[str, list[dict[str, Any]]]:
-    """Round the weights and biases of every Conv in place, and return their scales, a power of two by output channel.
+    """Round the weights and biases of every Conv in place. Return the scales of the weights, all powers of two.
 
-    Weights become even numbers of steps and biases odd ones, so that no sum is half way between two bytes. The scales
-    are ONNX Runtime's `TensorQuantOverrides`, by the weights' name. `ranges`: ranges from `power_of_two_ranges`. Raises
+    Weights become even numbers of steps and biases odd ones, so that no sum is half way between two bytes. The result
+    has a scale for each output channel, by the weights' name, as ONNX Runtime's `TensorQuantOverrides`. Raises
     CannotRoundAlikeError.
+
+    `ranges`: ranges from `power_of_two_ranges`.
+    `reduce_range`: whether weights have 7 bits instead of 8.
     """
     stored = _stored_as(model)
     constants = {tensor.name: tensor for tensor in model.graph.initializer}
@@ -223,7 +234,7 @@ def power_of_two_weights(model: onnx.ModelProto, ranges: Any, reduce_range: bool
 def _bias_of(
     node: onnx.NodeProto, kernel: onnx.TensorProto, constants: dict[str, onnx.TensorProto], model: onnx.ModelProto
 ) -> onnx.TensorProto:
-    """Return the bias of Conv `node`; a Conv without one is given a bias of zeros."""
+    """Return the bias (O,) of the Conv `node`; if it has none, add a bias of zeros to `model` and `constants` first."""
     if len(node.input) == 2:
         zeros = numpy_helper.from_array(np.zeros(kernel.dims[0], np.float32), f"{node.output[0]}_bias")
         constants[zeros.name] = model.graph.initializer.add()
@@ -233,7 +244,7 @@ def _bias_of(
 
 
 def _stored_as(model: onnx.ModelProto) -> dict[str, str]:
-    """Map each tensor to the one that is stored in bytes for it: the output of its Relu, if only a Relu reads it."""
+    """Return the tensor that is stored as bytes for each tensor: itself, or the output of its only reader, a Relu."""
     readers: dict[str, list[onnx.NodeProto]] = {}
     for node in model.graph.node:
         for name in node.input:
@@ -246,9 +257,10 @@ def _stored_as(model: onnx.ModelProto) -> dict[str, str]:
 
 
 def _round_weights(kernel: onnx.TensorProto, finest: NDArray[np.float64], top: int) -> NDArray[np.float64]:
-    """Round `kernel` (O, I, h, w) to even multiples, up to `top`, of the returned scales (O,), in place.
+    """Round `kernel` (O, I, h, w), in place, to even multiples of the returned scales (O,), one by output channel.
 
-    Each scale is a power of two and at least `finest` (O,).
+    `finest`: (O,) lower limit of the scales, which are powers of two.
+    `top`: largest multiple.
     """
     values = numpy_helper.to_array(kernel).astype(np.float64)
     rows = values.reshape(len(values), -1)
@@ -262,8 +274,8 @@ def _round_weights(kernel: onnx.TensorProto, finest: NDArray[np.float64], top: i
 def _round_bias(bias: onnx.TensorProto, scales: NDArray[np.float64]) -> None:
     """Round `bias` (O,) to odd multiples of `scales` (O,), in place.
 
-    A bias of 0 lies half way between two odd multiples. Every second channel then goes up and the others down, because
-    the whole picture would move if all went up.
+    A bias of 0 lies half way between two odd multiples. It is rounded up in even channels and down in odd channels: if
+    all were rounded up, the whole picture would become brighter.
     """
     steps = numpy_helper.to_array(bias).astype(np.float64) / scales
     below = 2 * np.floor(steps / 2) + 1
@@ -280,10 +292,10 @@ def _step_of(data: Any) -> float:
 
 
 def _cut(name: str, data: Any, model: onnx.ModelProto) -> tuple[float, float]:
-    """Return the part of the measured range `data` that bytes will cover; it includes 0.
+    """Return the ends (low, high) of the part of the measured range `data` that bytes must cover; 0 is included.
 
-    The whole range is covered for the network's input, its output and the logits: clipped logits would leave no pixel
-    fully transparent.
+    Bytes must cover the whole range of the network's input, its output and the logits: with clipped logits, no pixel
+    would be fully transparent.
     """
     makers = {out: node for node in model.graph.node for out in node.output}
     ends = {value.name for value in (model.graph.input[0], model.graph.output[0])}
@@ -295,7 +307,7 @@ def _cut(name: str, data: Any, model: onnx.ModelProto) -> tuple[float, float]:
 
 
 def _step(low: float, high: float) -> float:
-    """Return the least power of two that suffices as a step: 256 steps reach from `low` to within a step of `high`."""
+    """Return the least power of two of which 256 steps cover the range from `low` to `high`, to within a step."""
     step = 2.0 ** math.ceil(math.log2(max(high - low, 1e-9) / (BYTE + 1)))
     while high / step + _zero_point(low, step) > BYTE + 1:
         step *= 2
@@ -307,7 +319,7 @@ def _zero_point(low: float, step: float) -> int:
 
 
 def _groups(model: onnx.ModelProto, known: Iterable[str]) -> list[set[str]]:
-    """Return the tensors `known`, in groups that share a step."""
+    """Return the tensors `known` in groups; the tensors of a group share a step."""
     group = {name: {name} for name in known}
     for names in _sharing(model):
         together: set[str] = set().union(*(group[name] for name in names if name in group))
@@ -316,7 +328,10 @@ def _groups(model: onnx.ModelProto, known: Iterable[str]) -> list[set[str]]:
 
 
 def _sharing(model: onnx.ModelProto) -> Iterator[list[str]]:
-    """Yield the tensors of each operator of `SHARING`; for an Add with a Relu behind it, also the Relu's output."""
+    """Yield the tensors that share a step: inputs and output of each operator of `SHARING`.
+
+    If a Relu follows an Add, the Relu's output shares the step too.
+    """
     followers = {name: node for node in model.graph.node for name in node.input}
     for node in model.graph.node:
         if node.op_type in SHARING:

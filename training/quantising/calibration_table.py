@@ -1,6 +1,6 @@
 """Compares calibration methods and numbers of frames by the error of the picture.
 
-Rule: pictures are evaluated on frames that no row was calibrated on, against the float network on the float input.
+Rule: the error is measured on frames that no row was calibrated on, against the float network's pictures.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from trilane.writing import write_atomically
 #: Errors that are this close to each other are a tie.
 TIE_DB = 0.1
 COUNTS = (5, 10, 50, 100)
-#: Number of frames that pictures are evaluated on, unless more are held out: the last ones.
+#: Number of frames, the last ones, on which the error is measured unless more are held out.
 EVALUATED = 5
 PROVIDERS = ["CPUExecutionProvider"]
 ERRORS_ONLY = 3
@@ -38,14 +38,15 @@ def calibration_table(
     counts: Sequence[int] = COUNTS,
     held_out: int = EVALUATED,
 ) -> Iterator[dict[str, Any]]:
-    """Yield rows `method`, `count`, `psnr_db`, `mean` and `largest` error (of 255).
+    """Yield a row for each method and count: `method`, `count`, `psnr_db`, and `mean` and `largest` error (of 255).
 
     `psnr_db` is the mean over the last `held_out` frames.
 
     `model`: float network (1, C, H, W).
     `frames`: (H, W, C) each.
     `methods`: names of `METHODS`.
-    `counts`: numbers of calibration frames; a count that would include evaluated frames is left out.
+    `counts`: numbers of calibration frames. A count that would reach into the last `held_out` frames is left out.
+    `held_out`: number of frames to measure the error on.
     Raises BadInputError when there are too few frames for the smallest count, or for an unknown method.
     """
     spare = len(frames) - held_out
@@ -68,9 +69,9 @@ def calibration_table(
 
 
 def recommended(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
-    """Return the row of the table to follow: among those within `TIE_DB` of the best, the one with the fewest frames.
+    """Return the recommended row of the table: the one with the fewest frames within `TIE_DB` of the best PSNR.
 
-    Among rows with as few frames, the one with the least error counts. Raises ValueError without rows.
+    If several rows have as few frames, the one with the highest PSNR is returned. Raises ValueError without rows.
     """
     best = max(float(row["psnr_db"]) for row in rows)
     ties = [row for row in rows if best - float(row["psnr_db"]) <= TIE_DB]
@@ -78,7 +79,7 @@ def recommended(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
 
 
 def recommendation(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Say in one line which row of the table to follow, and how close to the best one it is."""
+    """Return one line about the recommended row of the table and its distance to the best row."""
     row, best = recommended(rows), max(float(row["psnr_db"]) for row in rows)
     return (
         f"{row['method']} on {row['count']} frames: {row['psnr_db']:.2f} dB, {best - row['psnr_db']:.2f} dB below the "
@@ -87,7 +88,7 @@ def recommendation(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _session(model: onnx.ModelProto) -> Any:
-    """Return a function from the network's one input to its one output."""
+    """Return a function that runs the network: from its only input array to its only output array."""
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = ERRORS_ONLY
     session = onnxruntime.InferenceSession(model.SerializeToString(), settings, providers=PROVIDERS)
@@ -111,10 +112,9 @@ def _errors(float_pictures: Sequence[F32], pictures: Sequence[NDArray[np.uint8]]
 
 
 def plot_calibrations(rows: Sequence[Mapping[str, Any]], recommendation: str, path: Path) -> None:
-    """Draw `rows` of the calibration table into a file, with the `recommendation` above.
+    """Draw `rows` of the calibration table into a picture file, with `recommendation` as its title.
 
-    `path`: file whose ending is one of SUFFIXES.
-    Raises MissingPartError without Matplotlib, BadInputError for another ending or a file that cannot be written.
+    Raises MissingPartError without Matplotlib, BadInputError for an unknown suffix or a file that cannot be written.
     """
     figure = figure_for(path, (9, 4.5))
     axes = figure.subplots()

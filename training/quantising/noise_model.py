@@ -1,10 +1,10 @@
 """Predicts how far an integer network's picture is from the float network's, without running integers.
 
-Rule: the float network is computed with an error at every place where the integer network rounds or clips. The error is
-uniform, of half a step to either side, for each stored tensor and each weight. The derivation is in docs/networks.md.
+Rule: the float network is computed with an error at every place where the integer network rounds or clips. The rounding
+error of each stored tensor and each weight is uniform, half a step to either side. docs/networks.md has the derivation.
 
-Sources: uniform rounding error, Widrow & Kollar 2008, "Quantization Noise", chapter 4; prediction interval for one more
-draw, Hahn & Meeker 1991, "Statistical Intervals", section 4.2.
+Sources: for the uniform rounding error, Widrow & Kollar 2008, "Quantization Noise", chapter 4; for the prediction
+interval, Hahn & Meeker 1991, "Statistical Intervals", section 4.2.
 """
 
 from __future__ import annotations
@@ -28,15 +28,16 @@ from trilane.errors import BadInputError
 from trilane.training.quantising.calibration import MOVES, SHARING
 from trilane.training.quantising.quantise import Quantised
 
+#: Number of pictures with random rounding errors from which the bound is computed.
 DRAWS = 16
-#: Probability that one more draw is above the bound.
+#: Probability that one more such picture has an error above the bound.
 RISK = 0.001
-#: Student's t with `DRAWS` - 1 degrees of freedom is above this with the probability `RISK`.
+#: Student's t with `DRAWS` - 1 degrees of freedom exceeds this value with the probability `RISK`.
 STUDENT_T = 3.7328
 PROVIDERS = ["CPUExecutionProvider"]
 ERRORS_ONLY = 3
 PICTURE = 255
-#: Operators whose output consists of multiples of a step when their inputs do.
+#: Operators whose output consists of multiples of a step if their inputs do.
 KEEPS_STEPS = (*SHARING, "Relu", "Identity")
 #: Largest byte of a stored tensor: unsigned, 0 to 255.
 TOP = 255
@@ -44,12 +45,11 @@ TOP = 255
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """A network in floats that rounds and clips where the integer network does.
+    """A float network that rounds and clips where the integer network does.
 
-    `model`: model that reads the same bytes; its further inputs are the constants and the offset of each stored
-    tensor's steps.
-    `constants`: float value and largest error of each element, by the constant's name.
-    `offsets`: names of the inputs that are drawn from -½..½.
+    `model`: model whose first input is the integer network's bytes. Its other inputs are the constants and `offsets`.
+    `constants`: float value of each constant and largest error of each element, by name.
+    `offsets`: names of inputs that shift the steps of the stored tensors; drawn from -½..½ steps.
     """
 
     model: onnx.ModelProto = field(repr=False)
@@ -61,7 +61,7 @@ class NoiseModel:
         return session(self.model)
 
     def pictures(self, tensor: U8, draws: int, seed: int) -> Iterator[F32]:
-        """Yield `draws` pictures (N, H, W, 4), in 0..255, for the bytes `tensor` (N, H, W, C)."""
+        """Yield `draws` pictures (N, H, W, 4), in 0..255, with random errors, for the bytes `tensor` (N, H, W, C)."""
         rng = np.random.default_rng(seed)
         source = self.model.graph.input[0].name
         for _ in range(draws):
@@ -74,7 +74,10 @@ class NoiseModel:
 
 
 def float_picture(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> F32:
-    """Return the float network's picture (N, H, W, 4), in 0..255, for the real numbers of `tensor` (N, H, W, C)."""
+    """Return the float network's picture (N, H, W, 4), in 0..255, for the bytes `tensor` (N, H, W, C).
+
+    `model`: float network. `quantised`: integer network, whose scale and zero point turn the bytes into real numbers.
+    """
     encoding = quantised.network.input
     real = (tensor.astype(np.float32) - encoding.zero_point) * np.float32(encoding.scale)
     runner = session(model)
@@ -84,12 +87,13 @@ def float_picture(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> F
 
 
 def predicted_bound(model: NoiseModel, wanted: F32, tensor: U8, seed: int = 0) -> tuple[float, float]:
-    """Return the expected mean absolute error of the picture, and a bound that one more draw exceeds with `RISK`.
+    """Return the expected mean absolute error of the picture, and its bound: one more draw exceeds it with `RISK`.
+
+    Both are in steps of 1/255. bound = m + t s sqrt(1 + 1/n), with mean m and standard deviation s of n = `DRAWS`
+    draws and t = `STUDENT_T`.
 
     `wanted`: float network's picture (N, H, W, 4), in 0..255.
     `tensor`: bytes (N, H, W, C).
-    bound = m + t s sqrt(1 + 1/n), with mean m and deviation s of n = `DRAWS` draws and t = `STUDENT_T`. Both are in
-    steps of 1/255.
     """
     errors = [float(np.abs(picture - wanted).mean()) for picture in model.pictures(tensor, DRAWS, seed)]
     mean = float(np.mean(errors))
@@ -105,13 +109,13 @@ def noise_model(quantised: Quantised) -> NoiseModel:
 
 
 class NoiseGraph:
-    """The graph of a noise model while it is built, node by node; its steps and ranges are the integer network's."""
+    """Builds the graph of a noise model, node by node, with the steps and ranges of the integer network."""
 
     def __init__(self, quantised: Quantised) -> None:
         self.source = quantised.network.model.graph
         self.values = {tensor.name: numpy_helper.to_array(tensor) for tensor in self.source.initializer}
         self.floats = quantised.float_constants
-        #: Weights and biases use every second multiple of a scale where all runtimes round alike.
+        #: If all runtimes round alike, weights and biases use only every second multiple of their scale.
         self.multiples = 2 if quantised.facts["rounds_alike"] else 1
         self.makers = {name: node for node in self.source.node for name in node.output}
         self.nodes: list[onnx.NodeProto] = []
@@ -120,7 +124,7 @@ class NoiseGraph:
         self.limits: list[onnx.TensorProto] = []
 
     def take(self, node: onnx.NodeProto) -> None:
-        """Add the float model of `node`."""
+        """Add the float counterpart of `node`, a node of the integer network."""
         if node.op_type == "QuantizeLinear":
             self.store(node)
         elif node.op_type == "DequantizeLinear" and node.input[0] in self.values:
@@ -131,25 +135,28 @@ class NoiseGraph:
             self.nodes.append(node)
 
     def _constant(self, node: onnx.NodeProto) -> None:
-        """Turn a weight, bias or vector into an input that is drawn about its float value."""
+        """Turn the constant that `node` dequantises into an input of the model."""
         self.constants[node.output[0]] = self.constant(node)
 
     def constant(self, node: onnx.NodeProto) -> tuple[F32, NDArray[np.float64]]:
-        """Return the float value of what `node` reads, and the largest error of each element."""
+        """Return the float value of the constant that `node` dequantises, and the largest error of each element."""
         stored, scale = self.values[node.input[0]], np.asarray(self.values[node.input[1]], np.float64)
         axis = next((attribute.i for attribute in node.attribute if attribute.name == "axis"), 1)
         if scale.ndim and stored.ndim:
             scale = scale.reshape([-1 if side == axis else 1 for side in range(stored.ndim)])
         exact_value = self.float_value(node.input[0], stored.shape)
         half = np.broadcast_to(scale * self.multiples / 2, stored.shape)
-        # A float value of exactly 0 is stored exactly where 0 is among the stored multiples; biases have odd ones only.
+        # A float value of exactly 0 is stored without error, except in a bias of odd multiples.
         exact = (exact_value == 0) & (stored == 0)
-        # Where 0 is not among them, the error is always `half`; a uniform error sqrt(3) as wide has the same variance.
+        # In such a bias its error is always `half`. A uniform error sqrt(3) times as wide has the same variance.
         farthest = (exact_value == 0) & (stored != 0)
         return exact_value, np.where(exact, 0.0, np.where(farthest, 3**0.5, 1.0) * half)
 
     def float_value(self, stored: str, shape: tuple[int, ...]) -> F32:
-        """Return the float constant of `stored`; ONNX Runtime numbers the copies of a bias that several layers read."""
+        """Return the float value of the integer constant named `stored`. Raises BadInputError if it has none.
+
+        ONNX Runtime appends a number to the name of each further copy of a bias that several layers read.
+        """
         name = stored.removesuffix("_quantized")
         originals = [known for known in self.floats if name.startswith(known) and f"0{name[len(known) :]}".isdigit()]
         value = self.floats[max(originals, key=len)] if originals else None
@@ -158,7 +165,7 @@ class NoiseGraph:
         return value.astype(np.float32)
 
     def store(self, node: onnx.NodeProto) -> None:
-        """Clip a stored tensor, and round it to shifted steps inside its range unless it consists of multiples."""
+        """Add nodes that clip the tensor that `node` stores, and round it unless it consists of multiples of a step."""
         x, y = node.input[0], node.output[0]
         lowest, highest, step = self.bytes_of(node)
         low, high = self._limit(f"{y}.low", lowest), self._limit(f"{y}.high", highest)
@@ -169,14 +176,16 @@ class NoiseGraph:
             self._round(x, y, step, (low, high))
 
     def bytes_of(self, node: onnx.NodeProto) -> tuple[float, float, float]:
-        """Return the real numbers of bytes 0 and 255 of the tensor that `node` stores, and its step."""
+        """Return the real values of bytes 0 and 255 of the tensor that `node` stores, and the tensor's step."""
         step, zero = float(self.values[node.input[1]]), int(self.values[node.input[2]])
         return -zero * step, (TOP - zero) * step, step
 
     def _round(self, x: str, y: str, step: float, ends: tuple[str, str]) -> None:
-        """Add nodes for `y` = (round(`x` / step + offset) - offset) step, an error of +-½ step.
+        """Add nodes for `y` = (round(`x` / step + offset) - offset) step, which has an error of ±½ step.
 
-        They act inside the range and off 0.
+        A value of exactly 0 or at an end of the range is only clipped.
+
+        `ends`: names of the constants at the lower and the upper end of the range.
         """
         step_name, none = self._limit(f"{y}.step", step), self._limit(f"{y}.none", 0.0)
         offset = f"{y}.offset"
@@ -202,7 +211,7 @@ class NoiseGraph:
         return name
 
     def is_multiple(self, name: str, step: float) -> bool:
-        """Return whether tensor `name` consists of multiples of `step` already."""
+        """Return whether all values of tensor `name` are already multiples of `step`."""
         maker = self.makers.get(name)
         if maker is None:
             return False
@@ -214,7 +223,7 @@ class NoiseGraph:
         return all(self.is_multiple(source, step) for source in data)
 
     def finished(self) -> NoiseModel:
-        """Return the model, with the constants and offsets as inputs."""
+        """Return the noise model of the nodes that were taken."""
         inputs = [
             *(helper.make_tensor_value_info(n, TensorProto.FLOAT, v.shape) for n, (v, _) in self.constants.items()),
             *(helper.make_tensor_value_info(name, TensorProto.FLOAT, []) for name in self.offsets),
@@ -239,11 +248,10 @@ def session(model: onnx.ModelProto) -> Any:
 # quantiser.
 #
 # Rule: only two facts are taken from the integer network: the places where it rounds, and whether its steps are powers
-# of two. A stored tensor has 255 steps from the least to the greatest value that the float network gives it on this
-# very input. A weight has `LARGEST_WEIGHT` steps to either side of 0, by output channel; biases are exact. Where steps
-# are powers of two, each is `POWER_OF_TWO` times as wide: that is the most that rounding up to a power of two costs a
-# stored tensor. For a weight, using even multiples alone costs as much already. The picture has its own steps, of
-# 1/255.
+# of two. The range of a stored tensor is that of its float values on this input, and has 255 steps. The weights of an
+# output channel have `LARGEST_WEIGHT` steps to either side of 0; biases are exact. If steps are powers of two, each is
+# `POWER_OF_TWO` times as wide. For a stored tensor, rounding up to a power of two costs at most that factor; for a
+# weight, using only even multiples costs that factor. The steps of the picture are 1/255.
 
 #: Greatest ratio between a step that was rounded up to a power of two and the step itself.
 POWER_OF_TWO = 2
@@ -251,15 +259,15 @@ BYTE_TOP, INT16_TOP = 255, 2**15 - 1
 #: AVX2 without VNNI adds two products of a byte and a weight in 16 bits and saturates (Intel's manual, VPMADDUBSW). A
 #: bundle gives the same picture on every CPU, so no quantiser may use larger weights.
 LARGEST_WEIGHT = INT16_TOP // (2 * BYTE_TOP)
-#: Operators whose output consists of values of their input.
+#: Operators that copy values from their input to their output.
 MOVES_VALUES = (*MOVES, "Relu", "Identity")
 Range = tuple[float, float]
 
 
 def ideal_noise_model(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> NoiseModel:
-    """Return the noise model with the ideal steps for the bytes `tensor` (N, H, W, C).
+    """Return the noise model with the steps of an ideal quantiser for the bytes `tensor` (N, H, W, C).
 
-    `model`: float network from which `quantised` was made. Raises BadInputError as `noise_model`.
+    `model`: float network from which `quantised` was made. Raises BadInputError as `noise_model` does.
     """
     graph = _IdealGraph(quantised, float_ranges(model, quantised, tensor))
     for node in quantised.network.model.graph.node:
@@ -268,7 +276,10 @@ def ideal_noise_model(model: onnx.ModelProto, quantised: Quantised, tensor: U8) 
 
 
 def float_ranges(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> dict[str, Range]:
-    """Return the least and greatest float value of each stored tensor, 0 included, by its Quantize node's output."""
+    """Return the range (low, high) of each stored tensor's float values on the bytes `tensor`; 0 is included.
+
+    The keys are the names of the Quantize nodes' outputs.
+    """
     graph = _FloatGraph(model, quantised)
     for node in quantised.network.model.graph.node:
         graph.take(node)
@@ -283,10 +294,10 @@ def float_ranges(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> di
 
 
 class _FloatGraph(NoiseGraph):
-    """A network in floats that rounds nothing, with the names of the tensors that would be stored.
+    """Builds a float network that rounds nothing, and collects the names of the tensors that would be stored.
 
-    In integers the lower end of an output's range acts as the rectifier, so the Relu is added again where `model` has
-    one.
+    The integer network has no Relu: the lower end of the range before it clips as the Relu would. The Relus of `model`
+    are therefore added again.
     """
 
     def __init__(self, model: onnx.ModelProto, quantised: Quantised) -> None:
@@ -301,7 +312,7 @@ class _FloatGraph(NoiseGraph):
 
 
 class _IdealGraph(NoiseGraph):
-    """A noise model with the steps of an ideal quantiser."""
+    """Builds a noise model with the steps of an ideal quantiser."""
 
     def __init__(self, quantised: Quantised, ranges: dict[str, Range]) -> None:
         super().__init__(quantised)
@@ -325,10 +336,7 @@ class _IdealGraph(NoiseGraph):
         return self.widened * low, self.widened * high, step
 
     def is_multiple(self, name: str, step: float) -> bool:
-        """Return whether all values of tensor `name` are multiples of `step`.
-
-        They are where it only copies a stored tensor; joined and added tensors have steps of their own.
-        """
+        """Return whether tensor `name` only copies a stored tensor: joined and added tensors have their own steps."""
         maker = self.makers.get(name)
         if maker is None or maker.op_type == "DequantizeLinear":
             return maker is not None
@@ -339,15 +347,17 @@ class _IdealGraph(NoiseGraph):
 #
 # Rule: both networks read the same input bytes, so the rounding of the input does not count as a layer's noise.
 
-#: Greatest ratio that is reported: a layer without error has an infinite one, which JSON cannot express.
+#: Greatest SQNR that is reported: that of a layer without error is infinite, which JSON cannot express.
 MAX_DB = 200.0
 
 
 def layer_report(model: onnx.ModelProto, quantised: Quantised, frame: NDArray[np.float32]) -> list[dict[str, Any]]:
-    """Return rows `name`, `op_type`, `sqnr_db`, worst first, for the layers that both networks have.
+    """Return a row `name`, `op_type`, `sqnr_db` for each layer that both networks have, the lowest SQNR first.
 
-    `model`: float network (1, C, H, W). `frame`: (H, W, C). SQNR = 10 log10(sum x² / sum (x - q)²). Here x and q are a
-    layer's output in the two networks, after its activation, as the integer network stores it.
+    SQNR = 10 log10(sum x² / sum (x - q)²). x is the layer's output after its activation in the float network, q the
+    same output as the integer network stores it.
+
+    `model`: float network (1, C, H, W). `frame`: real input (H, W, C).
     """
     network = quantised.network
     tensor = np.clip(np.round(frame / network.input.scale) + network.input.zero_point, 0, 255).astype(np.uint8)
@@ -364,7 +374,7 @@ def layer_report(model: onnx.ModelProto, quantised: Quantised, frame: NDArray[np
 
 
 def _stored(network: NetworkFile) -> dict[str, tuple[onnx.NodeProto, str]]:
-    """Map each dequantised tensor to the layer that made it and its name in the float network, after a folded ReLU."""
+    """Return the layer and its output's name in the float network, by the name of the dequantised output."""
     graph = network.model.graph
     quantisers = {node.input[0]: node for node in graph.node if node.op_type == "QuantizeLinear"}
     readers = {node.input[0]: node for node in graph.node if node.op_type == "DequantizeLinear"}

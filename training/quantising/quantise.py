@@ -1,10 +1,10 @@
-"""Makes the INT8 network: a float network is calibrated on real frames and becomes an integer one.
+"""Makes the integer network: a float network is calibrated on real frames, then quantised.
 
 Rule: activations are unsigned bytes; weights are signed and symmetric with a scale per channel; real 0 is exact; the
-output bytes are the picture. All runtimes round alike where the network allows it, see `calibration`.
+output bytes are the picture. All runtimes round alike if the network allows it, see `calibration`.
 
-With `reduce_range`, weights stay within 64: on a CPU without VNNI, the sum of two products of larger ones overflows 16
-bits.
+With `reduce_range`, weights stay within ±64: on a CPU without VNNI, the sum of two products of larger weights overflows
+16 bits.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ MIN_FRAMES, MAX_FRAMES = 1, 1000
 class Quantised:
     """An integer network and how it was made.
 
-    `facts`: method, frames, weight bits, float layers, version.
+    `facts`: method, number of frames, bits of the weights, float layers, version of ONNX Runtime, as in the manifest.
     `float_constants`: weights and biases before rounding, by name.
     """
 
@@ -73,9 +73,10 @@ class ByteRanges:
 
 @dataclass(frozen=True)
 class _Calibrated:
-    """A float network with the ranges of its tensors.
+    """A float network with the ranges of its tensors, ONNX Runtime's TensorsData.
 
-    `overrides`: scales of weights; empty when they are measured.
+    `overrides`: scales of weights, by name; if empty, ONNX Runtime computes the scales.
+    `rounds_alike`: whether all runtimes round alike.
     """
 
     model: onnx.ModelProto
@@ -91,7 +92,7 @@ def quantise(
     reduce_range: bool = True,
     keep_float: Sequence[str] = (),
 ) -> Quantised:
-    """Quantise a float NCHW network.
+    """Return the integer network that is made from the float network `model`.
 
     `model`: network with one float32 input (1, C, H, W) and one output (1, 4, H, W) in 0..1 made by a Sigmoid.
     `frames`: real inputs for its calibration, (H, W, C) float32, 1 to 1000.
@@ -145,7 +146,7 @@ def byte_ranges(model: onnx.ModelProto, frames: Sequence[F32], method: str = "mi
 
 
 def _float_constants(plain: onnx.ModelProto, rounded: onnx.ModelProto) -> dict[str, NDArray[Any]]:
-    """Return the constants of float model `plain`; those that only `rounded` has are biases that were 0."""
+    """Return the constants of float model `plain`, and zeros for the biases that only `rounded` has, by name."""
     known = {name: numpy_helper.to_array(tensor) for name, tensor in constants_of(plain).items()}
     added = {name: np.zeros(tensor.dims, np.float32) for name, tensor in constants_of(rounded).items()}
     return added | known
@@ -167,7 +168,7 @@ def _measured(model: onnx.ModelProto, frames: Sequence[F32], method: str) -> tup
 
 
 def _calibrated(model: onnx.ModelProto, ranges: Any, reduce_range: bool, keep_float: Sequence[str]) -> _Calibrated:
-    """Return scales with which all runtimes round alike; where that is not possible, the measured ranges."""
+    """Return `model` rounded so that all runtimes round alike; if that is impossible, `model` with measured ranges."""
     if not keep_float and may_round_alike(model):
         rounded, widened = copy.deepcopy(model), copy.deepcopy(ranges)
         power_of_two_ranges(rounded, widened)
@@ -199,28 +200,28 @@ def _check_weights(model: onnx.ModelProto) -> None:
 
 
 def _describe(model: onnx.ModelProto, keep_float: Sequence[str]) -> None:
-    """Remove what runtimes do not read: all operator sets but one, and all metadata except the layers kept in float."""
+    """Remove what runtimes do not read: other operator sets than ONNX's, and old metadata. Add the layers in float."""
     for entry in [entry for entry in model.opset_import if entry.domain not in ("", "ai.onnx")]:
         model.opset_import.remove(entry)
     del model.metadata_props[:]
     helper.set_model_props(model, {FLOAT_LAYERS_KEY: json.dumps(list(keep_float))} if keep_float else {})
 
 
-# Cross-layer equalisation: channels of neighbouring layers get similar ranges, and the network computes the same.
+# Cross-layer equalisation: channels of neighbouring layers get similar ranges, and the network's output stays the same.
 #
 # Rule: relu(s x) = s relu(x) for s > 0, so a channel may be scaled after one layer and back before the next. Source:
 # Nagel et al. 2019, "Data-Free Quantization Through Weight Equalization and Bias Correction", section 4.1.
 
 ROUNDS = 3
-#: Least and greatest factor between two layers in one round.
+#: Least and greatest factor by which one round scales a channel.
 SCALE_LIMITS = (1e-2, 1e2)
 
 
 def equalised(model: onnx.ModelProto) -> onnx.ModelProto:
     """Return a copy of the float network with every Conv -> ReLU -> Conv chain equalised, except grouped layers.
 
-    Let r1 be the range of the weights that make a channel, r2 that of the weights that read it, and s = sqrt(r1 r2) /
-    r2. The first layer's row is divided by s, the second layer's column is multiplied by it.
+    Let r1 be the largest weight that makes a channel, r2 the largest weight that reads it, and s = sqrt(r1 / r2). The
+    first layer's row and bias are divided by s, and the second layer's column is multiplied by s.
     """
     result = copy.deepcopy(model)
     weights = {tensor.name: tensor for tensor in result.graph.initializer}
@@ -250,7 +251,7 @@ def _pairs(
 
 
 def _only(users: dict[str, list[onnx.NodeProto]], node: onnx.NodeProto) -> onnx.NodeProto | None:
-    """Return the only node that reads the output of `node`; None when there are others or none."""
+    """Return the node that reads the output of `node`; None if several nodes read it, or none."""
     readers = users.get(node.output[0], [])
     return readers[0] if len(readers) == 1 else None
 
@@ -288,7 +289,7 @@ QUANTISED_OPERATORS = [
 
 @contextmanager
 def _no_axis_warnings() -> Iterator[None]:
-    """Suppress the quantiser's warning that vectors, such as those of norms, have no second axis; they need none."""
+    """Suppress the quantiser's warning that vectors, such as those of norms, have no second axis. None is needed."""
 
     def other(record: logging.LogRecord) -> bool:
         return "is out-of-range for weight" not in record.getMessage()
@@ -307,7 +308,7 @@ def insert_scales_and_zero_points(
     """Return `model` with Quantize and Dequantize nodes.
 
     `model`: float network.
-    `ranges`: ranges of its tensors, ONNX Runtime's TensorsData.
+    `ranges`: ranges of the model's tensors, ONNX Runtime's TensorsData.
     `overrides`: scales of weights by name, ONNX Runtime's `TensorQuantOverrides`.
     `reduce_range`: whether weights have 7 bits instead of 8.
     `keep_float`: names of nodes that stay in float.
@@ -334,7 +335,7 @@ def insert_scales_and_zero_points(
 
 
 def set_picture_scale_and_zero_point(graph: onnx.GraphProto, node: onnx.NodeProto) -> None:
-    """Give the last Quantize `node` the scale 1/255 and zero point 0."""
+    """Give the Quantize `node` of the output the scale 1/255 and the zero point 0."""
     values = {"picture_scale": np.float32(OUTPUT_SCALE), "picture_zero_point": np.uint8(0)}
     for slot, (name, value) in enumerate(values.items(), start=1):
         node.input[slot] = name
@@ -347,7 +348,10 @@ def set_picture_scale_and_zero_point(graph: onnx.GraphProto, node: onnx.NodeProt
 
 
 def replace_ends_by_bytes(model: onnx.ModelProto) -> None:
-    """Replace the first Quantize and the last Dequantize by Transposes, which the runtimes fold away. In place."""
+    """Give `model`, in place, a uint8 NHWC input and output: remove the first Quantize and the last Dequantize.
+
+    The runtimes fold the added Transposes away.
+    """
     graph = model.graph
     source, target = graph.input[0], graph.output[0]
     first = next(node for node in graph.node if source.name in node.input and node.op_type == "QuantizeLinear")
@@ -369,7 +373,10 @@ def replace_ends_by_bytes(model: onnx.ModelProto) -> None:
 
 
 def _nhwc_to_real(inner: list[onnx.NodeProto], source: str, quantised: str) -> list[onnx.NodeProto]:
-    """Return the nodes that dequantise and transpose the input; `inner` reads their output instead of `quantised`."""
+    """Return nodes that dequantise and transpose the input `source`.
+
+    The nodes of `inner` that dequantise `quantised` are removed, and the others read the new nodes' output.
+    """
     readers = [node for node in inner if quantised in node.input]
     scale, zero_point = readers[0].input[1:3]
     nchw = readers[0].output[0]
