@@ -234,7 +234,11 @@ def _manifest(base: Bundle, parts: Parts, network: NetworkFile, name: str) -> Ma
 
 
 def _provenance(own: Manifest, parts: Parts) -> dict[str, Any]:
-    """Return the provenance for a new manifest. Entries about the body or the weights stay only if this part stays."""
+    """Return the provenance for a new manifest.
+
+    The entries about the body stay if the body is not replaced. The entry about the weights stays if the network is
+    not replaced.
+    """
     stays = {"body": (parts.body, CAPTURED), "weights": (parts.network, UNTRAINED)}
     kept = {key: word for key, (part, word) in stays.items() if part is None and own.provenance.get(key) == word}
     kept |= {LOOK: own.provenance[LOOK]} if parts.body is None and LOOK in own.provenance else {}
@@ -291,7 +295,7 @@ VERSION = 2
 
 @dataclass(frozen=True)
 class _Recipe:
-    """What a variant of an avatar has. `trained`: whether `width` and `channels` are the avatar's own.
+    """The network of a variant of an avatar. `trained`: whether `width` and `channels` are the avatar's own.
 
     `method`: method of calibration, None to keep the avatar's network. `views`: number of views to calibrate on.
     """

@@ -66,9 +66,10 @@ def samples_csv(reads: Sequence[Measurements]) -> str:
 
 
 def one_of(reads: Sequence[Measurements], name: str) -> tuple[Measurements, Measurement]:
-    """Return the measurements of a file, and among them the measurement `name`.
+    """Return the file that has the measurement `name`, and this measurement.
 
-    An empty `name` means the only run of the only file. Raises BadInputError if no file or several files have it.
+    An empty `name` means the only run of the only file. Raises BadInputError if no file has the measurement, or if
+    several files have it.
     """
     holding = [read for read in reads if any(each.name == name for each in read.measurements)] if name else reads
     if not holding:

@@ -98,7 +98,7 @@ class Run:
 
     @cached_property
     def events(self) -> list[tuple[int, Event]]:
-        """The scheduler's events in order, each after its time in ns. Their types: `trilane.scheduler.events`."""
+        """The events that the scheduler received, in order: (time in ns, event of `trilane.scheduler.events`)."""
         return [(step.now_ns, event) for step in self.records() if isinstance(step, Stepped) for event in step.events]
 
     @cached_property
@@ -249,7 +249,10 @@ class Prediction:
 
     @property
     def units(self) -> Mapping[str, Any]:
-        """Return the `busy` share and the `idle` shares by cause of each unit, by name; empty for a bare network."""
+        """Return a mapping for each unit: its `busy` share, and `idle`, its idle shares by cause.
+
+        The result is empty for a network by itself.
+        """
         found: Mapping[str, Any] = self.document.get("units", {})
         return found
 

@@ -116,7 +116,7 @@ def _is_of_a_scene(words: Sequence[str]) -> bool:
 
 
 def _is_scene(name: str) -> bool:
-    """Return whether `name` means a scene. It does not if a run's folder has this name."""
+    """Return whether `name` means a scene, and not the folder of a run with the same name."""
     from trilane.apps.watch.followed_run import folder_of
     from trilane.scene.schema import scene_names
 

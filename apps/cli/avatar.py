@@ -235,10 +235,9 @@ def _shape(text: str) -> Shape:
 
 @contextmanager
 def _tracked(text: str) -> Iterator[Callable[[Sequence[int], Iterable[Any]], Iterable[Any]]]:
-    """Yield a function that iterates over work with a progress bar, if stderr is a terminal.
+    """Yield a function `track(numbers, work)`. It iterates over `work`, with a progress bar if stderr is a terminal.
 
-    Its parameters are a sequence with as many elements as the work has steps, and the work as an iterable.
-    `text`: label of the bar.
+    `numbers`: sequence that is as long as `work`. `text`: label of the bar.
     """
     from rich.progress import Progress
 

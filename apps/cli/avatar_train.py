@@ -1,6 +1,6 @@
 """Commands of `trilane avatar` that train and validate an avatar.
 
-Rule: this file talks to the person; `trilane.training.train` and `trilane.training.validate` do the work.
+Rule: this file reads options and shows results; `trilane.training.train` and `trilane.training.validate` do the work.
 """
 
 from __future__ import annotations

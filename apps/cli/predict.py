@@ -348,7 +348,7 @@ def predict(options: PredictOptions, *, json: JsonOption = False) -> None:
 
 
 def _write_trace(chip: Profile, plan: Plan, options: PredictOptions, answer: dict[str, Any], target: Path) -> None:
-    """Write a trace of the simulated run that gave the predicted busy and idle shares, to the file `target`."""
+    """Write the simulated run that gave the predicted busy and idle shares, as a trace in the file `target`."""
     from trilane.apps.explain.trace import write_predicted
     from trilane.hw_profiles.predict import predicted_run
 

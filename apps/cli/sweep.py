@@ -314,7 +314,7 @@ def _line(record: Mapping[str, Any]) -> str:
 
 
 def _disturbed(record: Mapping[str, Any]) -> str:
-    """Return a text on the repetitions of a trial on a busy machine, and why its result still cannot be trusted."""
+    """Return a text on how often a trial was repeated, and on the reason why its result still cannot be trusted."""
     times = record.get("repeated", 0)
     again = f"; done again {times} {'time' if times == 1 else 'times'}, as the machine was not quiet" if times else ""
     return again + "".join(f"; UNSURE: {reason}" for reason in record.get("unsure", [])[:1])

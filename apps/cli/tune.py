@@ -208,7 +208,7 @@ def _tune(
     short: int | None,
     resume: bool,
 ) -> dict[str, Any]:
-    """Search, with the results of trials in the sweep's `folder`, and return the document that `--json` prints.
+    """Search for the best configuration, keep the trials in `folder`, and return the document that `--json` prints.
 
     `budget`: number of configurations to try. `short`: frames of a trial's first short run, if any.
     """

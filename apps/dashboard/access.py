@@ -122,7 +122,7 @@ class Refusals:
         self._counts[why] += 1
 
     def as_json(self) -> dict[str, int]:
-        """Return the counts by the value of the reason."""
+        """Return the count of each reason, by the reason's value."""
         return {why.value: count for why, count in self._counts.items()}
 
 

@@ -60,7 +60,10 @@ class StateIs(NamedTuple):
 
 
 class ChangesRefused(NamedTuple):
-    """A message to the server: the run refuses the requested value of `control`. `why`: reason in words."""
+    """A message to the server: the run refuses a request. `why`: reason in words.
+
+    `control`: name of the control, `restart` for several controls, "" for a new run that did not begin.
+    """
 
     control: str
     why: str

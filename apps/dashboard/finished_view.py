@@ -291,7 +291,10 @@ class TimeTable:
             self._fresh = []
 
     def near(self, time: float, reach: float, most: int) -> NDArray[Any]:
-        """Return rows that overlap `time - reach` to `time + reach`, sorted by begin; the `most` nearest if more do."""
+        """Return the rows that overlap the interval from `time - reach` to `time + reach`, sorted by begin.
+
+        If there are more than `most`, only the nearest to `time` are returned.
+        """
         low, high = time - reach, time + reach
         touching = [piece for piece in self._pieces if piece.begin <= high and piece.end >= low]
         touching.sort(key=lambda piece: _away(time, piece.begin, piece.end))

@@ -102,10 +102,10 @@ class _Runs:
         self.director = Director(prepare, lambda message: self.link.send(message))
 
     def run_all(self, first: Prepared) -> RunOutcome:
-        """Run `first`, and each requested run after it; return the last outcome. A failed run is the last one.
+        """Run `first`, followed by each requested run, and return the last outcome. A failed run is the last one.
 
-        If a further run presents no frame, the previous configuration runs again. If there is none, raises
-        TrilaneError.
+        After a run without a presented frame, the requested run or else the previous configuration follows. Raises
+        TrilaneError if there is neither.
         """
         now, before = first, None
         while True:

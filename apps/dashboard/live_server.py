@@ -341,12 +341,15 @@ class LiveView:
         self._is_news = True
 
     def _now_ns(self) -> int | None:
-        """Return the time of the figures, ns: now. None means the last record, if the run is over or not fully read."""
+        """Return the time for which to compute figures, ns: the present time.
+
+        None means the time of the last record. It is returned if the run is over, or if its journal is not fully read.
+        """
         return None if self._is_behind or self._state in ("ended", "failed") else time.monotonic_ns()
 
 
 def _place_of(folder: Path) -> Path:
-    """Return `folder` of a live run, or, if the run has completed, the folder with the final name."""
+    """Return the place of a run's files: `folder`, or the folder with the final name if the run is complete."""
     complete = folder.with_name(run_name(folder))
     return folder if folder.is_dir() or not complete.is_dir() else complete
 

@@ -301,7 +301,7 @@ class TimelineRows:
             self._idle.append((unit, cause, self._ms(piece.begin_ns), self._ms(piece.end_ns)))
 
     def _ms(self, now_ns: int) -> float:
-        """Return the time since the first step in ms, rounded to a microsecond. The first call is that step's."""
+        """Return the time since the first step in ms, rounded to a microsecond. The first call sets the first step."""
         if self._start_ns is None:
             self._start_ns = now_ns
         return round((now_ns - self._start_ns) * MS, 3)

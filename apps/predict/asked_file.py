@@ -75,7 +75,7 @@ def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str],
 
 
 def _clock(measured: Measured) -> list[str]:
-    """Return a note on the part of a job that counts as its time, if the times are measured."""
+    """Return a list with a note on the part of a job that counts as its time; empty if no times are measured."""
     return [FROM_HAND_OVER if measured.chip == HOST else WITH_A_CORE] if measured.times else []
 
 
@@ -84,14 +84,17 @@ def _without_share(file: PipelineFile) -> list[str]:
 
 
 def _without_base(lacking: Sequence[str]) -> list[str]:
-    """Return a note that only variants are predicted, if the file lacks times. `lacking`: stages without a time."""
+    """Return a list with a note that only variants are predicted; empty if the file as it is has all times.
+
+    `lacking`: stages without a time in the file.
+    """
     return [NO_BASE.format(", ".join(lacking))] if lacking else []
 
 
 class _Chips:
     """The chip of a prediction, with its units in the precision that each network needs.
 
-    `name`: name of the chip. If no chip is requested, a measured run means this machine.
+    `name`: name of the requested chip. Without a request, it is HOST if a run was measured, else the default chip.
     `used`: profile of the chip; None until it is loaded, which happens if it is requested or a network needs it.
     `assumed`: stage and assumed precision of each network whose file states no precision, as texts in order.
     """
@@ -151,7 +154,7 @@ def _trust_in(folder: Path) -> Trust:
 
 
 def _with_share(file: PipelineFile, measured: Measured) -> PipelineFile:
-    """Return `file`; if it has neither share nor pattern of the bypass, with the share that was measured in the run."""
+    """Return `file` with the measured share of frames that took the bypass, unless the file has a share or pattern."""
     if file.bypass is None or file.bypass[1].taken is not None:
         return file
     (begin, way), names = file.bypass, list(file.stages)

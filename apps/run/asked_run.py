@@ -113,7 +113,11 @@ def _with_remade_avatar(options: RunOptions) -> tuple[RunOptions, tuple[str, ...
 
 
 def _require_check(checked: Checked) -> None:
-    """Raise BadInputError for a scene with a HUD, which no comparison has; MissingPartError for a missing library."""
+    """Raise an error before the run if `--check` is not possible.
+
+    Raises BadInputError for a scene with a HUD, because the pictures to compare with have none. Raises MissingPartError
+    if a library is missing.
+    """
     from trilane.apps.run.run_job import require_parts
     from trilane.avatars.bundle import load_bundle
 

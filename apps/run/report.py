@@ -240,7 +240,7 @@ class TensorSize(Record):
 
 
 class Resolution(Record):
-    """How often frames got a smaller tensor to be in time.
+    """The sizes of the planned tensor, which gets smaller if frames would be late.
 
     `sizes`: sizes of the tensor, the largest first.
     `switches`: number of presented frames whose size differs from the previous frame's.
@@ -265,7 +265,7 @@ class VerdictBound(Record):
 
 
 class VerdictFacts(Record):
-    """Whether the run holds its rate (`trilane.apps.run.verdict`).
+    """The verdict of the run (`trilane.apps.run.verdict`).
 
     `passed`: `pass` in the file. `target_fps`: rate that the run must hold, in frames a second.
     `bound`: null without a critical path. `trusted`: whether the machine was quiet. `why`: reasons in one line.
@@ -314,7 +314,7 @@ class Report(RunMetrics, Preamble):
     `failure`: reason for an early end, else null.
     `baseline`: metrics of a `sequential` run of the same scene, null without such a run.
     `placement`: cores of the units and the reason for them; absent if they were not placed for this run.
-    `resolution`: sizes of a planned tensor; absent if sizes did not vary to have frames in time.
+    `resolution`: sizes of a planned tensor; absent if the run does not reduce the tensor to have frames in time.
     `pace`: comparison with virtual time, for a run at a chip's pace; else absent.
     `accuracy`: by avatar, the result of `trilane.avatars.validation.accuracy_of`: figures, or why there are none.
     `check`: error of frames of this run; absent if no check was requested.

@@ -168,7 +168,7 @@ class RunFolder:
 
 
 def _partial(target: Path) -> Iterator[Path]:
-    """Yield the partial folders of runs that will write, or were to write, `target`."""
+    """Yield the `.partial` folders of live and ended runs to `target`."""
     return target.parent.glob(f"{glob.escape(target.name)}.*.partial")
 
 

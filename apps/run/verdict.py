@@ -43,8 +43,8 @@ class Trust(NamedTuple):
 def trust_of(report: Mapping[str, Any]) -> Trust:
     """Return the judgement whether a run can be trusted.
 
-    `report`: mapping with the known ones of these keys of report.json: `clock`, `other_programs`, `processor`,
-    `temperature_c`.
+    `report`: mapping with the keys `clock`, `other_programs`, `processor` and `temperature_c` of report.json, as far as
+    they are known.
     """
     if report.get("clock", HOST_CLOCK) != HOST_CLOCK:
         return Trust(True, ("computed in virtual time",))
@@ -277,8 +277,8 @@ def _late(found: Lateness) -> str:
 def _held(facts: Facts) -> str:
     """Return the rate and the frames in time, such as `96 fps (92 to 102), at 30 fps 0 of 299 frames late`.
 
-    If a fixed rate releases the frames, the text explains the first rate: it counts the shown frames. In a prediction,
-    it needs a source that always has a frame.
+    If a fixed rate releases the frames, the text says what its first number is: the rate of shown frames. In a
+    prediction, this number is the rate with a source that always has a frame.
     """
     if facts.failure:
         return f"the run ended early: {facts.failure}"

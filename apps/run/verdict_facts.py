@@ -103,9 +103,9 @@ def _is_paced(document: Mapping[str, Any]) -> bool:
 
 
 def _lateness(document: Mapping[str, Any], *, is_paced: bool) -> Lateness | None:
-    """Return how many frames were not in time. None in slow motion without a rate, where misses count at full speed.
+    """Return how many frames were not in time; None for a run in slow motion whose frames no fixed rate releases.
 
-    `is_paced`: result of `_is_paced`.
+    The misses of such a run are counted against another rate. `is_paced`: result of `_is_paced`.
     """
     frames, late = document["frames"], document["deadline_misses"]
     dropped = wanted_drops(frames["dropped"])
@@ -164,7 +164,11 @@ def _image(document: Mapping[str, Any]) -> str:
 
 
 def _validated(facts: Mapping[str, Any]) -> tuple[float, float | None]:
-    """Return two PSNRs of a validation, in dB: the mean over the bands, else the worst band's; and the worst view's."""
+    """Return two PSNRs from the validation of an avatar, in dB.
+
+    The first is the mean, or the PSNR of the worst band of zoom if there is no mean. The second is the PSNR of the
+    worst view, None if unknown.
+    """
     mean = facts.get("psnr_db")
     known = min(facts["psnr_db_by_band"].values()) if mean is None else mean
     return known, (facts.get("worst") or {}).get("psnr_db")
