@@ -377,9 +377,11 @@ def _between(low: float | None, high: float | None) -> str:
 
 
 def _skipped(report: Report) -> str:
-    """Return a line on the presented frames that skipped stages, with the number of frames for each reason."""
-    frames, composite = report.frames, report.stages["composite"]
-    means = report.stage_metrics.get("composite", {})
+    """Return a line on the presented frames that skipped stages. For a scene, it states how many had which reason."""
+    frames = report.frames
+    if "pipeline" in report.config:
+        return f"took the bypass: {frames.skipped} of {frames.presented} frames"
+    composite, means = report.stages["composite"], report.stage_metrics.get("composite", {})
     why = {"reused": "reused", "nobody on the screen": "nobody", "without their picture": "stale"}
     counts = {said: round(means.get(key, 0.0) * composite.jobs) for said, key in why.items()}
     parts = ", ".join(f"{said} {count}" for said, count in counts.items() if count)
