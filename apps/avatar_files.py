@@ -1,11 +1,12 @@
-"""An avatar's files: facts about them, an avatar assembled from parts of others, and one made again for a run.
+"""An avatar's files: facts about them, a new avatar with replaced files, and a variant of an avatar for a run.
 
-Rule: every fact about an avatar comes from its own files or its manifest. When a part is replaced, the figures and
-words about it are dropped. A validation is kept only if none of the validated files has changed.
+Rule: every fact about an avatar comes from its own files or its manifest. When a file is replaced, the new manifest
+lacks the figures and words about the old file. A validation is kept only if none of the validated files has changed.
 
-An avatar is made again with another calibration, width or number of channels of its network. A new calibration
-quantises the avatar's own float network, so its pictures are valid. A network of another width or number of channels is
-untrained: only its times are valid, and its manifest says so. The result is cached under a digest of all its inputs.
+`remade_avatar` makes a variant with another calibration, width or number of channels of the network. A new calibration
+quantises the avatar's own float network, so the pictures of the variant are valid. A network of another width or number
+of channels is untrained: only its times are valid, and its manifest says so. A variant is cached under a digest of all
+its inputs.
 """
 
 from __future__ import annotations
@@ -52,16 +53,16 @@ from trilane.training.clothing import KEY as LOOK
 if TYPE_CHECKING:
     from trilane.training.quantising.quantise import Quantised
 
-#: Of a network that is not the replaced one's: what the manifest says of its encoder and norm, which nobody stated.
+#: Encoder and norm in the manifest if the operators of a new network differ from those of the replaced network.
 OTHER = "other"
-#: A network's picture is its bytes as they are: alpha and colour in 0..1 have this scale, and zero point 0.
+#: Scale of a network's output. The picture is the output bytes as they are: alpha and colour in 0..1, zero point 0.
 PICTURE_SCALE = 1 / 255
 MAX_WIDTH = 256
 NAME_LENGTH = 100
 
 
 def bundle_facts(bundle: Bundle) -> dict[str, Any]:
-    """Return the manifest's entries, sizes in bytes, and what the network's file holds. Raises BadInputError.
+    """Return the manifest's entries, the sizes of the files, and facts about the network. Raises BadInputError.
 
     Keys: `name`, `folder`, `files`, `body`, `texture`, `network`, `quantisation`, `provenance`, `training_command`,
     `validation`.
@@ -90,9 +91,11 @@ def bundle_facts(bundle: Bundle) -> dict[str, Any]:
 
 
 def level_facts(level: MeshLevel, side: int) -> dict[str, Any]:
-    """Return the size of a level of the mesh, and how far it moves the surface at rest and the texels at its seams.
+    """Return facts about a coarser level of the mesh.
 
-    `side`: side of the texture in texels.
+    `triangles`, `vertices`: counts. `rest_mm`: largest distance between its surface and the whole mesh's, at rest.
+    `seam_texels`: largest shift of the texture at its seams, in texels.
+    `side`: side of the texture, in texels.
     """
     return {
         "triangles": len(level.faces),
@@ -103,7 +106,7 @@ def level_facts(level: MeshLevel, side: int) -> dict[str, Any]:
 
 
 def add_levels(bundle: Bundle) -> dict[str, Any]:
-    """Make the levels of the mesh of `bundle`, write them into its folder, and return facts about them.
+    """Make coarser levels of the mesh of `bundle`, write them into its folder, and return facts about them.
 
     Raises BadInputError, MissingPartError.
     """
@@ -118,7 +121,7 @@ def add_levels(bundle: Bundle) -> dict[str, Any]:
 
 
 def network_facts(network: NetworkFile) -> dict[str, Any]:
-    """Return `shape` (N, H, W, C), `sha256`, and the work of one pass (`graph_facts`). Raises BadInputError."""
+    """Return `shape` (N, H, W, C) and `sha256` of a network, and the keys of `graph_facts`. Raises BadInputError."""
     try:
         work = graph_facts(network.model)
     except BadInputError as error:
@@ -128,21 +131,21 @@ def network_facts(network: NetworkFile) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Parts:
-    """Files that replace those of an avatar; None where its own stays."""
+    """Files that replace an avatar's own files. None keeps the avatar's file."""
 
     network: Path | None = None
     texture: Path | None = None
     body: Path | None = None
 
     def files(self) -> dict[str, Path]:
-        """Return the files that replace one, by key."""
+        """Return the replacing files by key: `network`, `texture`, `body`."""
         return {key: file for key, file in vars(self).items() if file is not None}
 
 
 def assemble(base: Bundle, parts: Parts, out: Path) -> dict[str, Any]:
-    """Write an avatar to the folder `out`: its `parts`, and all other files from `base`. Return facts about it.
+    """Write an avatar to the folder `out`, with `parts` and all other files of `base`. Return facts about this avatar.
 
-    Raises BadInputError when a part is wrong or does not fit the others; nothing is written then.
+    Raises BadInputError before anything is written, if a part is wrong or does not fit the other files.
     """
     if not parts.files():
         raise BadInputError("avatar create", "no part", "--network, --texture or --body, at least one of them")
@@ -171,7 +174,7 @@ def assemble(base: Bundle, parts: Parts, out: Path) -> dict[str, Any]:
 
 
 def _drawable(network: NetworkFile) -> NetworkFile:
-    """Return `network` if the units can feed it and show its picture. Raises BadInputError."""
+    """Return `network` if the GPU can fill its input, and its output is a picture. Raises BadInputError."""
     from trilane.stages.gpu.raster import CHANNELS
 
     check_integer_layers(network)
@@ -187,7 +190,10 @@ def _drawable(network: NetworkFile) -> NetworkFile:
 
 
 def _texture(source: Path, network: NetworkFile, parts: Parts) -> NDArray[np.float32]:
-    """Read the neural texture `source`. Raises BadInputError, also for one that `network` cannot read."""
+    """Return the neural texture of the file `source`, (H, W, C) float32.
+
+    Raises BadInputError, also if texture and `network` differ in the number of channels.
+    """
     arrays = read_npz(source, TEXTURE_KEYS, "a neural texture")
     shape = arrays["texture"].shape if "texture" in arrays else ()
     if len(shape) == 3 and shape[2] != network.channels:
@@ -199,7 +205,7 @@ def _texture(source: Path, network: NetworkFile, parts: Parts) -> NDArray[np.flo
 
 
 def _check_body(base: Bundle, body: Body, parts: Parts) -> None:
-    """Raise BadInputError where the texture is laid out for another body than `body`."""
+    """Raise BadInputError if `body` has another UV layout than the body of `base`, and no new texture is given."""
     own = load_body(base.body_path)
     pairs = ((own.uv, body.uv), (own.uv_faces, body.uv_faces))
     same = all(one.shape == other.shape and np.allclose(one, other, atol=1e-6) for one, other in pairs)
@@ -228,7 +234,11 @@ def _manifest(base: Bundle, parts: Parts, network: NetworkFile, name: str) -> Ma
 
 
 def _provenance(own: Manifest, parts: Parts) -> dict[str, Any]:
-    """Return the origin of each part. Words about the person or the weights stay only if these parts stay."""
+    """Return the provenance for a new manifest.
+
+    The entries about the body stay if the body is not replaced. The entry about the weights stays if the network is
+    not replaced.
+    """
     stays = {"body": (parts.body, CAPTURED), "weights": (parts.network, UNTRAINED)}
     kept = {key: word for key, (part, word) in stays.items() if part is None and own.provenance.get(key) == word}
     kept |= {LOOK: own.provenance[LOOK]} if parts.body is None and LOOK in own.provenance else {}
@@ -237,9 +247,9 @@ def _provenance(own: Manifest, parts: Parts) -> dict[str, Any]:
 
 
 def _kind(base: Bundle, network: NetworkFile) -> tuple[str, str, int]:
-    """Return encoder, norm and width of the network; encoder and norm are `OTHER` unless its operators are the base's.
+    """Return the encoder, norm and width of `network`. The width is the number of channels of the first convolution.
 
-    The width is the number of channels of the first convolution.
+    Encoder and norm are those of `base` if both networks have the same operators, else `OTHER`.
     """
     own = base.manifest.network
     before, now = ([node.op_type for node in each.model.graph.node] for each in (base.read_network(), network))
@@ -248,7 +258,7 @@ def _kind(base: Bundle, network: NetworkFile) -> tuple[str, str, int]:
 
 
 def _width(model: onnx.ModelProto) -> int:
-    """Return the channels of the first convolution of `model`; 1 where none has known weights."""
+    """Return the number of output channels of the first convolution in `model`; 1 if its weights are unknown."""
     weights = {tensor.name: tensor.dims[0] for tensor in model.graph.initializer if len(tensor.dims) == 4}
     makers = {name: node for node in model.graph.node for name in node.output}
     for node in model.graph.node:
@@ -261,7 +271,7 @@ def _width(model: onnx.ModelProto) -> int:
 
 
 def _shapes(network: NetworkFile) -> str:
-    """Say at which tensor shapes the network can run."""
+    """Return a sentence on the tensor shapes at which the network can run."""
     _, height, width, _ = network.shape
     try:
         reshaped(network, STRIDE * 3, STRIDE * 5)
@@ -277,15 +287,18 @@ def _clipped(texture: NDArray[np.float32], network: NetworkFile) -> float:
     return float(((texture < low) | (texture > high)).mean())
 
 
-#: Of an untrained network's weights.
+#: Seed of an untrained network's weights.
 SEED = 0
-#: Grows when this file makes another avatar of the same.
+#: Part of a cached variant's digest. Raise it when this file would make other files from the same inputs.
 VERSION = 2
 
 
 @dataclass(frozen=True)
 class _Recipe:
-    """The differences of the new avatar. `trained`: whether width and channels are the avatar's own."""
+    """The network of a variant of an avatar. `trained`: whether `width` and `channels` are the avatar's own.
+
+    `method`: method of calibration, None to keep the avatar's network. `views`: number of views to calibrate on.
+    """
 
     width: int
     channels: int
@@ -299,12 +312,11 @@ class _Recipe:
 
 
 def remade_avatar(name: str, options: RunOptions) -> tuple[Path, str]:
-    """Make avatar `name` again with the network that `options` ask for, or find it in the cache.
+    """Return the folder of the variant of avatar `name` that `options` request, and a sentence about the variant.
 
-    Returns its folder and a sentence about it.
-
-    Raises BadInputError for an avatar whose float network is needed and not here, MissingPartError without PyTorch,
-    TrilaneError where nothing can be kept.
+    The variant is made, or found in the cache.
+    Raises BadInputError if the avatar's float network is needed but missing, MissingPartError without PyTorch,
+    TrilaneError if the cache cannot be written.
     """
     bundle = load_bundle(name)
     recipe = _recipe(bundle, options)
@@ -351,7 +363,7 @@ def _digest(bundle: Bundle, recipe: _Recipe) -> str:
 
 @contextmanager
 def _alone(lock: Path) -> Iterator[None]:
-    """Wait until no other process makes the same avatar, and keep others from it meanwhile."""
+    """Hold an exclusive lock on the file `lock` inside the block, so that only one process makes the same variant."""
     try:
         file = lock.open("w+")  # "w" alone would wait on a pipe
     except OSError as error:
@@ -407,7 +419,7 @@ def _quantised(bundle: Bundle, recipe: _Recipe, chosen: NDArray[np.intp]) -> Qua
 
 
 def _float_model(bundle: Bundle, recipe: _Recipe) -> onnx.ModelProto:
-    """Return the network that is quantised: the avatar's own, or an untrained one."""
+    """Return the network to quantise: the avatar's own float network, or an untrained network."""
     import torch
 
     from trilane.training.make_bundle import CALIBRATION_SHAPE, float_model
@@ -422,7 +434,7 @@ def _float_model(bundle: Bundle, recipe: _Recipe) -> onnx.ModelProto:
 
 
 def _named_weights(bundle: Bundle) -> Path:
-    """Return the file of the float network of `bundle`. Raises BadInputError without one."""
+    """Return the file of the float network of `bundle`. Raises BadInputError if the manifest names none."""
     weights = float_weights(bundle)
     if weights is None:
         remedy = "`trilane avatar validate --float-network` notes which it is"
@@ -430,16 +442,16 @@ def _named_weights(bundle: Bundle) -> Path:
     return weights
 
 
-#: The name for the network of the avatar's own file.
+#: Word that stands for the network of the avatar's own file, in place of a method.
 AS_IT_IS = "as-it-is"
-#: Number of views that networks are calibrated on that are compared with each other.
+#: Number of views on which `Calibrations` calibrates.
 COMPARED_VIEWS = 50
 
 
 class Calibrations:
-    """The network of the first avatar of `checked` by several methods of calibration, each made once.
+    """Replaces the network of the first avatar of `checked` by networks of other calibrations.
 
-    It is quantised from the avatar's own float network, on views drawn as in the training. Nothing else changes.
+    Each is quantised once, from the avatar's own float network, on views drawn as in training.
     """
 
     def __init__(self, checked: Checked) -> None:
@@ -448,7 +460,7 @@ class Calibrations:
         self._made: dict[str, NetworkFile] = {}
 
     def changed(self, checked: Checked, method: str) -> Checked:
-        """Return `checked` with the network by `method`, which is `AS_IT_IS` or a name of METHODS.
+        """Return `checked` with the network that `method` calibrates. `method`: `AS_IT_IS`, or a name in METHODS.
 
         Raises BadInputError without the float network, MissingPartError without PyTorch.
         """
@@ -469,9 +481,10 @@ class Calibrations:
 
 
 def drawn_material(avatar: str, views: int, held_out: int) -> tuple[onnx.ModelProto, list[F32]]:
-    """Return the float network of `avatar`, and inputs (H,W,C): `views` of the training's kind, then `held_out` others.
+    """Return the float network of `avatar`, and a list of inputs for it, each (H, W, C) float32.
 
-    Raises BadInputError for an avatar without a float network here, MissingPartError without PyTorch or OpenGL.
+    The list has `views` inputs drawn as in training, followed by `held_out` inputs from held-out views.
+    Raises BadInputError if the float network is missing, MissingPartError without PyTorch or OpenGL.
     """
     bundle = load_bundle(avatar)
     weights = _named_weights(bundle)

@@ -1,10 +1,10 @@
-"""What `trilane times` makes of measurements: a document, the time of a stage in a pipeline file, rows for a fit.
+"""Results of `trilane times`: a document, a CSV of samples, a pipeline file with a measured time, a row for a fit.
 
     reads = [read_measurements(path) for path in paths]
     document(reads)
     stage_text(Path("street.toml"), "seg", read, "RPC (execute) time")
 
-Rule: nothing is written here; each function returns the text of a file, checked as its reader would check it.
+Rule: no file is written here. A function that returns the text of a file first runs the checks of that file's reader.
 """
 
 from __future__ import annotations
@@ -24,19 +24,20 @@ from trilane.pipeline.measurements.measurement import Measurement
 from trilane.pipeline.measurements.read_file import OWN_COLUMNS, Measurements, chosen
 from trilane.pipeline.pipeline_file import checked_tables, tables_of, time_of
 
-MOST_WRITTEN: Final = 10_000  # samples that are written into a pipeline file
+#: Largest number of samples that a pipeline file gets.
+MOST_WRITTEN: Final = 10_000
 #: Columns of the rows for `trilane profiles fit`.
 FIT_COLUMNS: Final = ("network", "ms", "unit", "precision", "runtime", "source")
-#: Option of `trilane times` that sets a column.
+#: Column of a fit's row -> option of `trilane times` that sets this column.
 OPTION_OF: Final = {"unit": "--hardware", "precision": "--precision", "runtime": "--runtime"}
-#: Words in which tools name the hardware of a run -> a profile's unit.
+#: Word for the hardware in another tool's file -> unit of a hardware profile.
 UNIT_OF_WORD: Final = {
     "CPU": "cpu", "XNNPACK": "cpu", "GPU": "gpu", "NPU": "dsp", "HTP": "dsp", "DSP": "dsp", "HEXAGON": "dsp",
 }  # fmt: skip
 
 
 def document(reads: Sequence[Measurements]) -> dict[str, Any]:
-    """Return all measurements as plain data, each with its file."""
+    """Return the content of `--json`: the files, their measurements and the refused rows."""
     return {
         "files": [
             {
@@ -54,7 +55,7 @@ def document(reads: Sequence[Measurements]) -> dict[str, Any]:
 
 
 def samples_csv(reads: Sequence[Measurements]) -> str:
-    """Return every single time as a row of a CSV, which `trilane times` reads again."""
+    """Return a CSV with a row for each sample of each measurement. `trilane times` can read this CSV."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(OWN_COLUMNS)
@@ -65,9 +66,10 @@ def samples_csv(reads: Sequence[Measurements]) -> str:
 
 
 def one_of(reads: Sequence[Measurements], name: str) -> tuple[Measurements, Measurement]:
-    """Return the measurement that `name` means, with its file; with an empty name the only run.
+    """Return the file that has the measurement `name`, and this measurement.
 
-    Raises BadInputError for none, and for several files that have it.
+    An empty `name` means the only run of the only file. Raises BadInputError if no file has the measurement, or if
+    several files have it.
     """
     holding = [read for read in reads if any(each.name == name for each in read.measurements)] if name else reads
     if not holding:
@@ -80,11 +82,11 @@ def one_of(reads: Sequence[Measurements], name: str) -> tuple[Measurements, Meas
 
 
 def stage_text(path: Path, stage: str, read: Measurements, measurement: Measurement) -> str:
-    """Return the text of the pipeline file `path` with the measurement as the `time_ms` of `stage`.
+    """Return the text of the pipeline file `path`, with `measurement` as the `time_ms` of `stage`.
 
-    Everything else of the file stays, comments too. A profile in the file's folder is named, others are written out.
-    The stage may lack a time before: the file is checked with it.
-    Raises BadInputError for a stage that is not there or too many samples, MissingPartError without tomlkit.
+    All else in the file stays, including comments. The check sees the new text, so the stage may lack a time before.
+    `read`: measurements of the file that contains `measurement`.
+    Raises BadInputError for an unknown stage or too many samples, MissingPartError without tomlkit.
     """
     try:
         import tomlkit
@@ -93,7 +95,7 @@ def stage_text(path: Path, stage: str, read: Measurements, measurement: Measurem
     before = tables_of(path)
     stages = before.get("stages")
     if not isinstance(stages, dict) or not all(isinstance(each, dict) for each in stages.values()):
-        checked_tables(before, path)  # which says what is wrong
+        checked_tables(before, path)  # its error names the fault
     elif stage not in stages:
         expected = f"one of {', '.join(stages)}"
         raise BadInputError(f"{path}: stages", f"no stage {stage!r}", expected, did_you_mean(stage, stages))
@@ -105,7 +107,11 @@ def stage_text(path: Path, stage: str, read: Measurements, measurement: Measurem
 
 
 def _as_toml(path: Path, read: Measurements, measurement: Measurement) -> Any:
-    """Return the value of `time_ms` as an inline table."""
+    """Return `measurement` as an inline table for `time_ms`. Raises BadInputError for too many samples.
+
+    The table names the measured file if that lies in the folder of the pipeline file `path`. Otherwise the table
+    contains the samples, or the mean and the standard deviation.
+    """
     import tomlkit
 
     inside = Path(os.path.relpath(read.path.absolute(), path.absolute().parent))
@@ -125,18 +131,19 @@ def _as_toml(path: Path, read: Measurements, measurement: Measurement) -> Any:
 
 
 def _rounded(ms: float) -> float:
-    """Return a time with as many digits as clocks have: sums of floats end in digits that nobody measured."""
+    """Return `ms` rounded to six digits, because sums of floats end in digits that nobody measured."""
     return float(f"{ms:.6g}")
 
 
 def with_row(
     path: Path, read: Measurements, measurement: Measurement, network: str | None, asked: Mapping[str, str | None]
 ) -> tuple[str, list[str]]:
-    """Return the text of the table `path` with one row more, and lines that say what the row has and where it is from.
+    """Return the text of the CSV table `path` with a further row, and lines for people on the row's values and sources.
 
-    The row has the measurement's median, or else its mean. The table may be new. `asked`: the columns of OPTION_OF;
-    None means what the file says, or else what the fit assumes. Raises BadInputError for a time that is not of a whole
-    run, and for a table with other columns.
+    The row contains the measurement's median in ms, or its mean if there is no median. `path` need not exist.
+    `network`: path of the network from the folder of the table.
+    `asked`: value of each column in OPTION_OF. None means the value in the measured file, else the fit's default.
+    Raises BadInputError for the time of a layer, and for a table with other columns.
     """
     if measurement.kind == "layer":
         runs = [repr(each.name) for each in read.measurements if each.kind == "run"]
@@ -162,7 +169,7 @@ def with_row(
 
 
 def _unit_told(read: Measurements, measurement: Measurement) -> str | None:
-    """Return the unit that did a run, as its file says of it or of each layer; None where that is not one unit."""
+    """Return the unit that the file names for the measurement, else for all layers; None if that is not one unit."""
     layers = [each.hardware for each in read.measurements if each.kind == "layer"]
     named = [measurement.hardware] if measurement.hardware else layers
     units = [{unit for word, unit in UNIT_OF_WORD.items() if word in each.upper()} for each in named]

@@ -41,24 +41,25 @@ if TYPE_CHECKING:
 
 
 INTERRUPTED = 130
-#: Defaults of a program's run that are not those of the command line.
+#: Defaults of `run` that differ from the defaults of the command line.
 DEFAULTS = {"baseline_frames": 0}
-#: Options of a prediction that a program may give: those that lead to one answer, and to no file.
+#: Options that `predict` accepts. The command line also has options that give several answers or write a file.
 PREDICTED = PredictOptions.model_fields.keys() - (
     {"scene", "beside", "turns", "what_if", "plot", "trace", "table"} | OF_A_PIPELINE_ALONE
 )
 FRAME_TYPE = np.dtype(
     [("frame", np.int64), ("presented_ns", np.int64), ("frame_ns", np.int64), ("latency_ns", np.int64)]
 )
-#: Name of a row, its value, and where that comes from.
+#: A row of an HTML table: name, value, and source of the value.
 Row = tuple[str, str, str]
 TOO_SHORT = "too short to tell"
 
 
 class Run:
-    """A finished run. It keeps the parts of its journal that it has read; `records` reads without keeping.
+    """A finished run.
 
     `folder`: run folder. `report`: report.json (docs/report.md), with the machine and the avatars' error.
+    `jobs`, `events` and `idle` are read from the journal at first use and stay in memory.
     """
 
     def __init__(self, folder: Path, report: Report) -> None:
@@ -76,15 +77,15 @@ class Run:
         return run_html(self.report, str(self.folder))
 
     def records(self) -> Iterator[Record]:
-        """Yield the records of the journal after the first. Raises BadInputError."""
+        """Yield the records of the journal after the first record. Raises BadInputError."""
         return open_journal(self.folder)[1]
 
     @cached_property
     def jobs(self) -> NDArray[Any]:
-        """Every job, by their ends: a structured array of shape (jobs,) with the fields of docs/explain.md.
+        """All jobs in the order of their ends: a structured array of shape (jobs,), with the fields of docs/explain.md.
 
-        Times are int64, ns; words `str_`; figures of the stages float64, NaN where a stage has none. Raises
-        BadInputError.
+        Times are int64, ns; words are `str_`. A stage's metrics are float64, and NaN in the jobs of other stages.
+        Raises BadInputError.
         """
         figures = figure_names(self.folder)
         begun, _ = open_journal(self.folder)
@@ -97,12 +98,12 @@ class Run:
 
     @cached_property
     def events(self) -> list[tuple[int, Event]]:
-        """The events that the scheduler received: (ns, event) in order, named tuples of `trilane.scheduler.events`."""
+        """The events that the scheduler received, in order: (time in ns, event of `trilane.scheduler.events`)."""
         return [(step.now_ns, event) for step in self.records() if isinstance(step, Stepped) for event in step.events]
 
     @cached_property
     def idle(self) -> list[IdleSlice]:
-        """The idle slices of all units in the order of their ends, each with its time without a core."""
+        """The idle slices of all units, in the order of their ends."""
         begun, records = open_journal(self.folder)
         timeline = Timeline(begun.graph, begun.settings, idle=True)
         facts = [fact for record in records for fact in timeline.add(record)]
@@ -111,9 +112,9 @@ class Run:
     def frames(self) -> NDArray[Any]:
         """Return the presented frames, in order: a structured array of shape (frames,), all int64.
 
-        `frame`: number; `presented_ns`: time of presentation; `frame_ns`: time since the frame before, -1 for the
-        first; `latency_ns`: time from its sampled pose to the end of the stage that the pipeline names, -1 where
-        this stage did not take it.
+        `frame`: number of the frame. `presented_ns`: time of its presentation. `frame_ns`: time since the previous
+        presented frame, -1 for the first. `latency_ns`: time from the sampling of the pose to the end of the stage that
+        the pipeline names, -1 if that stage had no job for the frame.
         Raises BadInputError.
         """
         begun, records = open_journal(self.folder)
@@ -134,12 +135,15 @@ class Run:
         return pandas.DataFrame({name: self.jobs[name] for name in self.jobs.dtype.names or ()})
 
     def explain(self, slowest: int = 10) -> dict[str, Any]:
-        """Say where the time went, as `trilane explain RUN --json` does (docs/explain.md). Raises BadInputError."""
+        """Return the document of `trilane explain RUN --json --slowest N` (docs/explain.md), with N = `slowest`.
+
+        Raises BadInputError.
+        """
         return explain_run(self.folder, slowest)
 
 
 class RunFailedError(TrilaneError):
-    """A run ended before it was done. `run`: what was done until then."""
+    """A run ended early. `run`: the run until that moment. `exit_code`: exit code of `trilane run` in this case."""
 
     def __init__(self, message: str, run: Run, exit_code: int) -> None:
         super().__init__(message)
@@ -147,7 +151,7 @@ class RunFailedError(TrilaneError):
 
 
 def load_run(folder: str | Path) -> Run:
-    """Load the run in `folder`. Raises BadInputError for a folder that is none, or that is not whole yet."""
+    """Load the run in `folder`. Raises BadInputError if `folder` does not exist or has no complete report."""
     place = _place("load_run", folder)
     if not place.is_dir():
         raise BadInputError(place, "no folder", "the folder of a run")
@@ -161,16 +165,17 @@ def run(
     on_message: Callable[[str], None] | None = None,
     **options: Any,
 ) -> Run:
-    """Run a scene on the three units, each a process of its own, and load what it wrote.
+    """Run a scene or a pipeline file, with a process for each unit, and load the run folder.
 
-    `scene`: a scene file, the name of one that comes with Trilane, or a pipeline file.
-    `options`: fields of `trilane.stages.run_options.RunOptions`; `trilane run --help` explains them. None leaves what
-    the scene says. No `sequential` run follows unless `baseline_frames` asks for one.
-    `cores` may be a mapping, such as {"dsp": [0, 1]}.
-    `on_progress(policy, presented, requested)`, `on_message(text)`: called from this thread.
-    Raises BadInputError and MissingPartError for what cannot be run, RunFailedError for a run that ended early and
-    keeps its folder, TrilaneError for one that presented no frame, KeyboardInterrupt after an interrupted one was
-    written.
+    `scene`: a scene file, the name of a bundled scene, or a pipeline file.
+    `options`: fields of `trilane.stages.run_options.RunOptions`; `trilane run --help` explains them. None means the
+    scene's own value. `cores` may be a mapping, such as {"dsp": [0, 1]}. A `sequential` run for comparison follows only
+    if `baseline_frames` is above 0.
+    `on_progress(what, done, total)`: function that gets numbers of frames, in the caller's thread. `what` is the
+    policy, or `check` during the check. `on_message(text)`: function that gets messages, in the caller's thread.
+    Raises BadInputError and MissingPartError before a run that cannot begin. Raises RunFailedError if the run ended
+    early but left its folder, TrilaneError if no frame was presented. Raises KeyboardInterrupt after an interrupt, when
+    the folder is complete.
     """
     from trilane.apps.run.run_job import Hooks
     from trilane.pipeline.pipeline_file import is_pipeline_file
@@ -193,7 +198,10 @@ def run(
 def _signature(
     function: Callable[..., Any], model: type[Options], names: Iterable[str], defaults: Mapping[str, Any] | None = None
 ) -> inspect.Signature:
-    """Return the parameters of `function`, with one for each option in `names` in place of `**options`."""
+    """Return the signature of `function`, with a parameter for each option in `names` in place of `**options`.
+
+    `model`: class of the options. `defaults`: defaults by name that replace the defaults of `model`.
+    """
     signature = inspect.signature(function, eval_str=True)
     first, *told, _ = signature.parameters.values()
     options = [
@@ -213,10 +221,10 @@ run.__signature__ = _signature(run, RunOptions, RunOptions.model_fields, DEFAULT
 class Prediction:
     """A hardware profile's prediction for an application or a network; every figure is computed.
 
-    `document`: keys of `trilane predict --json`.
-    `frame_ms`: frame time; `low_ms`, `high_ms`: interval that holds it with a probability of 80 %, None where nothing
-    was measured.
-    `latency_ms`: None for a network by itself.
+    `document`: document of `trilane predict --json`.
+    `profile`: name of the hardware profile. `what`: the avatar, network file or published network.
+    `frame_ms`: mean frame time. `low_ms`, `high_ms`: bounds of its 80 % interval, None if the error is unknown.
+    `latency_ms`: mean latency, None for a network by itself.
     `power_w`: power of the whole device.
     """
 
@@ -231,17 +239,20 @@ class Prediction:
 
     @property
     def fps(self) -> float:
-        """Return the frames a second."""
+        """Return the rate in frames a second."""
         return 1e3 / self.frame_ms
 
     @property
     def is_display_capped(self) -> bool:
-        """Say whether frames would come faster if the display showed them."""
+        """Return whether the display, or the requested rate, limits the frame rate."""
         return bool(self.document.get("display_capped", False))
 
     @property
     def units(self) -> Mapping[str, Any]:
-        """Return by unit its busy share and its idle shares by cause; empty for a network by itself."""
+        """Return a mapping for each unit: its `busy` share, and `idle`, its idle shares by cause.
+
+        The result is empty for a network by itself.
+        """
         found: Mapping[str, Any] = self.document.get("units", {})
         return found
 
@@ -250,7 +261,7 @@ class Prediction:
 
     @cached_property
     def verdict(self) -> Verdict:
-        """The verdict: whether the rate is held on the chip, what bounds it, how sure that is, what to try."""
+        """The verdict: whether the chip holds the rate, what bounds the frame time, how sure that is, what to try."""
         return predicted_verdict(self.document)
 
     def _repr_html_(self) -> str:
@@ -274,8 +285,9 @@ def predict(
 
     `profile`: a hardware profile, by name or file. `options`: fields of
     `trilane.apps.predict.predict_options.PredictOptions` in `PREDICTED`; `trilane predict --help` explains them.
-    `avatar`: the application with this avatar's network, `default` if not given. `network`: an ONNX file by itself, or
-    with `application` in the avatar's application. `encoder`, `norm`, `size` or `channels`: the published application.
+    `avatar` selects the avatar whose network the application runs; it is `default` if not given. `network` is an ONNX
+    file. This network is predicted by itself, or in the avatar's place with `application`. `encoder`, `norm`, `size`
+    and `channels` select the published application.
     `on_message(text)`: function that is called before this machine is measured for the profile `host`, which may take
     half a minute.
     Raises BadInputError.
@@ -307,9 +319,10 @@ predict.__signature__ = _signature(predict, PredictOptions, PREDICTED)  # type: 
 
 
 def _bound(function: Callable[..., Any], first: str | Path, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of `run` or `predict` by name, with new names for old ones.
+    """Return the arguments of `function`, which is `run` or `predict`, by their present names.
 
-    Each old name is a DeprecationWarning. Raises TypeError for an unknown one, with the most similar option.
+    `first`: value of the first parameter. `options`: other arguments by name.
+    An old name causes a DeprecationWarning. Raises TypeError for an unknown name, with the most similar option.
     """
     command, signature = function.__name__, inspect.signature(function)
     warned = partial(warnings.warn, category=DeprecationWarning, stacklevel=5)  # at the caller of `run` or `predict`
@@ -322,14 +335,14 @@ def _bound(function: Callable[..., Any], first: str | Path, options: Mapping[str
 
 
 def _place(where: str, given: str | Path) -> Path:
-    """Return `given` as a path. Raises BadInputError for an empty one."""
+    """Return `given` as a path. Raises BadInputError at `where` for an empty string."""
     if isinstance(given, str) and not given.strip():
         raise BadInputError(where, *EMPTY_PATH)
     return Path(given)
 
 
 def table(title: str, rows: Iterable[Row]) -> str:
-    """Write a table with a caption and a row for each figure."""
+    """Return an HTML table with the caption `title` and a row for each figure. All texts are escaped."""
     body = "".join(
         f"<tr><th style='text-align:left'>{escape(name)}</th><td style='text-align:left'>{escape(value)}</td>"
         f"<td style='text-align:left'><small>{escape(source)}</small></td></tr>"
@@ -340,7 +353,7 @@ def table(title: str, rows: Iterable[Row]) -> str:
 
 
 def run_html(report: Report, folder: str) -> str:
-    """Write the verdict and the figures of a run that people ask for first, with the machine and the avatar's error."""
+    """Return an HTML table of a run: verdict, most important figures, error of the avatars, and machine."""
     verdict = [(label, text, "") for label, text in verdict_of(report, folder).lines()]
     return table(f"Run {folder}", [*verdict, *_run_rows(report)])
 
@@ -373,7 +386,7 @@ def _between(low: float | None, high: float | None) -> str:
 
 
 def _error(facts: Mapping[str, Any]) -> tuple[str, str]:
-    """Return PSNR by band and its source; else why there is none."""
+    """Return the PSNR of each band of zoom and its source, or else that there are no figures and why."""
     if "psnr_db_by_band" not in facts:
         return NO_FIGURES, str(facts.get("why", ""))
     bands = ", ".join(f"{band} {value:.1f}" for band, value in facts["psnr_db_by_band"].items())
@@ -381,5 +394,5 @@ def _error(facts: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def prediction_html(title: str, rows: Mapping[str, str]) -> str:
-    """Write the figures of a prediction; all are computed."""
+    """Return an HTML table of a prediction. `rows`: texts by name; the source of each is `COMPUTED`."""
     return table(title, ((name, value, COMPUTED) for name, value in rows.items()))

@@ -1,1 +1,1 @@
-"""What a pipeline file says, before anything of it runs: `trilane check`."""
+"""Checks of pipeline files and scenes before a run: `trilane check` and `trilane init`."""

@@ -1,11 +1,9 @@
-"""What `trilane check` says of a pipeline file, as one document: stages, streams, the bound on the period, memory.
+"""The document of `trilane check` about a pipeline file: stages, streams, least period, memory. Also its drawing.
 
 Rule: nothing runs here, and no Python of the file is imported.
 
-Draws a checked pipeline file: a lane for each unit, a box for each stage, a line for each input.
-
-A line of dashes is an input of the newest frame, a line of dots a bypass. The stages of the cycle that makes the period
-have a thick border.
+The drawing has a lane for each unit, a box for each stage and a line for each input. A dashed line is an input that
+takes the newest frame. A dotted line is the bypass. The stages that determine the period have a thick border.
 """
 
 from __future__ import annotations
@@ -24,7 +22,7 @@ from trilane.pipeline.pipeline_file import PipelineFile, read_pipeline
 from trilane.transport.slots import edge_rule
 from trilane.units import NS_PER_MS
 
-#: Of the slots of one stream; a run has them in shared memory.
+#: Largest total size of one stream's slots. A run keeps them in shared memory.
 MOST_STREAM_BYTES: Final = 2 << 30
 
 
@@ -37,7 +35,7 @@ def check_file(path: Path) -> dict[str, Any]:
 
 
 def document_of(file: PipelineFile) -> dict[str, Any]:
-    """Return what `check_file` says of a pipeline file that was read."""
+    """Return the result of `check_file` for a file that is already read. Raises BadInputError."""
     types = port_types(file, read_networks(file))
     prices = {name: price for name in file.stages if (price := given_price(file, name)) is not None}
     known = prices if len(prices) == len(file.stages) else None
@@ -83,7 +81,10 @@ def _stage(file: PipelineFile, name: str, price: StagePrice | None) -> dict[str,
 
 
 def _routes(file: PipelineFile, rules: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return the way past some stages: its ends, the stages that a frame skips there, and the share of such frames."""
+    """Return the bypass, if any: its ends, the stages between them, and the share of frames that take the bypass.
+
+    `rules`: rule of each edge, by the stage that writes to it.
+    """
     if file.bypass is None:
         return []
     begin, way = file.bypass
@@ -92,7 +93,7 @@ def _routes(file: PipelineFile, rules: Mapping[str, str]) -> list[dict[str, Any]
 
 
 def _what(stage: StageKeys) -> str:
-    """Return the stage's model, code or block; empty for a time alone."""
+    """Return the stage's network file, Python factory or block; "" for a stage that has only a time."""
     return str(getattr(stage, stage.kind)) if stage.kind != "time_ms" else ""
 
 
@@ -121,15 +122,15 @@ def _stream(file: PipelineFile, name: str, rule: str, types: PortTypes) -> dict[
 
 
 COLUMN, LANE, BOX, HEIGHT, LEFT, TOP = 170, 84, 130, 44, 90, 20
-OVER: Final = 10  # pixels above a row of boxes, where a line passes them
-LETTERS: Final = 17  # of a name that fit into a box
+OVER: Final = 10  # pixels between a row of boxes and a line that passes above them
+LETTERS: Final = 17  # of a stage's name, at most, in its box
 DASHES: Final = {"frame": "", "latest": " stroke-dasharray='5 4'"}
 DOTS: Final = " stroke-dasharray='1 4'"
 STYLE: Final = "font-family='sans-serif' font-size='12'"
 
 
 def draw_graph(document: Mapping[str, Any]) -> str:
-    """Return an SVG of what `check_file` found."""
+    """Return the drawing of a pipeline as an SVG. `document`: result of `check_file`."""
     columns = _columns(document)
     rows = _rows(document, columns)
     tops, height = _lanes(document, rows)
@@ -153,7 +154,7 @@ def draw_graph(document: Mapping[str, Any]) -> str:
 
 
 def _columns(document: Mapping[str, Any]) -> dict[str, int]:
-    """Return the column of each stage: one after the last of those that it reads."""
+    """Return the column of each stage: to the right of every stage that it reads."""
     found: dict[str, int] = {}
     for stage in document["stages"]:
         before = [found[each["from"].partition(".")[0]] for each in stage["in"]]
@@ -162,7 +163,7 @@ def _columns(document: Mapping[str, Any]) -> dict[str, int]:
 
 
 def _rows(document: Mapping[str, Any], columns: Mapping[str, int]) -> dict[str, tuple[str, int]]:
-    """Return the unit of each stage and its row in the unit's lane: stages in one column are below each other."""
+    """Return each stage's unit, and its row in the unit's lane. Stages in one lane and column get different rows."""
     used: dict[tuple[str, int], int] = {}
     found = {}
     for stage in document["stages"]:
@@ -173,7 +174,7 @@ def _rows(document: Mapping[str, Any], columns: Mapping[str, int]) -> dict[str, 
 
 
 def _lanes(document: Mapping[str, Any], rows: Mapping[str, tuple[str, int]]) -> tuple[dict[str, int], int]:
-    """Return the top of each unit's lane, and the height of all, in pixels."""
+    """Return the y coordinate of the top of each unit's lane, and the height of the drawing, both in pixels."""
     tops, top = {}, TOP
     for unit in document["units"]:
         tops[unit] = top
@@ -198,7 +199,7 @@ def _line(start: tuple[int, int], end: tuple[int, int], dashes: str) -> str:
     x, y, to_x, to_y = start[0] + BOX, start[1] + HEIGHT // 2, end[0], end[1] + HEIGHT // 2
     bend = (x + to_x) // 2
     path = f"M {x} {y} C {bend} {y} {bend} {to_y} {to_x} {to_y}"
-    if y == to_y and to_x - x > COLUMN:  # over the boxes between the two
+    if y == to_y and to_x - x > COLUMN:  # the line passes above the boxes between its ends
         over = y - HEIGHT // 2 - OVER
         path = f"M {x} {y} C {x + OVER} {over} {x} {over} {x + 2 * OVER} {over} H {to_x - 2 * OVER}"
         path += f" C {to_x} {over} {to_x - OVER} {over} {to_x} {to_y}"

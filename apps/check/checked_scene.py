@@ -1,6 +1,6 @@
-"""What `trilane check` says of a scene: the avatar's pipeline as a pipeline file, from the description of a run.
+"""The document of `trilane check` about a scene: the pipeline of the scene's run, written as a pipeline file.
 
-Rule: nothing runs here. With a chip the frames of the scene are planned and priced as `trilane predict SCENE` does.
+Rule: nothing runs here. If a chip is given, the stages get times as in `trilane predict SCENE`.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ from trilane.stages.configure import configure
 from trilane.stages.run_options import RunOptions
 from trilane.units import HOST, NS_PER_MS, SUSTAINED
 
-DIGITS: Final = 6  # of a time in ms: the scheduler counts nanoseconds
+DIGITS: Final = 6  # behind the point of a time in ms, because the scheduler counts nanoseconds
 
 
 class CheckedScene(NamedTuple):
-    """`document`: as `check_file` returns it, with `notes`. `text`: the scene as a pipeline file."""
+    """The check of a scene. `document`: as from `check_file`, with `notes`. `text`: the scene's pipeline as a file."""
 
     document: dict[str, Any]
     text: str
 
 
 def is_scene(text: str) -> bool:
-    """Say whether somebody means a scene: the name of an included one, or a TOML file without a pipeline's tables."""
+    """Return whether `text` is the name of a bundled scene, or of a TOML file without the tables of a pipeline."""
     path = Path(text)
     if text in scene_names():
         return True
@@ -54,7 +54,8 @@ def is_scene(text: str) -> bool:
 def check_scene(text: str, profile: str | None = None) -> CheckedScene:
     """Check a scene and return its pipeline. Raises BadInputError, or MissingPartError for a part that a run needs.
 
-    `text`: name of an included scene, or a file. `profile`: chip whose times the stages have; None: they have none.
+    `text`: name of a bundled scene, or a file.
+    `profile`: chip for which the times of the stages are computed; without a chip, the stages have no times.
     """
     options = RunOptions(scene=text, skinning="gpu")
     checked = configure(options, Path.cwd())
@@ -78,9 +79,10 @@ def check_scene(text: str, profile: str | None = None) -> CheckedScene:
 
 
 def _priced(text: str, profile: str) -> tuple[Mapping[str, float], Mapping[str, Any]]:
-    """Return the mean time of a job by stage in ms, of frames with a network, and which frames have none.
+    """Return two parts of the pipeline file: times of stages, and how many frames take the bypass.
 
-    The second is written as the keys of a bypass.
+    The first part has the mean time of a job by stage, in ms, over the frames that need the network. The second part
+    has the key `pattern` or `share` of the bypass. Raises BadInputError.
     """
     chip = load_runnable(profile)
     if chip.name == HOST:
@@ -94,7 +96,7 @@ def _priced(text: str, profile: str) -> tuple[Mapping[str, float], Mapping[str, 
 
 
 def _said(profile: str | None, share: float | None) -> list[str]:
-    """Say whose times the stages have, and how many frames take the route."""
+    """Return notes on the source of the stages' times, and on the share of frames that take the bypass."""
     if profile is None or share is None:
         return ["without times: --profile CHIP adds the times of a chip"]
     said = f"times are means of {profile}, {SUSTAINED}, for frames that the network paints"

@@ -1,8 +1,7 @@
-"""Writes a pipeline file that runs networks on a video, ready to be run, with sizes and rate read from the files.
+"""Writes a runnable pipeline file for networks on a video. Sizes and rate are read from the video and the networks.
 
-Each network looks at every frame of the video, on a branch of its own: a stage `prepare` makes its input, and a stage
-`discard` takes what it finds. Commented stages below it write a video of what the network finds. A person then joins
-the branches as the pipeline needs it.
+Each network has its own branch, which gets every frame of the video. A stage `prepare` makes the network's input, and a
+stage `discard` takes the output. Stages in comments write a video of the output. The user can then join the branches.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from trilane.pipeline.pipeline_file import read_pipeline
 from trilane.writing import write_bytes
 
 A_VIDEO = "a video that PyAV reads"
-SUFFIXES = len("-99-video")  # of names that are made of a network's
+SUFFIXES = len("-99-video")  # longest text that is added to a network's name in the name of a stage
 ON_A_CHIP = "on a chip, each block but discard needs time_ms = MS, or scale = { CHIP = FACTOR } and --measured RUN"
 
 
@@ -37,12 +36,11 @@ def write_new_file(
 ) -> str:
     """Write the file `out`, and return its text.
 
-    `networks`: ONNX files; `video`: video; all lie in the folder of `out`, or in folders in it.
+    `networks`: ONNX files. `video`: video file. All must lie in the folder of `out` or below it.
     `unit`: unit of all networks, cpu, gpu or dsp.
-    `shapes`: sizes of inputs that the networks leave open, by the input's name.
-
-    Raises BadInputError for a file that exists, for files that cannot be read or lie elsewhere, and for a network that
-    does not take pictures or has no weights; nothing is left behind.
+    `shapes`: shapes of inputs whose sizes the networks leave open, by the input's name.
+    Raises BadInputError if `out` exists, if another file cannot be read or lies elsewhere, or if a network takes no
+    picture or has no weights. After an error, `out` does not exist.
     """
     if out.exists():
         raise BadInputError(out, "a file that exists", "another name, as nothing is overwritten")
@@ -73,7 +71,10 @@ def write_new_file(
 def _branch(
     network: Path, folder: Path, unit: str, names: set[str], shapes: Mapping[str, tuple[int, ...]]
 ) -> list[str]:
-    """Return the lines of a network's stages; `names`: names of stages so far, to which these are added."""
+    """Return the lines of a network's branch. `names`: names of all stages so far; the branch's names are added.
+
+    `folder`: folder of the pipeline file. `shapes`: as in `write_new_file`. Raises BadInputError.
+    """
     graph = read_graph(network, dict(shapes))
     require_weights(graph, network)
     inputs = [_picture_input(network, value.name, value_type(value)) for value in fed_inputs(graph)]
@@ -99,9 +100,10 @@ def _branch(
 
 
 def _video_of(name: str, found: str, of: PortType | None) -> list[str]:
-    """Return lines that write a video of what network `name` finds, after one that says how to use them.
+    """Return lines of stages that write a video of a network's output, after a line that explains their use.
 
-    `found`: its output, quoted. `of`: type of the output; one that `overlay` cannot draw gets that first line alone.
+    `name`: stage of the network. `found`: `STAGE.OUTPUT`, quoted. `of`: type of this output. If `overlay` cannot draw
+    this type, the result is one line that says so.
     """
     shape = of.shape if of is not None else ()
     is_plane = len(shape) == 4 and sum(size > 1 for size in shape) in (2, 3)
@@ -119,7 +121,7 @@ def _video_of(name: str, found: str, of: PortType | None) -> list[str]:
 
 
 def _picture_input(network: Path, name: str, of: PortType | None) -> str:
-    """Return the name of an input that is a picture. Raises BadInputError for another one."""
+    """Return `name` if this input of `network` is a picture. `of`: type of the input. Raises BadInputError."""
     shape = of.shape if of is not None else ()
     if len(shape) != 4 or not {shape[1], shape[3]} & set(NETWORK_CHANNELS):
         expected = "a picture, 1xCxHxW or 1xHxWxC with 1 or 3 channels"
@@ -129,7 +131,7 @@ def _picture_input(network: Path, name: str, of: PortType | None) -> str:
 
 
 def _inside(path: Path, folder: Path) -> str:
-    """Return the path as the file names it, quoted. Raises BadInputError for a path outside of the file's folder."""
+    """Return `path` relative to `folder`, in TOML's quotes. Raises BadInputError for a path outside of `folder`."""
     absolute = Path(path.parent.resolve() / path.name)
     if not absolute.is_relative_to(folder):
         remedy = f"write the file into {absolute.parent}, or put a link to {path.name} into {folder}"
@@ -138,7 +140,7 @@ def _inside(path: Path, folder: Path) -> str:
 
 
 def _video(path: Path) -> tuple[int, int, float]:
-    """Return width and height in pixels and the rate of a video. Raises BadInputError."""
+    """Return width and height of a video in pixels, and its rate in frames a second. Raises BadInputError."""
     require_file(path, A_VIDEO)
     try:
         with av.open(str(path), metadata_errors="replace") as container:

@@ -1,9 +1,9 @@
-"""The types of a pipeline file's ports: from its own words, from its networks, and from what blocks do.
+"""The types of a pipeline file's ports: as the file states them, as its networks define them, or as blocks imply.
 
     types = port_types(file, read_networks(file))
     types["camera"][""].shape  # (480, 640, 3)
 
-Rule: what is not known stays unknown, because own code may write anything. What is known must fit.
+Rule: a port of the user's own code may have no known type. Types that are known must fit together.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from trilane.pipeline.file_keys import (
 from trilane.pipeline.pipeline_file import PipelineFile
 from trilane.stages.blocks.pictures import Preparation
 
-#: Types of the ports that each stage writes, by name; without the stages of which nothing is known.
+#: Types of the ports that a stage writes, by port, by stage. A stage whose types are unknown is absent.
 PortTypes = dict[str, dict[str, PortType]]
 CODES = {name: code for code, name in TYPES.items()}
 PICTURE_CHANNELS = (1, 3, 4)
@@ -47,9 +47,9 @@ BARE_REMEDY = "export it with its weights; `trilane check` and `trilane predict`
 
 
 def read_networks(file: PipelineFile) -> dict[str, GraphFile]:
-    """Read the network of every stage that has one, by the stage's name.
+    """Return the network of each stage that has one, by the stage's name.
 
-    Raises BadInputError, also for inputs that nobody feeds and ports that the network does not have.
+    Raises BadInputError, also if a network's input gets no stream, or if the file names a port that a network lacks.
     """
     found = {}
     for name, stage in file.stages.items():
@@ -64,7 +64,10 @@ def read_networks(file: PipelineFile) -> dict[str, GraphFile]:
 
 
 def require_weights(graph: GraphFile, where: str | Path) -> None:
-    """Raise BadInputError about `where` for a network whose weights have no values: no runtime runs it."""
+    """Raise BadInputError if weights of the network have no values, because no runtime can run it then.
+
+    `where`: place in the pipeline file, or network file, that the message names.
+    """
     held = {each.name for each in graph.model.graph.initializer} | {each.name for each in fed_inputs(graph)}
     if bare := [value.name for value in graph.model.graph.input if value.name not in held]:
         without = f"{graph.path.name} without weights: {len(bare)} are inputs without values"
@@ -87,7 +90,10 @@ def _read(file: PipelineFile, name: str, stage: OnnxStage) -> GraphFile:
 
 
 def _check_names(file: PipelineFile, name: str, stage: OnnxStage, graph: GraphFile) -> None:
-    """Check that each input of a network is fed, and that no other one is. A weight without values may be fed."""
+    """Raise BadInputError unless stage `name` feeds all inputs of its network, and nothing that the network lacks.
+
+    A stream may also feed a weight that has no values.
+    """
     where, inputs = f"{file.path}: stages.{name}", [value.name for value in graph.model.graph.input]
     wanted = [value.name for value in fed_inputs(graph)]
     for shape in stage.shapes:
@@ -114,7 +120,7 @@ def _check_names(file: PipelineFile, name: str, stage: OnnxStage, graph: GraphFi
 
 
 def _check_fixed(where: str, stage: OnnxStage, graph: onnx.GraphProto) -> None:
-    """Check that `shapes` gives no size another value than the network's own, which no runtime would take."""
+    """Raise BadInputError if `shapes` of the stage changes a size that the network fixes. No runtime accepts that."""
     for value in graph.input:
         own = [size.dim_value for size in value.type.tensor_type.shape.dim]
         given = stage.shapes.get(value.name, ())
@@ -125,7 +131,7 @@ def _check_fixed(where: str, stage: OnnxStage, graph: onnx.GraphProto) -> None:
 
 
 def _check_output(file: PipelineFile, name: str, each: StageInput, outputs: list[str]) -> None:
-    """Check the port of a network that stage `name` reads."""
+    """Raise BadInputError if stage `name` reads a port that is none of a network's `outputs`. `each`: this input."""
     where = f"{file.path}: stages.{name}.in" + (f".{each.port}" if each.port else "")
     if each.from_port and each.from_port not in outputs:
         found = f"the unknown port {each.from_port!r} of {each.stage}"
@@ -134,7 +140,10 @@ def _check_output(file: PipelineFile, name: str, each: StageInput, outputs: list
 
 
 def port_types(file: PipelineFile, networks: Mapping[str, GraphFile]) -> PortTypes:
-    """Return the types of the ports. `networks`: those of `read_networks`. Raises BadInputError for a misfit."""
+    """Return the types of all ports whose type is known. `networks`: result of `read_networks`.
+
+    Raises BadInputError if a stage cannot read what it gets.
+    """
     found: PortTypes = {}
     for name, stage in file.stages.items():
         _check_inputs(file, name, stage, found, networks)
@@ -146,7 +155,7 @@ def port_types(file: PipelineFile, networks: Mapping[str, GraphFile]) -> PortTyp
 
 
 def _check_bypass(file: PipelineFile, types: PortTypes) -> None:
-    """Check that the stage at the end of a bypass gets what it cannot do without from the stage at its begin."""
+    """Raise BadInputError if the bypass begins at a stage without a port that the stage at its end needs."""
     if file.bypass is None:
         return
     begin, way = file.bypass
@@ -167,7 +176,10 @@ def _check_bypass(file: PipelineFile, types: PortTypes) -> None:
 def _written(
     stage: StageKeys, known: PortTypes, network: GraphFile | None, networks: Mapping[str, GraphFile]
 ) -> dict[str, PortType]:
-    """Return the types of what a stage writes; empty where they are unknown. `known`: types of the stages before."""
+    """Return the types of a stage's ports; empty if they are unknown. `known`: types of the earlier stages' ports.
+
+    `network`: network of this stage, if any. `networks`: networks of all stages.
+    """
     if stage.out is not None:
         return stage.out
     if network is not None:
@@ -188,7 +200,7 @@ def _written(
 
 
 def source_type(each: StageInput, known: PortTypes) -> PortType | None:
-    """Return the type of what an input reads; None where it is unknown."""
+    """Return the type of the port that an input reads; None if it is unknown. `known`: types of the known ports."""
     ports = known.get(each.stage, {})
     if each.from_port:
         return ports.get(each.from_port)
@@ -196,7 +208,7 @@ def source_type(each: StageInput, known: PortTypes) -> PortType | None:
 
 
 def value_type(value: onnx.ValueInfoProto) -> PortType | None:
-    """Return the type of a network's input or output; None for numbers that no port carries."""
+    """Return the type of a network's input or output; None if no port can carry its kind of numbers."""
     kind = value.type.tensor_type
     try:
         name = np.dtype(onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type)).name
@@ -207,14 +219,14 @@ def value_type(value: onnx.ValueInfoProto) -> PortType | None:
 
 
 def is_picture(port: PortType) -> bool:
-    """Say whether a port carries a picture, height x width x channels of bytes."""
+    """Return whether a port carries a picture: bytes, height x width x channels."""
     return port.dtype == "u8" and len(port.shape) == 3 and port.shape[2] in PICTURE_CHANNELS
 
 
 def _check_inputs(
     file: PipelineFile, name: str, stage: StageKeys, known: PortTypes, networks: Mapping[str, GraphFile]
 ) -> None:
-    """Check the types of what a stage reads, where they are known."""
+    """Raise BadInputError if stage `name` cannot read a port. `known`: types of the known ports of earlier stages."""
     for each in stage.inputs:
         found = source_type(each, known)
         if found is None:
@@ -234,7 +246,10 @@ def _check_inputs(
 
 
 def _check_network(where: str, found: PortType, each: StageInput, network: GraphFile) -> None:
-    """Check what a network's input reads: that type, or a picture where the network takes one."""
+    """Raise BadInputError unless the network's input has type `found`, or both are pictures.
+
+    `each`: input of the stage that reads a port of this type.
+    """
     inputs = network.model.graph.input if each.port else fed_inputs(network)
     value = next(one for one in inputs if each.port in ("", one.name))
     wanted = value_type(value)

@@ -1,7 +1,7 @@
-"""`trilane avatar`: look into avatars and what they are trained on, train and validate them, quantise their networks.
+"""`trilane avatar`: look into avatars and captures, train and validate avatars, quantise their networks.
 
-Rule: this file lists the commands of the group and talks to the person. It holds `inspect`, `create`, `create-data` and
-`check-data`; `avatar_train.py` and `avatar_network.py` hold the others.
+Rule: this file registers the commands of the group, and only reads options and shows results. It contains `inspect`,
+`create`, `levels`, `create-data` and `check-data`. `avatar_train.py` and `avatar_network.py` contain the others.
 """
 
 from __future__ import annotations
@@ -175,14 +175,14 @@ app.command(epilog=avatar_train.EPILOG_TRAIN)(avatar_train.train)
 app.command(epilog=avatar_train.EPILOG_VALIDATE)(avatar_train.validate)
 app.command(epilog=avatar_network.EPILOG_NETWORK)(avatar_network.network)
 app.command(epilog=avatar_network.EPILOG_QUANTISE)(avatar_network.quantise)
-app.command("quantize", hidden=True)(avatar_network.quantise)  # the name that the command had first
+app.command("quantize", hidden=True)(avatar_network.quantise)  # first name of the command
 app.command(epilog=avatar_network.EPILOG_CALIBRATIONS)(avatar_network.calibrations)
 app.command(epilog=avatar_network.EPILOG_SPLIT)(avatar_network.split)
 app.command(epilog=avatar_network.EPILOG_EXPORT)(avatar_network.export)
 
 
 def _checked(capture: Capture, picture: Path) -> dict[str, Any]:
-    """Write the sheet of `capture` to `picture`, and return the facts about the capture."""
+    """Check `capture`, write the sheet with the fits to the file `picture`, and return facts. Raises BadInputError."""
     from trilane.training.capture.capture_samples import BodyRaster
     from trilane.training.capture.check import (
         bad_frames,
@@ -213,7 +213,7 @@ def _checked(capture: Capture, picture: Path) -> dict[str, Any]:
 
 
 def _state_cost(capture: SyntheticCapture, recipe: Recipe) -> None:
-    """Estimate on stderr the cost of all frames, from the measured cost of one."""
+    """Print the estimated time, disk space and memory for all frames on stderr, after measuring one frame."""
     import psutil
 
     from trilane.training.capture.synthetic import measured_cost
@@ -225,7 +225,7 @@ def _state_cost(capture: SyntheticCapture, recipe: Recipe) -> None:
 
 
 def _shape(text: str) -> Shape:
-    """Return (height, width) of `--picture`. Raises BadInputError."""
+    """Return (height, width) from the value WIDTHxHEIGHT of `--picture`. Raises BadInputError."""
     match = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", text)
     if match is None or not all(LEAST_SIDE <= int(side) <= MOST_SIDE for side in match.groups()):
         expected = f"WIDTHxHEIGHT in pixels, each from {LEAST_SIDE} to {MOST_SIDE}, such as 1280x720"
@@ -235,7 +235,10 @@ def _shape(text: str) -> Shape:
 
 @contextmanager
 def _tracked(text: str) -> Iterator[Callable[[Sequence[int], Iterable[Any]], Iterable[Any]]]:
-    """Yield a function that shows work as a progress bar, when stderr is a terminal."""
+    """Yield a function `track(numbers, work)`. It iterates over `work`, with a progress bar if stderr is a terminal.
+
+    `numbers`: sequence that is as long as `work`. `text`: label of the bar.
+    """
     from rich.progress import Progress
 
     console = stderr_console()

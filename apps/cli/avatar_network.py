@@ -1,6 +1,7 @@
 """Commands of `trilane avatar` that make network files: `network`, `split`, `export`, `quantise`, `calibrations`.
 
-Rule: this file talks to the person; the work is done in `trilane.avatars`, `trilane.training` and `trilane.stages.dsp`.
+Rule: this file only reads options and shows results. `trilane.avatars`, `trilane.training` and `trilane.stages.dsp` do
+the work.
 """
 
 from __future__ import annotations
@@ -63,7 +64,7 @@ Examples:
   trilane avatar calibrations --avatar default --plot calibrations.png
 """
 MAX_FRAMES = 1000
-#: Views of an avatar that a calibration is looked at on.
+#: Number of held-out views of an avatar on which calibrations are compared.
 HELD_OUT = 24
 EITHER = "a float network and its --frames, or --avatar alone"
 
@@ -153,12 +154,12 @@ def export(
 
 
 def _both_sides(size: str) -> str:
-    """Return `S` as `SxS`."""
+    """Return the size `S` as `SxS`; a size with both sides stays as it is."""
     return size if "x" in size else f"{size}x{size}"
 
 
 def _shape(size: str) -> Shape:
-    """Return (height, width) of `--size`. Raises BadInputError."""
+    """Return (height, width) from the value HEIGHTxWIDTH of `--size`. Raises BadInputError."""
     from trilane.arrays import parse_shape
     from trilane.unexpected_value import UnexpectedValue
 
@@ -171,7 +172,7 @@ def _shape(size: str) -> Shape:
 def _untrained(
     encoder: str, norm: str, width: int, channels: int, shape: Shape, seed: int
 ) -> tuple[onnx.ModelProto, int]:
-    """Return a network with random weights, and the number of its weights."""
+    """Return a float network with random weights, and the number of its parameters. Raises MissingPartError."""
     try:
         import torch
     except ModuleNotFoundError as error:
@@ -186,7 +187,7 @@ def _untrained(
 
 
 def _write_parts(whole: NetworkFile, at: list[str], folder: Path) -> list[Path]:
-    """Write the parts of the network to `folder`; returns their files."""
+    """Cut the network `whole` at the tensors `at`, write the parts to `folder`, and return their files, in order."""
     from trilane.avatars.network_split import split as cut_at
     from trilane.writing import write_bytes
 
@@ -284,7 +285,7 @@ def calibrations(
         from trilane.hw_profiles.governor import figure_for
         from trilane.writing import require_writable
 
-        figure_for(plot, (1, 1))  # that it can be drawn and written is found out before the work
+        figure_for(plot, (1, 1))  # raises errors about the drawing before the long work
         require_writable(plot)
     model, inputs, held_out = _material(source, frames, avatar)
     table_rows = calibration_table(model, inputs, methods, held_out=held_out)
@@ -307,7 +308,10 @@ def calibrations(
 
 
 def _material(source: Path | None, frames: Path | None, avatar: str | None) -> tuple[Any, list[Any], int]:
-    """Return a float network, its inputs, and how many of them are held out. Raises BadInputError, MissingPartError."""
+    """Return a float network, a list of inputs (H,W,C) float32, and how many inputs at its end are held out.
+
+    Raises BadInputError, MissingPartError.
+    """
     from trilane.avatars.network_file import parse_network
     from trilane.training.quantising.calibration_table import COUNTS, EVALUATED
 
@@ -322,7 +326,7 @@ def _material(source: Path | None, frames: Path | None, avatar: str | None) -> t
 
 
 def _write_layers(path: Path, model: Any, result: Any, frame: Any) -> Any:
-    """Measure the error of every layer on `frame` and write it to `path`; returns the rows."""
+    """Measure the error of every layer on `frame`, write the rows to the file `path`, and return them."""
     from trilane.training.quantising.noise_model import layer_report
     from trilane.writing import write_bytes
 
@@ -333,7 +337,7 @@ def _write_layers(path: Path, model: Any, result: Any, frame: Any) -> Any:
 
 
 def _frames(path: Path) -> list[Any]:
-    """Read frames (H,W,C) float32 of a .npy file, at most `MAX_FRAMES`. Raises BadInputError."""
+    """Return the frames (H,W,C) float32 of a .npy file, at most `MAX_FRAMES` of them. Raises BadInputError."""
     import numpy as np
 
     from trilane.files import read_npy

@@ -1,6 +1,6 @@
 """Commands of `trilane avatar` that train and validate an avatar.
 
-Rule: this file talks to the person; `trilane.training.train` and `trilane.training.validate` do the work.
+Rule: this file reads options and shows results; `trilane.training.train` and `trilane.training.validate` do the work.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ Examples:
   trilane avatar train my-capture --out again --config mine/training.toml
   trilane avatar train --out further --config avatars/default/training.toml
 """
-#: Where wheels of PyTorch lie that need no GPU; the plain package index has those for NVIDIA's.
+#: Package index with PyTorch's builds for the CPU. The default index has the builds for NVIDIA GPUs.
 CPU_INDEX = "https://download.pytorch.org/whl/cpu"
-#: Share of the newest loss in the one that is shown; seconds between two lines where no bar is drawn.
+#: Weight of the newest loss in the shown running mean; seconds between two lines if stderr is no terminal.
 NEWEST, LINE_S = 0.05, 30.0
-#: Folder of the log for TensorBoard, in the work folder; seconds after which what was logged is on the disk.
+#: Name of TensorBoard's folder in the work folder; seconds after which logged values are on the disk.
 LOG, FLUSH_S = "tensorboard", 10
-#: Width of the networks of `default` and `hiker`.
+#: Width of the networks of the avatars `default` and `hiker`.
 DEFAULT_WIDTH = 16
 EPILOG_VALIDATE = """\b
 Examples:
@@ -51,7 +51,7 @@ Examples:
   trilane avatar validate default --seed 1 --seed 2 --sheet worst.png
   trilane avatar validate my-avatar --sizes
 """
-#: Runtimes that are validated when none is given, where they are installed; the first one's figures are the avatar's.
+#: Runtimes to validate with if none is given and they are installed. The first one gives the avatar's figures.
 RUNTIMES = ("ort", "openvino")
 
 
@@ -123,7 +123,7 @@ def train(
 
 
 def _require_torch() -> None:
-    """Raise MissingPartError with the lines that install what training needs."""
+    """Raise MissingPartError with installation commands if a package for training is missing."""
     missing = [name for name in ("torch", "scipy", "skimage") if not machine.here.has_package(name)]
     if "torch" in missing:
         lines = f"{package_line('torch')} --index-url {CPU_INDEX} (CPU) or {package_line('torch')} (NVIDIA GPU)"
@@ -134,7 +134,7 @@ def _require_torch() -> None:
 
 @contextmanager
 def _shown(log: EventLog | None) -> Iterator[_ShownTraining]:
-    """Yield a listener that shows a training on stderr, as bars on a terminal, else as lines; and in `log`."""
+    """Yield a listener that shows a training on stderr, as bars on a terminal, else as lines, and writes to `log`."""
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = stderr_console()
@@ -148,7 +148,7 @@ def _shown(log: EventLog | None) -> Iterator[_ShownTraining]:
 
 
 class _ShownTraining:
-    """Shows the progress of a training; a `train.Listener`."""
+    """Shows the progress of a training. It implements `trilane.training.train.Listener`."""
 
     def __init__(self, console: Console, progress: Progress, log: EventLog | None) -> None:
         self._console, self._progress, self._log = console, progress, log
@@ -180,9 +180,10 @@ class _ShownTraining:
 
 
 class EventLog:
-    """Writes the losses of a training into `folder` as a log for TensorBoard; the first step makes its file.
+    """Writes the losses of a training into `folder` as a log for TensorBoard.
 
-    A continued training removes the entries after its saved state.
+    The first `write` makes the file. If a training continues from a saved state, the entries after that state are
+    removed.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -190,7 +191,7 @@ class EventLog:
         self._writer: Any = None
 
     def write(self, step: int, terms: Mapping[str, float], loss: float) -> None:
-        """Log each of the `terms` of the loss at `step`, before weighting, and their weighted sum `loss`."""
+        """Log the unweighted `terms` of the loss at `step`, by name, and their weighted sum `loss`."""
         if self._writer is None:
             self._writer = _writer(self._folder, step)
         self._writer.add_scalar("loss", loss, step)
@@ -204,7 +205,7 @@ class EventLog:
 
 
 def _writer(folder: Path, step: int) -> Any:
-    """Return a writer to `folder`, after removing its entries from `step` on."""
+    """Return TensorBoard's writer to `folder`. The entries of an earlier training from `step` on are discarded."""
     from torch.utils.tensorboard import SummaryWriter
 
     return SummaryWriter(str(folder), purge_step=step, flush_secs=FLUSH_S)
@@ -283,7 +284,7 @@ def validate(
 
 
 def _band_table(validation: Validation) -> Table:
-    """Return a table with a row for each band of zoom: the first runtime's errors, and what quantising cost."""
+    """Return a table with a row for each band of zoom: errors with the first runtime, and loss by quantising."""
     from rich.table import Table
 
     from trilane.avatars.validation import from_validation
@@ -305,7 +306,10 @@ def _band_table(validation: Validation) -> Table:
 
 
 def _validate(bundle: Bundle, plan: ValidationPlan, float_network: Path | None, sheet: Path | None) -> Bundle:
-    """Validate `bundle`, write its manifest and, where asked, the sheet. Return the bundle as it was written."""
+    """Validate `bundle`, write the figures into its manifest, and return the new bundle.
+
+    `float_network`: weights before quantising, to compare with. `sheet`: file for a picture of the worst views.
+    """
     from rich.progress import Progress
 
     from trilane.training import validate as work
@@ -329,7 +333,10 @@ def _validate(bundle: Bundle, plan: ValidationPlan, float_network: Path | None, 
 
 
 def _add_sizes(bundle: Bundle, plan: ValidationPlan) -> Bundle:
-    """Measure `bundle` at several tensor sizes and add the figures to its validation, which must fit its files."""
+    """Measure `bundle` at several tensor sizes, add the figures to its manifest, and return the new bundle.
+
+    Raises BadInputError if the bundle has no validation of its present files.
+    """
     from rich.progress import Progress
 
     from trilane.avatars.validation import VALIDATE, name_of, refused
@@ -353,7 +360,7 @@ def _psnr_db(sample: Evaluated, plan: ValidationPlan) -> float:
 
 
 def _float_network(bundle: Bundle, weights: Path) -> FloatNetwork:
-    """Return the network of the file `weights`. Raises BadInputError, MissingPartError."""
+    """Return the float network in the file `weights`, for `bundle`. Raises BadInputError, MissingPartError."""
     try:
         from trilane.training.trainable_avatar import float_painter_of
     except ImportError as error:

@@ -1,8 +1,8 @@
 """`trilane bench`: measurements of this machine's speed and exactness, by name.
 
-Rule: a bench is a module of `trilane.bench` with a `measure`, and a line of `BENCHES`. The parameters of `measure` are
-the command's options, with types from their defaults. Its docstring and the module's question are the help. An option
-has one meaning in all benches, or a line of its own in `MEANINGS`.
+Rule: a bench is a line of `BENCHES` and a module with a function `measure`. The parameters of `measure` are the
+command's options, whose types follow from their defaults. The docstrings of the module and of `measure` are the help.
+An option has the same meaning in all benches, unless `MEANINGS` has a line for this bench and option.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from trilane.apps.cli.main import lazy_group
 from trilane.apps.predict.predict_options import ENCODER_HELP, NORM_HELP
 from trilane.stages.run_options import RUNTIME_HELP, SIZE_HELP, WIDTH_HELP
 
-#: Bench: its module, and the line that `trilane bench --help` shows for it.
+#: Bench -> its module, and its line in `trilane bench --help`.
 BENCHES = {
     "raster": ("trilane.bench.raster", "One packed pass against a pass for every four channels and a permute."),
     "readback": ("trilane.bench.readback", "Variants of moving pixels between GPU and slot."),
@@ -50,7 +50,7 @@ BENCHES = {
     ),
 }
 METAVARS: dict[type, str] = {int: "N", float: "X", str: "TEXT"}
-#: A table with more columns is printed with a row for each column.
+#: Largest number of columns. A table with more columns is printed transposed.
 MOST_COLUMNS = 9
 EPILOG = """\b
 Examples:
@@ -63,7 +63,7 @@ FIXED_SIZE = "Tensor size in pixels: HEIGHTxWIDTH."
 SQUARE_SIZE = "Side of the square tensor in pixels."
 NAMED_RUNTIME = "ort, openvino, qnn or cuda."
 DRIVER_THREADS = "Threads of the software OpenGL driver."
-#: Option, or bench and option: its line in `--help`.
+#: Option, or bench and option -> its line in `--help`.
 MEANINGS = {
     "avatar": "`default`, `hiker`, the folder of an avatar, or `resnet18`: the full-width network, untrained.",
     "avatars": "How many avatars share the tensor.",
@@ -133,7 +133,7 @@ MEANINGS = {
 
 
 def bench_command(name: str) -> Any:
-    """Return the command of bench `name`, with an option for every parameter of its `measure`."""
+    """Return the command of bench `name`, with an option for each parameter of its `measure`."""
     module = importlib.import_module(BENCHES[name][0])
     measure = module.measure
 
@@ -168,14 +168,17 @@ def bench() -> None:
 
 
 def _help(name: str, module: ModuleType) -> str:
-    """Return the bench's line, its module's question, and what `measure` says of its answer."""
+    """Return the help of a bench: its line, the first paragraph of its module, and the docstring of `measure`."""
     question = (inspect.getdoc(module) or "").split("\n\n")[0]
     answer = (inspect.getdoc(module.measure) or "").partition("Raises ")[0].rstrip()
     return f"{BENCHES[name][1]}\n\n{question}\n\n{answer}"
 
 
 def _option(bench: str, parameter: inspect.Parameter) -> Any:
-    """Return an option with the type of its default; for a tuple, one that is given once for each value."""
+    """Return Typer's option for a parameter of `measure`. Its type is the type of the default.
+
+    If the default is a tuple, the option may be given several times, once for each value.
+    """
     default = parameter.default
     several = isinstance(default, tuple)
     kind = type(default[0] if several else default)
@@ -185,11 +188,10 @@ def _option(bench: str, parameter: inspect.Parameter) -> Any:
 
 
 def show(name: str, measure: Callable[..., Mapping[str, Any]], asked: Mapping[str, Any], as_json: bool) -> None:
-    """Measure and print the result with the machine's facts.
+    """Run a bench and print its result with facts about the machine.
 
-    `name`: name of the bench. `measure`: function of its module.
-    `asked`: value of each option.
-    `as_json`: whether to print one JSON document, or a table for people.
+    `name`: name of the bench. `measure`: function of its module. `asked`: value of each option, by name.
+    `as_json`: whether to print one JSON document, or tables for people.
     """
     from trilane.bench import check_limits
     from trilane.stages.machine_facts import machine_facts
@@ -215,7 +217,7 @@ def show(name: str, measure: Callable[..., Mapping[str, Any]], asked: Mapping[st
 
 
 def flat(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `data` with the keys of mappings in it joined by dots."""
+    """Return `data` without nested mappings: the keys of inner mappings are joined by dots."""
     joined: dict[str, Any] = {}
     for key, value in data.items():
         inner = flat(value) if isinstance(value, Mapping) else None
@@ -228,7 +230,7 @@ def _table(rows: list[dict[str, Any]]) -> Any:
 
     columns = list(dict.fromkeys(key for row in rows for key in row))
     if len(columns) > MOST_COLUMNS:
-        turned = Table(show_header=False)  # which has as many columns as its longest row
+        turned = Table(show_header=False)  # Rich adds a column for each cell of the longest row
         for column in columns:
             turned.add_row(column, *(_text(row.get(column, "")) for row in rows))
         return turned
@@ -245,5 +247,5 @@ def _text(value: Any) -> str:
 
 
 def meaning(bench: str, option: str) -> str:
-    """Return the line for `option` of `bench`. Raises KeyError for an option without one."""
+    """Return the line in `--help` for `option` of `bench`. Raises KeyError if `MEANINGS` has none."""
     return MEANINGS.get(f"{bench} {option}") or MEANINGS[option]

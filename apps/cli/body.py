@@ -1,6 +1,6 @@
 """`trilane body`: look into body files, pose them, build one.
 
-Rule: this file talks to the person; the work is done in `trilane.body` and `trilane.training.body_from_anny`.
+Rule: this file reads options and shows results; `trilane.body` and `trilane.training.body_from_anny` do the work.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def inspect(path: BodyFileArgument, json: JsonOption = False) -> None:
 
 
 def body_facts(path: Path) -> dict[str, Any]:
-    """Return counts, size and skinning of a body file. Raises BadInputError."""
+    """Return facts about a body file: counts, size and skinning weights. Raises BadInputError."""
     from trilane.body.body import load_body
     from trilane.body.skinning import WEIGHT_COUNTS, weight_error_bound
 
@@ -118,7 +118,10 @@ def _check_poses(path: Path, frames: NDArray[np.float64], expected: str) -> NDAr
 
 
 def _write_vertices(out: Path, shaped: ShapedBody, frames: NDArray[np.float64]) -> tuple[int, int, int]:
-    """Write the vertices of every pose as the file `out`; returns the shape of their array. Raises BadInputError."""
+    """Write the vertices of every pose to the file `out` (.npy), and return the shape (T, V, 3) of the array.
+
+    `frames`: poses (T, 165), axis-angle. Raises BadInputError.
+    """
     import numpy as np
 
     from trilane.body.skinning import posed_vertices
@@ -137,7 +140,7 @@ def _write_vertices(out: Path, shaped: ShapedBody, frames: NDArray[np.float64]) 
 
 
 def _check_place(path: Path, size: int) -> None:
-    """Raise BadInputError when no file of `size` bytes can be at `path`."""
+    """Raise BadInputError if no file of `size` bytes can be written to `path`."""
     if path.is_dir():
         raise BadInputError(path, "a folder", "a file in a folder", OTHER_OUT)
     if not path.parent.is_dir():

@@ -1,6 +1,6 @@
 """`trilane check`: a pipeline file as text, JSON or a drawing.
 
-Rule: this module shows what `trilane.apps.check` found; nothing is computed here, and nothing of the file is imported.
+Rule: this module shows the results of `trilane.apps.check`. It computes nothing and imports no code of the file.
 """
 
 from __future__ import annotations
@@ -74,7 +74,10 @@ def check(file: FileArgument, svg: SvgOption = None, profile: ProfileOption = No
 
 
 def _checked(file: str, profile: str | None) -> tuple[dict[str, Any], str]:
-    """Return the document of a pipeline file or a scene, and a scene's text. Raises BadInputError."""
+    """Return the document for `--json`, and a scene's pipeline as a file's text, "" for a pipeline file.
+
+    `profile`: chip for the times of a scene. Raises BadInputError.
+    """
     from trilane.apps.check.checked_file import check_file
     from trilane.apps.check.checked_scene import check_scene, is_scene
     from trilane.errors import BadInputError
@@ -99,7 +102,7 @@ def _head(document: Mapping[str, Any]) -> list[str]:
 
 
 def _stages(document: Mapping[str, Any]) -> Table:
-    """Return the stages by unit, in the order of a frame."""
+    """Return a table of the stages, grouped by unit. `document`: result of `check_file`."""
     from rich.markup import escape
     from rich.table import Table
 

@@ -1,8 +1,8 @@
 """The Typer application of the commands, and the options that several commands share.
 
-Rule: an option with one value is given at most once, because a second value would silently replace the first. Errors
-about a value state what was found and what was expected. Options of a run are fields of `RunOptions`; other shared
-options are defined here. Each has one spelling and one explanation in all commands.
+Rule: an option with a single value is refused if it is given twice, because one value would silently replace the other.
+Errors about a value state what was found and what was expected. Options of a run are fields of `RunOptions`. Other
+shared options are defined here. An option has the same spelling and explanation in all commands.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from trilane.errors import BadInputError, did_you_mean
 from trilane.options import EMPTY_PATH, Options, element_of, expected, kind_of, limits_of, option_of
 from trilane.stages.run_options import AVATARS_HELP, PROFILE_HELP, WIDTH_HELP, RunOptions
 
-#: Name of the attribute of a command's function that holds its model of options.
+#: Attribute of a command's function, with the class of the command's options.
 OPTIONS = "options_model"
-#: What pydantic calls the kinds of numbers.
+#: Pydantic's name of a kind of number -> plain name.
 IN_PLAIN_WORDS = {"a valid number": "a number", "a valid integer": "a whole number"}
 POLICY_HELP = "sequential, pipelined, latest or deadline."
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")]
@@ -40,12 +40,12 @@ PortOption = Annotated[
 
 
 class OnceCommand(TyperCommand):
-    """A command whose options take one value each, but for those that collect several."""
+    """A command that refuses an option given twice, unless the option collects several values."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Raise BadInputError naming an option that is given twice or has a value of another kind or range.
+        """Parse `args` as Typer does. Raises BadInputError for an option that is given twice or has a wrong value.
 
-        An empty path or argument is refused too. An option's other spelling (`--no-hud`) is the same option.
+        An empty path or argument is an error too. `--hud` and `--no-hud` are the same option.
         """
         typed, _, given = self.make_parser(ctx).parse_args(args=list(args))
         for parameter in self.params:
@@ -63,7 +63,7 @@ class OnceCommand(TyperCommand):
 
 
 def _refuse_empty(parameter: Any, typed: str | Sequence[str] | None) -> None:
-    """Raise BadInputError for an empty path or argument. `typed`: words as typed; Typer reads an empty one as `.`."""
+    """Raise BadInputError for an empty path or argument, which Typer would read as `.`. `typed`: words as typed."""
     kinds = [*_kinds(parameter.type_descriptor.annotation)]
     names_a_thing = parameter.param_type_name == "argument" and str in kinds
     texts = [typed] if isinstance(typed, str) else typed or ()
@@ -72,14 +72,17 @@ def _refuse_empty(parameter: Any, typed: str | Sequence[str] | None) -> None:
 
 
 def _kinds(kind: Any) -> Iterator[Any]:
-    """Yield the type and all types within it."""
+    """Yield the type `kind` and, recursively, the types of its arguments, such as Path in `list[Path]`."""
     yield kind
     for each in get_args(kind):
         yield from _kinds(each)
 
 
 def _wrong_value(parameter: Any, error: ValidationError, model: type[Options] | None) -> BadInputError:
-    """Say what pydantic found wrong with the value of an option or argument. `model`: options of the command."""
+    """Return the error about the value of an option or argument that pydantic has refused.
+
+    `parameter`: Typer's option or argument. `error`: pydantic's error. `model`: class of the command's options.
+    """
     first, kind = error.errors()[0], parameter.type_descriptor.annotation
     where = parameter.opts[0]
     found = first["input"]
@@ -94,12 +97,12 @@ def _wrong_value(parameter: Any, error: ValidationError, model: type[Options] | 
 
 
 def _may_be_repeated(option: TyperOption) -> bool:
-    """Return whether the option may be repeated: it collects values, or it is a flag without an opposite."""
+    """Return whether an option may be repeated: it collects or counts, or is a flag without an opposite."""
     return option.multiple or option.count or (option.is_flag and not option.secondary_opts)
 
 
 def given(ctx: typer.Context) -> set[str]:
-    """Return the names of the parameters that the command line gives."""
+    """Return the names of the parameters that stand on the command line."""
     sources = {name: ctx.get_parameter_source(name) for name in ctx.params}
     return {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
 
@@ -116,7 +119,7 @@ class Commands(typer.Typer):
 
 
 def _described(model: type[Options], name: str) -> Any:
-    """Describe field `name` of `model` to Typer as an option or argument, whose value the field checks."""
+    """Return Typer's option or argument for field `name` of `model`. Its callback checks the value with the field."""
     field = model.model_fields[name]
     option = option_of(field)
 
@@ -129,17 +132,17 @@ def _described(model: type[Options], name: str) -> Any:
     settings: dict[str, Any] = {"help": field.description, "callback": checked, "min": least, "max": most}
     if option.is_argument:
         return typer.Argument(**settings)
-    is_pair = kind_of(field) is bool and not option.spelling  # which Typer spells --NAME/--no-NAME
+    is_pair = kind_of(field) is bool and not option.spelling  # Typer spells it --NAME/--no-NAME
     return typer.Option(*() if is_pair else (model.spelling(name), *option.synonyms), **settings)
 
 
 def with_options(
     model: type[Options], names: Collection[str] | None = None
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Return a decorator for a command whose first parameter is a `model`: each field becomes an option of its own.
+    """Return a decorator for a command whose first parameter is a `model`. Each field becomes an option.
 
-    Typer reads the options of a command from its signature, which is put together here. The command's model has the
-    fields that the command line gives; the others have their defaults.
+    Typer reads a command's options from its signature, so the decorator builds one with a parameter for each field. The
+    command gets a `model` in which only fields from the command line count as set.
     `names`: fields that become options; all if None.
     """
     fields = [name for name in model.model_fields if names is None or name in names]

@@ -1,10 +1,11 @@
-"""`trilane compare`: runs beside each other, a verdict and a gate. `trilane report`: many runs on one page.
+"""`trilane compare`: differences between runs, a verdict and a gate. `trilane report`: many runs on one page.
 
-Rule: this module reads options and shows; every figure comes from `trilane.apps.compare`. A verdict comes first, then
-its evidence, then the uncertain figures. A gate tells GitHub too, by annotations and a summary in Markdown
-(docs.github.com, "Workflow commands for GitHub Actions" and "Adding a job summary"). All texts of files are escaped
-there, so that none is a command to GitHub or Markdown. Annotations go to stderr, which GitHub reads too, so that --json
-stays one document.
+Rule: this module reads options and shows results; every figure comes from `trilane.apps.compare`. The verdict comes
+first, followed by its evidence and the uncertain figures.
+
+A gate may also write annotations for GitHub and a summary in Markdown (docs.github.com, "Workflow commands for GitHub
+Actions" and "Adding a job summary"). Texts from files are escaped there, so that none acts as a command or as Markdown.
+Annotations go to stderr, which GitHub reads too, so that stdout stays one document with --json.
 """
 
 from __future__ import annotations
@@ -174,7 +175,7 @@ def _gates(asked: Sequence[str], slower: str | None) -> list[Gate]:
 
 
 def _say(judged: Sequence[JudgedLimit]) -> None:
-    """Say what each limit came to."""
+    """Print the outcome of each limit on stderr."""
     several = len({each.name for each in judged}) > 1
     for each in judged:
         said = without_controls(f"{each.name}: {each.said}" if several else each.said)
@@ -182,7 +183,7 @@ def _say(judged: Sequence[JudgedLimit]) -> None:
 
 
 def _leave(judged: Sequence[JudgedLimit]) -> None:
-    """Leave with the exit code of the gate."""
+    """Raise typer.Exit with the exit code of the gate, unless all limits are kept."""
     from trilane.apps.compare.gate import LimitOutcome, whole
 
     codes = {LimitOutcome.KEPT: 0, LimitOutcome.BROKEN: BROKEN, LimitOutcome.UNKNOWN: CANNOT_TELL}
@@ -191,7 +192,7 @@ def _leave(judged: Sequence[JudgedLimit]) -> None:
 
 
 def _are_sweeps(names: list[str]) -> bool:
-    """Say whether all names are sweeps. Raises BadInputError for sweeps beside something else."""
+    """Return whether all `names` are folders of sweeps. Raises BadInputError if only some of them are."""
     from trilane.apps.compare.compared_sweeps import is_sweep
 
     sweeps = [name for name in names if is_sweep(name)]
@@ -209,14 +210,14 @@ def _write_page(path: Path, comparisons: list[Comparison]) -> None:
     say(f"page: {path}")
 
 
-#: Measures of which one statistic is shown even where nothing differs.
+#: Measures that are shown even if they do not differ, with a statistic in ALWAYS_STATISTICS.
 ALWAYS = ("frame time", "latency", "instructions", "time of an instruction", "work", "busy")
 ALWAYS_STATISTICS = ("mean", "typical", "share")
 MOST_CHANGES = 12
 
 
 def comparison_lines(comparison: Comparison, show_all: bool) -> Iterator[str | Table]:
-    """Yield texts and tables of one comparison. `show_all`: also show figures that do not differ."""
+    """Yield the texts and tables that show `comparison`. `show_all`: whether to show figures that do not differ."""
     from trilane.apps.compare.comparison import METHOD, bounds_text
 
     yield f"{comparison.other.name} beside {comparison.base.name}"
@@ -236,7 +237,7 @@ def comparison_lines(comparison: Comparison, show_all: bool) -> Iterator[str | T
     yield METHOD
 
 
-#: Why a configuration of a sweep has no partner.
+#: Reason for which a configuration of a sweep is not compared -> its text.
 LEFT_OUT = {
     "not_done": "not done in both",
     "base_alone": "in the base alone",
@@ -245,7 +246,7 @@ LEFT_OUT = {
 
 
 def sweep_lines(comparison: SweepComparison, show_all: bool) -> Iterator[str | Table]:
-    """Yield texts and tables of two sweeps. `show_all`: also show trials that do not differ."""
+    """Yield the texts and tables that compare two sweeps. `show_all`: whether to show trials that do not differ."""
     from trilane.apps.compare.compared_sweeps import METHOD
 
     yield f"{comparison.other} beside {comparison.base}: {len(comparison.pairs)} trials of equal configuration"
@@ -268,7 +269,7 @@ def sweep_lines(comparison: SweepComparison, show_all: bool) -> Iterator[str | T
 
 
 def _trial_table(pairs: Sequence[TrialPair]) -> Table:
-    """Return a table of the options that vary, the mean frame times, their change and its interval."""
+    """Return a table of pairs of trials: options that vary, mean frame times, their change, and its interval."""
     from trilane.apps.compare.comparison import change_of, interval_of, setting
     from trilane.apps.compare.rows import MS
 
@@ -287,7 +288,7 @@ def _trial_table(pairs: Sequence[TrialPair]) -> Table:
 
 
 def _table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    """Return a table whose cells are no markup."""
+    """Return a table with column titles and rows. Cells are plain texts, without Rich's markup."""
     from rich.table import Table
     from rich.text import Text
 
@@ -298,7 +299,10 @@ def _table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
 
 
 def _left_out(comparison: Comparison, shown: Sequence[Figure]) -> Iterator[str]:
-    """Say how many figures the table leaves out: figures without a difference, then uncertain ones."""
+    """Yield sentences on the figures that the table leaves out: how many do not differ, and how many are uncertain.
+
+    `shown`: figures in the table.
+    """
     from trilane.apps.compare.difference import Finding
 
     left = [comparison.outcome(figure) for figure in comparison.rows if figure not in shown]
@@ -332,16 +336,16 @@ def _figure_table(comparison: Comparison, figures: list[Figure]) -> Table:
 
 
 SUMMARY: Final = "GITHUB_STEP_SUMMARY"
-#: GitHub keeps at most 1 MiB of a step's summary.
+#: Largest summary of a step that GitHub accepts.
 MAX_SUMMARY_BYTES: Final = 1 << 20
 #: Outcome of a limit -> level of its annotation.
 LEVELS: Final = {"kept": "notice", "broken": "error", "cannot tell": "warning"}
 
 
 def write_to_github(judged: Sequence[JudgedLimit], verdict: str) -> None:
-    """Write an annotation for each limit, and add a summary to the file that GITHUB_STEP_SUMMARY names, if any.
+    """Write an annotation for each limit to stderr. Add a summary to the file in GITHUB_STEP_SUMMARY, if it is set.
 
-    Raises BadInputError for a file that cannot be written.
+    `verdict`: verdict of the comparison, in words. Raises BadInputError if the file cannot be written.
     """
     for each in judged:
         stderr_console().file.write(annotation(each) + "\n")
@@ -357,7 +361,7 @@ def write_to_github(judged: Sequence[JudgedLimit], verdict: str) -> None:
 
 
 def annotation(judged: JudgedLimit) -> str:
-    """Return a workflow command, such as `::error title=slower=5%25 broken::infer takes longer`."""
+    """Return GitHub's command for an annotation, such as `::error title=slower=5%25 broken::infer takes longer`."""
     title = f"{judged.gate.text} {judged.outcome}"
     in_title = _escaped(title).replace(":", "%3A").replace(",", "%2C")
     return f"::{LEVELS[judged.outcome]} title={in_title}::{_escaped(f'{judged.name}: {judged.reason}')}"
@@ -368,9 +372,9 @@ def _escaped(text: str) -> str:
 
 
 def summary(judged: Sequence[JudgedLimit], verdict: str) -> str:
-    """Return the summary: the gate's outcome, the verdict on the runs, and a table with a row for each limit.
+    """Return the summary in Markdown: outcome of the gate, verdict, and a table with a row for each limit.
 
-    It has as many rows as GitHub keeps.
+    The last rows are left out if the summary would be longer than GitHub accepts.
     """
     from trilane.apps.compare.gate import whole
 
@@ -387,7 +391,7 @@ def summary(judged: Sequence[JudgedLimit], verdict: str) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return `text` on one line, as Markdown that shows it as it is."""
+    """Return `text` on one line, with Markdown's special characters escaped."""
     return re.sub(r"([\\`*_{}\[\]<>()#+!|~&])", r"\\\1", " ".join(text.split()))
 
 

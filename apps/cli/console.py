@@ -18,19 +18,19 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.text import Text
 
-#: C0, DEL and C1, as Python writes them.
-#: Most messages of a run that are shown at its end.
+#: Largest number of a run's messages that are shown at its end.
 MOST_SHOWN = 5
-INDENT = 6  # letters before the text of a verdict's line
-#: Colours of the first word of a verdict.
+INDENT = 6  # width of the label before the text in a verdict's line
+#: Label of a verdict's first line -> Rich's style.
 STYLES = {"PASS": "bold green", "FAIL": "bold red"}
+#: Control character (C0, DEL, C1) -> its escape sequence in Python.
 _WRITTEN_OUT = {code: repr(chr(code))[1:-1] for code in (*range(0x20), *range(0x7F, 0xA0))}
 
 
 class _Kept:
-    """A stream whose terminal may close; later writes are then lost without an error.
+    """Wraps a stream so that writes raise no error after its terminal was closed. Their text is then lost.
 
-    `lost`: numbers of the errors after which that is so.
+    `lost`: further error numbers that are ignored in the same way.
     """
 
     def __init__(self, stream: IO[str], *lost: int) -> None:
@@ -58,17 +58,14 @@ class _Kept:
 
 
 def stderr_console() -> Console:
-    """Return the console for messages and progress. A reader of them that leaves early changes no exit code.
-
-    Rich obeys NO_COLOR and plain pipes by itself.
-    """
+    """Return Rich's console on stderr, for messages and progress. If the reader of a pipe leaves, nothing fails."""
     from rich.console import Console
 
     return Console(stderr=True, file=cast("IO[str]", _Kept(sys.stderr, errno.EPIPE)), highlight=False)
 
 
 def stdout_console() -> Console:
-    """Return the console for results that a person reads. A pipe gets 120 columns, so that tables are not cut."""
+    """Return Rich's console on stdout, for results in text. Without a terminal it has 120 columns for tables."""
     from rich.console import Console
 
     file = cast("IO[str]", _Kept(sys.stdout))
@@ -76,17 +73,17 @@ def stdout_console() -> Console:
 
 
 def say(text: str) -> None:
-    """Print a message, on one line however long it is."""
+    """Print a message on stderr, without wrapping."""
     stderr_console().print(text, soft_wrap=True, markup=False)
 
 
 def print_line(text: str) -> None:
-    """Print a line of a result, however long it is."""
+    """Print a line of a result on stdout, without wrapping."""
     stdout_console().print(text, soft_wrap=True, markup=False)
 
 
 def note(text: str) -> None:
-    """Print what a person should know although nothing is wrong, on one line."""
+    """Print a note on stderr: a fact that a person should know, although nothing is wrong."""
     say(without_controls(f"note: {text}"))
 
 
@@ -106,7 +103,7 @@ def stdout_kept() -> Iterator[None]:
 
 @contextmanager
 def spinner(text: str) -> Iterator[None]:
-    """Show `text` beside a moving sign while the block runs, when stderr is a terminal."""
+    """Show `text` with a spinner while the block runs, if stderr is a terminal."""
     console = stderr_console()
     if not console.is_terminal:
         yield
@@ -116,9 +113,9 @@ def spinner(text: str) -> Iterator[None]:
 
 
 def without_controls(value: Any) -> Any:
-    """Escape the control characters in a file's texts, because a terminal would obey them.
+    """Return `value` with escaped control characters in its texts, because a terminal would execute them.
 
-    `value`: text, or mappings and lists of texts and numbers; everything except texts stays as it is.
+    `value`: a text, or nested mappings and lists of texts and other values. Other values stay as they are.
     """
     if isinstance(value, str):
         return value.translate(_WRITTEN_OUT)
@@ -128,14 +125,17 @@ def without_controls(value: Any) -> Any:
 
 
 def shown_messages(messages: Sequence[str], failure: str | None) -> list[str]:
-    """Return a run's messages as a person is shown them: the first few, without its `failure`, which is shown too."""
+    """Return the messages of a run that the terminal shows: at most MOST_SHOWN, without the text of `failure`.
+
+    If there are more messages, a last line states how many.
+    """
     others = [message for message in messages if message != failure]
     more = len(others) - MOST_SHOWN
     return others if more <= 0 else [*others[:MOST_SHOWN], f"{more} more messages: report.json has them"]
 
 
 def print_kept(parts: Iterable[Any]) -> None:
-    """Print texts and tables on stdout, each text on one line. A reader that leaves early changes no exit code."""
+    """Print texts and tables on stdout, without wrapping texts. If the reader of a pipe leaves, nothing fails."""
     console = stdout_console()
     with console.capture() as written:
         for part in parts:
@@ -147,13 +147,16 @@ def print_kept(parts: Iterable[Any]) -> None:
 
 
 def print_json(document: Mapping[str, Any]) -> None:
-    """Print `document` as JSON on stdout. Raises ValueError for NaN and infinities, which JSON cannot hold."""
+    """Print `document` as JSON on stdout. Raises ValueError for NaN and infinities, which JSON lacks."""
     sys.stdout.write(json.dumps(document, indent=1, allow_nan=False) + "\n")
     sys.stdout.flush()
 
 
 def verdict_text(lines: Iterable[Sequence[str]], width: int) -> Text:
-    """Return the lines of a verdict, each a label and a text; a long line continues below its own text."""
+    """Return the lines of a verdict for a terminal of `width` columns. The texts are wrapped in their own column.
+
+    `lines`: pairs of a label and a text.
+    """
     from rich.text import Text
 
     found = Text()
@@ -166,13 +169,13 @@ def verdict_text(lines: Iterable[Sequence[str]], width: int) -> Text:
 
 
 def print_verdict(lines: Iterable[Sequence[str]]) -> None:
-    """Print the lines of a verdict on stdout."""
+    """Print the lines of a verdict, pairs of a label and a text, on stdout."""
     console = stdout_console()
     console.print(verdict_text(lines, console.width), soft_wrap=True)
 
 
 def print_facts(facts: Mapping[str, Any], as_json: bool) -> None:
-    """Print `facts` on stdout: as JSON, or as a table with a row for every key."""
+    """Print `facts` on stdout: as JSON, or as a table with a row for each key."""
     if as_json:
         print_json(facts)
         return
@@ -185,7 +188,7 @@ def print_facts(facts: Mapping[str, Any], as_json: bool) -> None:
 
 
 def _written(value: Any) -> str:
-    """Return `value` as it stands in a table: floats with four digits, also in a list of numbers and a mapping."""
+    """Return `value` as a text for a table. Floats have four digits, also in lists of numbers and in mappings."""
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, list) and all(isinstance(each, int | float) for each in value):
@@ -196,7 +199,11 @@ def _written(value: Any) -> str:
 
 
 def _flat(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield rows of a table: keys of inner mappings joined by dots, entries of a list of mappings by name or number."""
+    """Yield a table's rows, each as a key and a value, without nested mappings.
+
+    The keys of inner mappings are joined by dots. Each mapping in a list becomes a row, with its `name` or its number
+    as the key. `prefix`: text before all keys.
+    """
     for key, value in facts.items():
         if isinstance(value, dict):
             yield from _flat(value, f"{prefix}{key}.")

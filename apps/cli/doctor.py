@@ -1,4 +1,4 @@
-"""`trilane doctor`: what this machine has, what is missing, and the line that installs it.
+"""`trilane doctor`: the parts that this machine has, the missing parts, and the commands that install them.
 
 Rule: a part counts as working only after it has been tried here.
 """
@@ -30,9 +30,8 @@ EPILOG = "\b\nExamples:\n  trilane doctor\n  trilane doctor --json"
 class PartCheck:
     """The check of one part that a run uses.
 
-    `name`: name of the part. `found`: description of what was found.
-    `works`: whether it was tried and works. `needed`: whether a run needs it.
-    `install`: line that fixes it.
+    `name`: name of the part. `found`: finding in words. `works`: whether the part was tried and works.
+    `needed`: whether a run needs the part. `install`: command, or advice, that makes it work.
     """
 
     name: str
@@ -73,7 +72,7 @@ def _runtimes() -> PartCheck:
 
     try:
         facts = runtime_facts()
-    except Exception as error:  # a broken wheel raises whatever its loader raises
+    except Exception as error:  # a broken package may raise anything
         found = f"{type(error).__name__}: {error}"
         return PartCheck("inference runtimes", found, works=False, install=package_line("onnxruntime"))
     found = "; ".join(f"{runtime}: {', '.join(places)}" for runtime, places in facts.items())
@@ -110,7 +109,7 @@ def _memfd() -> PartCheck:
 
 
 def _dev_shm() -> PartCheck:
-    """Check /dev/shm, which is not needed: slots are memfds. What other programs left there does not matter."""
+    """Check /dev/shm, which a run does not need, because slots are memfds. Files of other programs do not matter."""
     if not SHM.is_dir():
         return PartCheck(str(SHM), "absent", works=False, needed=False, install="mount -t tmpfs tmpfs /dev/shm")
     free = shutil.disk_usage(SHM).free
@@ -118,7 +117,7 @@ def _dev_shm() -> PartCheck:
 
 
 def _wakeup() -> PartCheck:
-    """Check whether cores stay awake. This is optional: a message to a sleeping core takes some 50 us longer."""
+    """Check whether cores stay awake. This is optional: a message to a sleeping core takes about 50 us longer."""
     from trilane.machine import AWAKE, LATENCY_FILE, awake
 
     install = f'apt-get install acl; setfacl -m "u:$USER:w" {LATENCY_FILE}'
@@ -127,7 +126,7 @@ def _wakeup() -> PartCheck:
 
 
 def _counters() -> PartCheck:
-    """Check the hardware counters, which are not needed: without them a trace has no instructions and cache misses."""
+    """Check the hardware counters. They are optional: without them, a trace has no instructions and cache misses."""
     from trilane.pipeline.job_times import absence, availability, remedy
 
     why = absence()
@@ -136,7 +135,7 @@ def _counters() -> PartCheck:
 
 
 def checks(gl: dict[str, Any] | None) -> list[PartCheck]:
-    """Return every check, in the order in which they are shown. `gl`: result of `gl_facts`."""
+    """Return the checks of all parts, in the order of the output. `gl`: result of `gl_facts`."""
     machine = [_python(), _cpu(), _int8(), _counters(), _memfd(), _dev_shm(), _wakeup(), _gl(gl)]
     return [*machine, _runtimes(), *_packages()]
 

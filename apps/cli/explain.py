@@ -1,6 +1,6 @@
-"""`trilane explain`: where the time of a run went. `trilane plan`: what a scene models and leaves out before it runs.
+"""`trilane explain`: where the time of a run went. `trilane plan`: what the run of a scene would model and leave out.
 
-Rule: this module reads options and shows results; everything is decided and computed elsewhere.
+Rule: this module only reads options and shows results.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ Examples:
 """
 SLOWEST: Final = 10
 MOST_SLOWEST: Final = 1000
-LEAST_SHARE: Final = 0.005  # of the frame time, for a row
+LEAST_SHARE: Final = 0.005  # smallest share of the frame time that gets its own row
 SlowestOption = Annotated[int, typer.Option(min=1, max=MOST_SLOWEST, help="Number of the slowest frames to explain.")]
 FrameOption = Annotated[
     int | None, typer.Option(min=0, help="Say instead what became of this frame: its jobs, or why it was dropped.")
@@ -161,7 +161,7 @@ def _head(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _efficiency(document: Mapping[str, Any]) -> Iterator[str]:
-    """Say what bounded the run, and what all cores did."""
+    """Yield lines on the bound and the efficiencies of the run. `document`: document of `trilane explain --json`."""
     if bound := document.get("bound"):
         from trilane.apps.explain.reasons import bound_text
 
@@ -176,7 +176,7 @@ def _efficiency(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _budget(document: Mapping[str, Any]) -> Table:
-    """Return a table of what bounded the frame time, by stage and cause."""
+    """Return a table with the parts of the frame time on the critical path, by stage and cause."""
     from rich.table import Table
 
     table = Table(
@@ -200,7 +200,7 @@ def _budget(document: Mapping[str, Any]) -> Table:
 
 
 def _shared(rows: list[dict[str, Any]]) -> Iterator[str]:
-    """Name the stages that had the core while the unit of another stage lacked it for a noticeable time."""
+    """Yield a line for each stage that lacked its core for a noticeable time, with the stages that had this core."""
     for row in rows:
         if row["preempted_ms"] < LEAST_SHARE * row["service_ms"]:
             continue
@@ -315,7 +315,7 @@ def plan(
 
 
 def _refuse_other_things(path: Path) -> None:
-    """Raise BadInputError for what people may take for a scene: a pipeline file, and the folder of a run."""
+    """Raise BadInputError if `path` is a pipeline file or a folder, which people may confuse with a scene."""
     from trilane.pipeline.pipeline_file import is_pipeline_file
 
     if is_pipeline_file(path):
@@ -351,7 +351,7 @@ def _show_plan(document: dict[str, Any]) -> None:
 
 
 def _drawn(row: dict[str, Any]) -> str:
-    """Say how an avatar is drawn in every frame; avatars of one bundle are drawn alike."""
+    """Return a line on how an avatar is drawn in all frames. Avatars of the same bundle have the same line."""
     return (
         f"avatar {row['bundle']}: skinned by the {row['skinned_on']} unit; detail: {row['detail']}; "
         f"texture filter {row['texture_filter']}; expression: {row['expression']}"
@@ -379,7 +379,7 @@ def _saved(saved: dict[str, float]) -> str:
 
 
 def _left_out(phases: list[dict[str, Any]]) -> list[str]:
-    """Return a line for each way in which avatars are modelled, with the parts that it leaves out."""
+    """Return a line for each level of detail in use, with the parts of the body that it leaves out."""
     rows = [row for phase in phases for row in phase["avatars"]]
     lines = {}
     for row in rows:
@@ -396,7 +396,7 @@ def _image(image: dict[str, Any]) -> str:
 
 
 def _modelled(rows: list[dict[str, Any]]) -> str:
-    """Return a line for each way in which avatars are modelled, with the largest errors among these avatars."""
+    """Return a line for each level of detail among the avatars of a phase, with their largest errors in pixels."""
     lines = []
     for modelled in dict.fromkeys(_model(row) for row in rows):
         own = [row for row in rows if _model(row) == modelled]
@@ -408,14 +408,14 @@ def _modelled(rows: list[dict[str, Any]]) -> str:
 
 
 def _model(row: dict[str, Any]) -> str:
-    """Name the level of detail, and the level of the mesh unless it is the whole one."""
+    """Return the name of an avatar's level of detail. If its mesh is a coarser level, the triangles stand before it."""
     mesh = row["mesh"]
     coarser = f"{mesh['triangles']} of {mesh['of']} triangles, " if mesh["level"] else ""
     return f"{coarser}{row['modelled']}"
 
 
 def _totals(totals: dict[str, Any], config: dict[str, Any]) -> list[str]:
-    """Compare the whole scene with the fixed square, in sentences."""
+    """Return sentences that compare the work of the whole scene with the work of a fixed square tensor."""
     share = 1 - totals["work_ms"] / totals["fixed_work_ms"]
     return [
         f"beside a fixed tensor of 512x512: {totals['pixels'] / totals['fixed_pixels']:.1%} of the tensor's pixels, "

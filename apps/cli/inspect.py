@@ -1,7 +1,7 @@
-"""`trilane inspect`: what a file is, and what to do if it is not usable. `trilane times`: what other tools measured.
+"""`trilane inspect`: what a file is, and what to do if it is not usable. `trilane times`: measurements of other tools.
 
-Rule: this module shows and writes what `trilane.apps.inspect` and `trilane.apps.imported_times` made of files; nothing
-is computed here but bars.
+Rule: this module shows and writes results of `trilane.apps.inspect` and `trilane.apps.imported_times`. It computes only
+the bars of distributions.
 """
 
 from __future__ import annotations
@@ -72,7 +72,10 @@ def inspect(file: FileArgument, out: SheetOption = None, json: JsonOption = Fals
 
 
 def _draw(found: Any, out: Path | None) -> Path | None:
-    """Write the sheet and return its place; None where there is nothing to draw or nowhere to draw it."""
+    """Write the sheet to `out` and return this path; None if `out` is not given or there is nothing to draw.
+
+    `found`: result of `inspect_file`.
+    """
     from trilane.writing import write_atomically
 
     if out is None or found.draw is None:
@@ -84,7 +87,7 @@ def _draw(found: Any, out: Path | None) -> Path | None:
 
 
 def lines(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the document as lines for people."""
+    """Yield lines for people that show `document`, the document of `trilane inspect --json`."""
     yield f"{document['file']}: {document['what']}"
     rows = {
         "not usable": document["problem"],
@@ -214,7 +217,7 @@ def times(
 
 
 def _check_results(paths: Sequence[Path | None]) -> None:
-    """Refuse a result that would replace a file that is read, or another result. Raises BadInputError."""
+    """Raise BadInputError if two of `paths`, files to read and files to write, are the same file."""
     known: set[Path] = set()
     for path in filter(None, paths):
         if path.resolve() in known:
@@ -251,7 +254,7 @@ def _show(read: Measurements) -> None:
 
 
 def _table(kind: str, measurements: Sequence[Measurement]) -> Table:
-    """Return a row for each measurement, without the columns that none of them fills."""
+    """Return a table with a row for each measurement, without empty columns. `kind`: run, wall or layer."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -285,7 +288,10 @@ def _figure(value: float | None) -> str:
 
 
 def _distribution(measurement: Measurement) -> str:
-    """Draw the samples as bars from the least to the largest, or the figures of a distribution on a line."""
+    """Return a measurement's distribution from its minimum to its maximum, as a text.
+
+    The text is a histogram of the samples. Without samples, it is a line with marks at p50 and p95.
+    """
     low, high = measurement.min_ms, measurement.max_ms
     if low is None or high is None or high <= low:
         return ""

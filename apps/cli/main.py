@@ -1,8 +1,8 @@
 """Entry point of the `trilane` command: the table of commands, the global options and the exit codes.
 
-Rule: each line of `COMMANDS` names a module with a Typer `app`, which is imported when its command is called. Nothing
-slow is imported before. An error that a person can cause becomes one sentence on stderr and an exit code, never a
-traceback.
+Rule: `COMMANDS` names the module of each command. The module has a Typer `app` and is imported when the command is
+called. No slow module is imported earlier. An error that a person can cause becomes one sentence on stderr and an exit
+code, never a traceback.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from trilane.errors import TrilaneError, install_line, reason
 from trilane.machine import require_memory, shortage
 from trilane.signals import interrupting
 
-#: Command: its module, and the line that `trilane --help` shows for it.
+#: Command -> its module, and its line in `trilane --help`.
 COMMANDS = {
     "run": ("trilane.apps.cli.run", "Run a scene on the three units and write a run folder."),
     "predict": ("trilane.apps.cli.predict", "Predict frame time, idleness, heat and energy on a chip."),
@@ -49,9 +49,9 @@ COMMANDS = {
     "doctor": ("trilane.apps.cli.doctor", "Say what this machine has, what is missing and how to install it."),
 }
 
-FAILED, MISSING_PART, INTERRUPTED = 1, 3, 130  # 2 is wrong usage, as Typer has it, and so is 130
+FAILED, MISSING_PART, INTERRUPTED = 1, 3, 130  # Typer itself exits with 2 for wrong usage, and with 130
 
-#: What libraries raise, among other reasons, where they get no memory, no thread, or no room for their code.
+#: Exceptions that libraries raise if they get no memory or no thread. They can have other causes.
 OF_MEMORY = (MemoryError, ImportError, RuntimeError)
 
 EPILOG = """\b
@@ -71,25 +71,26 @@ Exit codes:
 def command_of(name: str) -> Any:
     """Import the module of command `name` and return the command.
 
-    A module's `app` is a command, a group, or a set of small commands from which the name selects one.
+    The module's `app` is this command, the group `name`, or a collection of commands that contains it.
     """
     require_memory(part=2)  # with less, NumPy's import or the kernel would end the process
     command = typer.main.get_command(importlib.import_module(COMMANDS[name][0]).app)
-    command = getattr(command, "commands", {}).get(name, command)  # small commands share a module
+    command = getattr(command, "commands", {}).get(name, command)
     command.name = name
     return command
 
 
 def lazy_group(lines: Mapping[str, str], command_of: Callable[[str], Any]) -> type[TyperGroup]:
-    """Return the class of a group of commands. A mistyped name is answered with the most similar ones.
+    """Return the class of a group whose commands are imported when they are called.
 
-    `lines`: the line of each command for `--help`, by name. `command_of`: function that imports a command by its name.
+    For a mistyped name, the group suggests similar names. `lines`: line in `--help` of each command, by name.
+    `command_of`: function that imports the command of a given name.
     """
 
     class LazyGroup(TyperGroup):
         def __init__(self, **settings: Any) -> None:
             super().__init__(**settings)
-            # Stand-ins are enough for `--help`, completion and suggestions.
+            # Placeholders without options are enough for `--help`, completion and suggestions.
             self.commands = {name: TyperCommand(name, help=line) for name, line in lines.items()}
 
         def resolve_command(self, ctx: Any, args: list[str]) -> Any:
@@ -139,7 +140,7 @@ def _fail(message: str, code: int, details: tuple[str, ...] = ()) -> NoReturn:
 
 
 def describe(error: Exception) -> tuple[str, int]:
-    """Return the sentence and the exit code of an error that no command handled."""
+    """Return a sentence about an error that no command handled, and the exit code."""
     if isinstance(error, TrilaneError):
         return str(error), error.exit_code
     if isinstance(error, ModuleNotFoundError):
@@ -166,21 +167,21 @@ def _has_working_directory() -> bool:
 
 
 def _is_of_stdout(error: OSError) -> bool:
-    """Return whether stdout caused `error`.
+    """Return whether a write to stdout caused `error`, which may mean a full disk.
 
-    If the error may be that of a full disk, one more byte is written as a test.
+    The test writes one more byte to stdout.
     """
     if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
         return False
     try:
         os.write(sys.stdout.fileno(), b"\n")
-    except (OSError, ValueError) as again:  # without a file descriptor it is no file
+    except (OSError, ValueError) as again:  # ValueError: stdout has no file descriptor, so it is no file
         return getattr(again, "errno", None) == error.errno
     return False
 
 
 def _call(arguments: list[str]) -> None:
-    """Call the command and flush its output. A full disk is an error; a reader that has left is none."""
+    """Run the command and flush its output. Raises OSError for a full disk, but not if the reader of a pipe left."""
     try:
         app(args=arguments, prog_name="trilane")
     except SystemExit:
@@ -190,7 +191,7 @@ def _call(arguments: list[str]) -> None:
 
 
 def _in_new_names(arguments: list[str]) -> list[str]:
-    """Return the command line with new names; each old one is told once, on stderr."""
+    """Return the command line with new names in place of old ones, and print a note on stderr for each old name."""
     notes: dict[str, None] = {}
     words = in_new_names(arguments, notes.setdefault)
     if notes:
@@ -202,9 +203,9 @@ def _in_new_names(arguments: list[str]) -> list[str]:
 
 
 def main() -> None:
-    """Run the command line of `sys.argv`; leaves by SystemExit with one of the exit codes."""
+    """Run the command line of `sys.argv`. Ends with SystemExit and one of the exit codes."""
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # what a locale's encoding lacks is printed as a question mark
+        sys.stdout.reconfigure(errors="replace")  # characters that the locale's encoding lacks become question marks
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]
     debug = len(arguments) < len(sys.argv) - 1
     try:
@@ -224,11 +225,11 @@ def entry() -> NoReturn:
     except SystemExit as left:
         code = left.code
     except KeyboardInterrupt as interrupt:
-        if not interrupt.args:  # otherwise somebody has said it
+        if not interrupt.args:  # otherwise a message about the interrupt was already printed
             os.write(2, b"interrupted\n")
         code = INTERRUPTED
     for stream in (sys.stdout, sys.stderr):
-        with contextlib.suppress(OSError, ValueError):  # closed by whoever was to read it
+        with contextlib.suppress(OSError, ValueError):  # the reader may have closed the stream
             stream.flush()
     os._exit(code if isinstance(code, int) else 0)
 

@@ -1,15 +1,10 @@
-"""`trilane predict`: a configuration, or a table of them, on a chip that is described by a hardware profile.
+"""`trilane predict`: predictions for a configuration, a table of configurations, a pipeline file or several pipelines.
 
-Rule: this module reads options; every figure comes from `trilane.hw_profiles`, and `predict_output.py` shows them.
+`trilane predict FILE.toml` predicts a pipeline file, and `trilane predict SCENE --beside …` several pipelines on one
+chip.
 
-`trilane predict FILE.toml`: a pipeline of one's own on a chip, as text and tables.
-
-Rule: nothing is computed here; `apps/predict/asked_file.py` reads what is asked, `hw_profiles` answers.
-
-`trilane predict SCENE --beside …`: several pipelines on one chip, as options and as tables.
-
-Rule: nothing is computed here; `apps/predict/asked_pipelines.py` reads the pipelines, and `hw_profiles/shared_chip.py`
-answers.
+Rule: this module reads options and shows results; every figure comes from `trilane.hw_profiles`. `predict_output.py`
+shows the predictions for a configuration or a table.
 """
 
 from __future__ import annotations
@@ -44,7 +39,7 @@ if TYPE_CHECKING:
 
 
 def predict_pipeline_file(options: PredictOptions, path: Path, as_json: bool) -> None:
-    """Print what the pipeline of a file and its variants do on a chip. Raises BadInputError."""
+    """Print the predictions for the pipeline file `path` and its variants. Raises BadInputError."""
     from trilane.apps.predict.asked_file import predict_asked_file
 
     with spinner("predicting"):
@@ -57,7 +52,7 @@ def predict_pipeline_file(options: PredictOptions, path: Path, as_json: bool) ->
     where = f"{machine['title']}, {answer['config']['performance_profile']}" if machine else "times of the file"
     name = without_controls(path.name)
     console.print(f"{name} (virtual clock), {where}; {requested} frames, seed {answer['config']['seed']}", markup=False)
-    if first["what_if"]:  # the file itself lacks times
+    if first["what_if"]:  # the file as it is has no prediction, because it lacks times
         console.print(f"with {without_controls(first['what_if'])}", markup=False, soft_wrap=True)
     _show_file(console, first)
     if len(answer["pipelines"]) > 1:
@@ -107,12 +102,12 @@ def _ms(value: float) -> str:
 
 
 def _digits(value: float) -> str:
-    """Return four digits, without an exponent."""
+    """Return `value` with four digits, without an exponent."""
     return f"{value:.4g}" if value < 1e4 else f"{value:.0f}"
 
 
 def _span(low: float | None, high: float | None, share: str = ", 80 %") -> str:
-    """Return an interval in brackets; nothing where it is a point or unknown."""
+    """Return an interval in brackets; "" if it is a point or unknown. `share`: text after the bounds."""
     return "" if low == high or low is None or high is None else f" ({_digits(low)} to {_digits(high)}{share})"
 
 
@@ -138,7 +133,7 @@ def _units(answer: Mapping[str, Any]) -> Table:
 
 
 def _what_ifs(answers: list[dict[str, Any]]) -> Table:
-    """Return a row for the file as it is, and one for each --set."""
+    """Return a table with a row for the file as it is, and a row for each --set."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -158,9 +153,9 @@ def _what_ifs(answers: list[dict[str, Any]]) -> Table:
 
 
 def predict_pipelines(options: PredictOptions, as_json: bool) -> None:
-    """Print how the scene of `options` and the pipelines beside it do on one chip.
+    """Print the prediction for the scene of `options` and the pipelines of --beside, on one chip.
 
-    Raises BadInputError for a fault in one of them.
+    Raises BadInputError.
     """
     from trilane.apps.predict.asked_pipelines import answer_of, tenants
     from trilane.hw_profiles.profile_files import load_runnable
@@ -186,7 +181,7 @@ def predict_pipelines(options: PredictOptions, as_json: bool) -> None:
 def _write_beside(
     chip: Profile, found: Sequence[Pipeline], options: PredictOptions, answer: Mapping[str, Any], target: Path
 ) -> None:
-    """Write the simulated runs of the pipelines as one trace."""
+    """Write the simulated runs of the pipelines into one trace, the file `target`. `found`: pipelines on the chip."""
     from trilane.apps.explain.trace import write_predicted
     from trilane.hw_profiles.schema import corners_of
     from trilane.hw_profiles.shared_chip import together
@@ -197,7 +192,7 @@ def _write_beside(
 
 
 def _variant(policy: str, edge: str | None) -> Variant:
-    """Return how the avatars' stages are joined. `policy`: "" where none was asked for."""
+    """Return policy and edge of the scenes. `policy`: "" if not given. Raises BadInputError for an unknown edge."""
     from trilane.hw_profiles.application import REFERENCE
     from trilane.hw_profiles.tenants import NEWEST
     from trilane.transport.slots import edge_rule
@@ -254,12 +249,12 @@ def _pipelines(answer: dict[str, Any]) -> Table:
 
 
 def _mean(times: Mapping[str, float]) -> str:
-    """Return the mean of some times in ms, a dash where there are none."""
+    """Return the mean of `times` in ms as a text; a dash without samples."""
     return f"{times['mean']:.1f}" if times["samples"] else "-"
 
 
 def _idle(answer: dict[str, Any]) -> Table:
-    """Return a table of each unit: its busy time for all, and its busy time and idle causes per pipeline."""
+    """Return a table of the units: busy share for all pipelines, and busy and idle shares for each pipeline."""
     from rich.table import Table
 
     rows = [row for one in answer["pipelines"] for row in one["units"].values()]
@@ -353,7 +348,7 @@ def predict(options: PredictOptions, *, json: JsonOption = False) -> None:
 
 
 def _write_trace(chip: Profile, plan: Plan, options: PredictOptions, answer: dict[str, Any], target: Path) -> None:
-    """Write the simulated run behind the predicted shares of time as a trace."""
+    """Write the simulated run that gave the predicted busy and idle shares, as a trace in the file `target`."""
     from trilane.apps.explain.trace import write_predicted
     from trilane.hw_profiles.predict import predicted_run
 
@@ -362,7 +357,7 @@ def _write_trace(chip: Profile, plan: Plan, options: PredictOptions, answer: dic
 
 
 def _predict_table(chip: Profile, path: Path, options: PredictOptions) -> list[dict[str, Any]]:
-    """Return an answer for each row of the table."""
+    """Return a prediction for each row of the table in the file `path`. Raises BadInputError."""
     from rich.progress import Progress
 
     from trilane.hw_profiles.predict import predict_table

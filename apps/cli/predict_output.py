@@ -1,6 +1,6 @@
-"""What `trilane predict` shows: one answer, a table of answers, or a drawing over time.
+"""The output of `trilane predict`: one prediction, a table of predictions, or a drawing over time.
 
-Rule: nothing is computed here; the answers are those of `trilane.hw_profiles.predict`.
+Rule: nothing is computed here; the predictions come from `trilane.hw_profiles`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SHOWN = ("bench_gpu_ms", "bench_dsp_ms", "app_gpu_ms", "app_dsp_ms", "confidence
 
 
 def show_table(profile: str, performance_profile: str, answers: list[dict[str, Any]], as_json: bool) -> None:
-    """Print an answer for each row of a table.
+    """Print a prediction for each row of a table of configurations.
 
     `profile`: hardware profile of the chip. `performance_profile`: performance profile of the chip.
     `answers`: answers of `predict_table`.
@@ -50,13 +50,11 @@ def show_table(profile: str, performance_profile: str, answers: list[dict[str, A
 
 
 def draw(chip: Profile, plan: Plan, asked: str, minutes: float, governor: str | None, path: Path) -> None:
-    """Draw frame rate and temperature over time to `path`.
+    """Draw frame rate and temperature over time into the file `path`.
 
-    `chip`: hardware profile of the chip. `plan`: application that runs on it.
-    `asked`: performance profile to draw beside `burst` and `sustained_high_performance`.
-    `minutes`: virtual time, minutes.
-    `governor`: name of the governor that lowers the clocks; None for the profile's own.
-    `path`: file to write.
+    `chip`: hardware profile of the chip. `plan`: application that runs on the chip.
+    `asked`: performance profile to draw besides `burst` and `sustained_high_performance`.
+    `minutes`: virtual minutes. `governor`: name of the governor against heat; None for the profile's own.
     """
     from trilane.hw_profiles.governor import over_time, plot_over_time
 
@@ -100,7 +98,7 @@ def show_networks(chip: Profile, options: PredictOptions, answers: list[dict[str
 
 
 def _compared_units(answers: list[dict[str, Any]]) -> Table:
-    """Return a row for each network on each unit."""
+    """Return a table with a row for each network on each unit. `answers`: answers of `predict_network`."""
     from rich.table import Table
 
     table = Table("network", "unit", "numbers", "ms", "80 %, ms", "a second", "W", "rate")
@@ -174,7 +172,7 @@ def _reserve(rate: dict[str, Any]) -> str:
 
 
 def _span(low: float | None, high: float | None, form: str, unit: str = "") -> str:
-    """Return an interval in brackets; nothing where there is none."""
+    """Return an interval in brackets; "" if it is unknown. `form`: format of a number, such as ".1f"."""
     return "" if low is None or high is None else f" ({low:{form}} to {high:{form}}{unit})"
 
 
@@ -207,7 +205,7 @@ def _operator_table(answer: dict[str, Any]) -> Table:
 
 
 def show_answer(answer: dict[str, Any], as_json: bool) -> None:
-    """Print one answer of `predict`."""
+    """Print one prediction for the application. `answer`: document of `trilane predict --json`."""
     if as_json:
         print_json(answer)
         return
@@ -271,7 +269,7 @@ def _unit_table(answer: dict[str, Any]) -> Table:
 
 
 def idle_causes(units: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Return the causes that the units' `idle` names, in their order."""
+    """Return the idle causes of all `units`, each once, in order. `units`: mappings with a key `idle`."""
     return [*dict.fromkeys(cause for unit in units for cause in unit["idle"])]
 
 

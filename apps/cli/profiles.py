@@ -167,7 +167,11 @@ def fit(
 
 
 def _next_command(result: ProfileFit | Calibrated, profile: Path, networks: Path) -> list[str]:
-    """Return the command that predicts the first row's network as the row was counted; none for other tables."""
+    """Return the command that predicts the network of the table's first row, as a list of at most one line.
+
+    The list is empty for a table of the reference networks. `profile`: file of the fitted profile. `networks`: folder
+    of the networks.
+    """
     from trilane.hw_profiles.calibrate import network_file
     from trilane.hw_profiles.fit import ProfileFit
 
@@ -182,7 +186,7 @@ def _next_command(result: ProfileFit | Calibrated, profile: Path, networks: Path
 
 
 def _beside(base: str, write: Path) -> str:
-    """Return a profile as `extends` names it: a file relative to the new one."""
+    """Return the value of `extends` for the profile `base`: a name, or a path relative to the new file `write`."""
     return os.path.relpath(base, write.absolute().parent) if base.endswith(".toml") else base
 
 

@@ -1,4 +1,4 @@
-"""`trilane quality`: differences between runtimes on a scene, and errors of hard cases beside their bounds.
+"""`trilane quality`: differences between runtimes on a scene, and errors of hard cases with their bounds.
 
 Rule: this module reads options and shows results; every figure comes from `trilane.apps.experiments`.
 """
@@ -87,7 +87,7 @@ def quality(
 
     names = list(runtime or installed())
     for name in names:
-        if not (by_cause and name == AUTO):  # which the run of --by-cause takes
+        if not (by_cause and name == AUTO):  # --by-cause accepts the runtime `auto`, as a run does
             resolve(name)
     if not by_cause:
         _refuse_without_by_cause({"--out": out, "--lpips-weights": lpips_weights})
@@ -108,14 +108,14 @@ def quality(
 
 
 def _refuse_without_by_cause(options: dict[str, Path | None]) -> None:
-    """Raise BadInputError for options that only --by-cause knows."""
+    """Raise BadInputError for a given option that needs --by-cause. `options`: values by spelling, None if absent."""
     for name, value in options.items():
         if value is not None:
             raise BadInputError(name, str(value), "it beside --by-cause", "the other comparisons do not use it")
 
 
 def _refuse_other_comparisons(hard_cases: bool, runtimes: list[str]) -> None:
-    """Raise BadInputError for options that cannot stand beside --by-cause, which looks at one run."""
+    """Raise BadInputError if --hard-cases or several runtimes stand beside --by-cause, which examines one run."""
     if hard_cases:
         raise BadInputError("--by-cause", "--hard-cases beside it", "one of them")
     if len(runtimes) > 1:
@@ -124,7 +124,7 @@ def _refuse_other_comparisons(hard_cases: bool, runtimes: list[str]) -> None:
 
 
 def _refuse_a_scene(scene: str, options: dict[str, object]) -> None:
-    """Raise BadInputError for options that hard cases ignore, because they bring their own inputs."""
+    """Raise BadInputError for a scene or its options beside --hard-cases, because hard cases have their own inputs."""
     asked = [name for name, value in options.items() if value is not None]
     if scene != SCENE or asked:
         found = ", ".join(asked) or scene
@@ -210,14 +210,17 @@ def _shown(value: Any) -> str:
 
 @dataclass(frozen=True)
 class _CauseFiles:
-    """Files of --by-cause. `out`: folder for heat maps; `lpips_weights`: file of LPIPS' weights; None for none."""
+    """Files of --by-cause, if given. `out`: folder for heat maps. `lpips_weights`: file with the weights of LPIPS."""
 
     out: Path | None = None
     lpips_weights: Path | None = None
 
 
 def _show_by_cause(scene: str, request: dict[str, Any], frames: int, files: _CauseFiles, as_json: bool) -> None:
-    """Measure and print. `request`: options of the run. Raises BadInputError, MissingPartError."""
+    """Measure the error of a run's frames by cause, and print it. Raises BadInputError, MissingPartError.
+
+    `request`: options of the run by name. `frames`: number of frames.
+    """
     from trilane.apps.experiments.error_by_cause import error_by_cause
     from trilane.apps.experiments.picture_errors import Lpips
     from trilane.stages.configure import configure, required_machine
@@ -229,7 +232,7 @@ def _show_by_cause(scene: str, request: dict[str, Any], frames: int, files: _Cau
     machine = required_machine()
     if out is not None:
         with write_folder(out):
-            pass  # that it can be written is found out before the work
+            pass  # raises an error about the folder before the long work
     with stdout_kept():
         result = error_by_cause(checked, frames, out, _tracked, lpips)
     if as_json:

@@ -1,8 +1,8 @@
-"""`trilane run`: a scene through the three units, to a run folder and a table.
+"""`trilane run`: runs a scene or a pipeline file, and shows the verdict or a table.
 
-Rule: this file talks to the person; `trilane.apps.run.asked_run` does the work. Every figure of the table is one of
-report.json's, and its source stands below the table. A figure that was not measured is a dash, and one that rests on
-too few frames says so.
+Rule: this file reads options and shows results; `trilane.apps.run.asked_run` does the work. Every figure of the table
+comes from report.json, and its source stands below the table. Unknown figures are dashes, and figures from too few
+frames are marked.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ DashboardOption = Annotated[
 
 @contextmanager
 def _hooks() -> Iterator[Hooks]:
-    """Show messages, and a progress bar when stderr is a terminal."""
+    """Yield callbacks that show messages on stderr, and a progress bar if stderr is a terminal."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
     from rich.text import Text
 
@@ -138,7 +138,7 @@ def _run_live(options: RunOptions, command: tuple[str, ...], port: int | None) -
 
 
 def _print_outcome(outcome: RunOutcome, as_json: bool, with_table: bool) -> None:
-    """Print the report or its verdict on stdout; the folder, and why a run failed, on stderr."""
+    """Print the report or its verdict on stdout. Print the folder, messages and the cause of a failure on stderr."""
     from trilane.apps.run.verdict_facts import verdict_of
 
     report = outcome.report
@@ -164,19 +164,19 @@ TOO_FEW = " *"
 
 @cache
 def needed() -> dict[str, int]:
-    """Return how many samples each percentile needs."""
+    """Return the number of samples that each percentile needs, by name."""
     from trilane.scheduler.stats import samples_needed
 
     return {name: samples_needed(int(name[1:]) / 100) for name in ("p90", "p95", "p99")}
 
 
 def too_few_note() -> str:
-    """Say what the mark at a percentile means."""
+    """Return the explanation of the mark TOO_FEW at a percentile."""
     return f"{TOO_FEW} of too few frames: " + ", ".join(f"{name} needs {count}" for name, count in needed().items())
 
 
 def run_table(report: Report) -> Table:
-    """Return rows of stages, units, times and rates; a column for the run and one for its baseline."""
+    """Return a table of stages, units, times and rates, with a column for the run and a column for its baseline."""
     from rich.table import Table
 
     runs: list[PolicyMetrics] = [report, report.baseline] if report.baseline else [report]
@@ -244,7 +244,7 @@ def _pace(pace: PaceComparison) -> str:
 
 
 def _check(check: Check) -> list[str]:
-    """Return a line for each thing that the frames were compared with."""
+    """Return a line for each comparison of the check: with the truth, and with the float path."""
     errors = [check, *([check.float_path] if check.float_path else [])]
     return [f"of this run, {check.frames} frames against {_errors(each)} ({MEASURED})" for each in errors]
 
@@ -267,9 +267,9 @@ def _caps(caps: Caps, temperature: Temperature) -> str:
 
 
 def accuracy_line(name: str, facts: Mapping[str, Any]) -> str:
-    """Say how wrong an avatar's pictures are and where the figures come from; else why there are none.
+    """Return a line with the error of an avatar's pictures and its source, or with the reason why it is unknown.
 
-    A report of an older Trilane does not say where its figures come from, so they are not shown.
+    Older reports do not state the source of their figures, so these figures are not shown.
     """
     source = facts.get("source", NO_FIGURES)
     if source == NO_FIGURES:
@@ -300,7 +300,10 @@ def _service_and_wait(times: StageTimes | None) -> str:
 
 
 def _byte_rows(runs: Sequence[PolicyMetrics]) -> Rows:
-    """Yield rows of the bytes that each stage moves for a frame, and of their sum beside the least; else none."""
+    """Yield two rows: the bytes that each stage moves for a frame, and their sum with its ratio to the least bytes.
+
+    Yields nothing if no run counts bytes.
+    """
     if not any(run.bytes for run in runs):
         return
     counting = [stage for stage, times in runs[0].stages.items() if times.bytes]
@@ -337,7 +340,7 @@ def _shares(unit: UnitShares | None, causes: Iterable[str]) -> str:
 
 
 def _core_rows(runs: Sequence[PolicyMetrics]) -> Rows:
-    """Yield the CPU time of the units of each set of cores; nothing for a report without such figures."""
+    """Yield a row for each set of cores, with the CPU time of its units. An older report has no such rows."""
     for index, first in enumerate(runs[0].core_shares):
         shares = [run.core_shares[index] if index < len(run.core_shares) else None for run in runs]
         name = f"core{'s' if len(first.cores) > 1 else ''} {','.join(map(str, first.cores))}"
@@ -364,19 +367,21 @@ def _time(run: PolicyMetrics, times: TimeSummary, statistic: str) -> str:
 
 
 def _too_few(times: TimeSummary, statistic: str) -> bool:
-    """Say whether a percentile rests on too few samples; an older report does not count them."""
+    """Return whether a percentile rests on too few samples. It is false for older reports, which do not count them."""
     return times.samples is not None and times.samples < needed().get(statistic, 0)
 
 
 def _between(low: float | None, high: float | None) -> str:
-    """Return a 95 % interval."""
+    """Return a 95 % interval as a text."""
     return TOO_SHORT if low is None or high is None else f"{_number(low)} to {_number(high)}"
 
 
 def _skipped(report: Report) -> str:
-    """Say which of the presented frames needed no new picture of the avatars, and why."""
-    frames, composite = report.frames, report.stages["composite"]
-    means = report.stage_metrics.get("composite", {})
+    """Return a line on the presented frames that skipped stages. For a scene, it states how many had which reason."""
+    frames = report.frames
+    if "pipeline" in report.config:
+        return f"took the bypass: {frames.skipped} of {frames.presented} frames"
+    composite, means = report.stages["composite"], report.stage_metrics.get("composite", {})
     why = {"reused": "reused", "nobody on the screen": "nobody", "without their picture": "stale"}
     counts = {said: round(means.get(key, 0.0) * composite.jobs) for said, key in why.items()}
     parts = ", ".join(f"{said} {count}" for said, count in counts.items() if count)
@@ -384,7 +389,7 @@ def _skipped(report: Report) -> str:
 
 
 def _of_several(run: PolicyMetrics, value: float | None) -> float | None:
-    """Return a frame time or a latency; None for a single frame, which gives no statistic."""
+    """Return `value`, a statistic of `run`, or None if the run presented fewer than two frames."""
     return value if run.frames.presented > 1 else None
 
 
@@ -409,7 +414,10 @@ def _left_out(frames: FrameCounts) -> str:
 
 
 def _bounds(part: PathShare | None, *, is_slowed: bool) -> str:
-    """Return what slowing a unit or a stage costs, or its share of the path where that is not known."""
+    """Return the cost of a slower unit or stage as a text, else its share of the critical path.
+
+    `is_slowed`: whether the row shows costs; a share is then marked as such.
+    """
     if part is None:
         return DASH
     if part.cost is None:

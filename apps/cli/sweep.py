@@ -1,7 +1,7 @@
-"""`trilane sweep`: tries many configurations of one command, each once, and keeps the results in a folder.
+"""`trilane sweep`: tries many configurations of one command, and keeps the results in a folder.
 
-Rule: this file talks to the person; `trilane.apps.sweep` defines and runs sweeps. A terminal shows a bar with the
-remaining time; any other stderr gets a line for each trial that ended.
+Rule: this file reads options and shows results; `trilane.apps.sweep` defines and runs sweeps. If stderr is a terminal,
+it shows a bar with the remaining time. Otherwise it gets a line for each trial that ends.
 """
 
 from __future__ import annotations
@@ -42,14 +42,14 @@ Examples:
 """
 ENDING = ".toml"
 SOME_FAILED, INTERRUPTED = 1, 130
-#: Of a trial's result, where it has them: what the table shows beside how it ended.
+#: Column of the summary -> keys that lead to its figure in a trial's result.
 FIGURES = {"fps": ("fps",), "frame ms": ("frame_time_ms", "mean")}
-#: Of trials with `--check`: of the single frames, as in the overview.
+#: The same for columns that a sweep with `--check` has too.
 ERRORS = {"PSNR, dB": ("check", "psnr_db"), "worst": ("check", "worst_psnr_db"), "1st pct.": ("check", "p1_psnr_db")}
 
 
 class EngineName(StrEnum):
-    """The place where trials are done: this machine, or the machines of a Ray cluster."""
+    """The machines that run trials: this machine (`local`), or the machines of a Ray cluster (`ray`)."""
 
     LOCAL = "local"
     RAY = "ray"
@@ -163,7 +163,10 @@ def of_words(
 
 
 def _trials(first: str, definition: Definition, command: SweptCommand) -> list[Trial]:
-    """Return the trials of a definition; an error in a file, the `first` word, names that file."""
+    """Return the trials of a definition. Raises BadInputError.
+
+    `first`: first word after `sweep`. If it is a sweep file, errors name this file.
+    """
     from trilane.apps.sweep.definition import trials_of
 
     try:
@@ -175,9 +178,9 @@ def _trials(first: str, definition: Definition, command: SweptCommand) -> list[T
 
 
 def require_checks(trials: Sequence[Trial]) -> None:
-    """Raise MissingPartError, before the first trial, if the runs cannot be checked as asked.
+    """Raise MissingPartError before the first trial if a library for `--check` is missing.
 
-    Each trial reports its other faults itself.
+    Other faults of a trial are ignored here, because the trial itself reports them.
     """
     from trilane.apps.run.run_job import require_parts
     from trilane.avatars.bundle import load_bundle
@@ -192,7 +195,7 @@ def require_checks(trials: Sequence[Trial]) -> None:
 
 
 def default_folder(name: str, trials: Sequence[Trial]) -> Path:
-    """Return the same folder for the same trials, so that a rerun finds the finished ones."""
+    """Return the usual folder of a sweep. Its name has a digest of the trials, so a rerun finds finished trials."""
     digest = hashlib.sha256("".join(sorted(trial.id for trial in trials)).encode()).hexdigest()
     return Path("sweeps") / f"{name}-{digest[:8]}"
 
@@ -200,7 +203,7 @@ def default_folder(name: str, trials: Sequence[Trial]) -> Path:
 def _run(
     trials: Sequence[Trial], folder: Path, definition: Definition, engine: EngineName, resume: bool, as_json: bool
 ) -> bool:
-    """Do the remaining trials and print how they ended. Return whether any trial is not done."""
+    """Run the remaining trials and print a summary. Return whether any trial has failed or was lost."""
     from trilane.apps.run.report_facts import made_facts
     from trilane.apps.sweep.store import Store, is_ended, run_sweep, summary
 
@@ -229,7 +232,7 @@ def engine_for(name: EngineName, store: Store) -> Iterator[Engine]:
     if name is EngineName.RAY:
         from trilane.apps.sweep.engines import cluster
 
-        with stdout_kept(), cluster(store.folder) as engine:  # Ray tells of dead machines on stdout
+        with stdout_kept(), cluster(store.folder) as engine:  # Ray prints messages about dead machines on stdout
             yield engine
         return
     from trilane.apps.sweep.engines import TrialPlace, run_here
@@ -252,7 +255,7 @@ def described(definition: Definition) -> dict[str, Any]:
 def _say_interrupted(trials: Sequence[Trial], store: Store) -> None:
     from trilane.apps.sweep.store import is_ended
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # what is left to do is to say so
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the message below is left to do
     ended = sum(is_ended(store.done.get(trial.id)) for trial in trials)
     text = f"interrupted: {ended} of {len(trials)} trials are done; --resume goes on ({store.folder})"
     say(text)
@@ -269,13 +272,19 @@ def _print_planned(trials: Sequence[Trial], as_json: bool) -> None:
 
 
 def seconds_left(elapsed_s: float, ended: int, left: int) -> float:
-    """Return the time left if these trials take as long as those that ended, at least one of them."""
+    """Return the expected remaining time in seconds, from the mean time of the ended trials.
+
+    `ended`: number of ended trials, at least 1. `left`: number of remaining trials.
+    """
     return elapsed_s / ended * left
 
 
 @contextmanager
 def progress(left: int, whole: int) -> Iterator[Callable[[Mapping[str, Any]], None]]:
-    """Yield a function to call for each trial that ended. `left`: number of the `whole` trials that are not done."""
+    """Show the progress of a sweep on stderr. Yield a function to call with the record of each trial that ends.
+
+    `left`: number of trials that have not ended yet. `whole`: number of all trials.
+    """
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
     console = stderr_console()
@@ -305,7 +314,7 @@ def _line(record: Mapping[str, Any]) -> str:
 
 
 def _disturbed(record: Mapping[str, Any]) -> str:
-    """Return how often a trial was done again, and why its result is not to be trusted still."""
+    """Return a text on how often a trial was repeated, and on the reason why its result still cannot be trusted."""
     times = record.get("repeated", 0)
     again = f"; done again {times} {'time' if times == 1 else 'times'}, as the machine was not quiet" if times else ""
     return again + "".join(f"; UNSURE: {reason}" for reason in record.get("unsure", [])[:1])
@@ -320,10 +329,9 @@ def _time(seconds: float) -> str:
 
 
 def print_summary(document: Mapping[str, Any], definition: Definition, records: Mapping[str, Any]) -> None:
-    """Print a row for each trial, a line of counts, and a line for each error that trials ended with.
+    """Print a table with a row for each trial, a line of counts, and a line for each error of failed trials.
 
-    `document`: as `--json` prints it.
-    `records`: by name, as in `trials.jsonl`.
+    `document`: document of `--json`. `records`: records of trials.jsonl, by the trial's id.
     """
     from rich.table import Table
 
@@ -350,7 +358,7 @@ def print_summary(document: Mapping[str, Any], definition: Definition, records: 
 
 
 def _answer(result: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the figures of a trial: of a pipeline file's prediction those of its last variant, which it is about."""
+    """Return the figures in a trial's result. In a prediction for a pipeline file, they belong to the last variant."""
     pipelines = result.get("pipelines")
     return pipelines[-1] if pipelines and "what_if" in pipelines[-1] else result
 
@@ -363,7 +371,7 @@ def _figure(result: Mapping[str, Any], path: tuple[str, ...]) -> Any:
 
 
 def marked(word: str, row: Mapping[str, Any]) -> str:
-    """Return `word` with UNSURE beside it for a trial whose machine was not quiet."""
+    """Return `word`, followed by UNSURE if the machine was not quiet during the trial. `row`: facts of the trial."""
     return f"{word}, UNSURE" if row.get("unsure") else word
 
 

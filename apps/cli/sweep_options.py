@@ -1,6 +1,6 @@
-"""The options of the commands that a sweep can try, found in the commands themselves.
+"""The options of the commands that a sweep can try, as the commands themselves define them.
 
-Rule: no second list of options exists. The command's own parser interprets names, spellings and values.
+Rule: there is no second list of options. The command's own parser interprets names, spellings and values.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from trilane.apps.old_names import in_new_name
 from trilane.apps.sweep.definition import COMMANDS, Options, Value
 from trilane.errors import BadInputError, did_you_mean
 
-#: Options of a trial that are not its configuration: why a sweep does not take them.
+#: Option that a sweep refuses, because it is not part of a trial's configuration -> reason.
 NOT_SWEPT = {
     "json": "every trial has it",
     "out": "the sweep's own --out is the folder of all its trials",
@@ -32,7 +32,10 @@ NOT_SWEPT = {
 
 
 class SweptCommand:
-    """A command by its words. Raises BadInputError for a command that a sweep cannot try."""
+    """A command that a sweep tries, and its options. `words`: the command, such as `run`, or `bench` and a name.
+
+    Raises BadInputError for any other command.
+    """
 
     def __init__(self, words: Sequence[str]) -> None:
         first = words[0] if words else ""
@@ -41,7 +44,10 @@ class SweptCommand:
         self._parameters = {_name(each): each for each in self._command.params if _name(each) not in NOT_SWEPT}
 
     def in_new_names(self, given: Mapping[str, Sequence[Value]], where: str) -> dict[str, Sequence[Value]]:
-        """Return options with their values by new names for old ones. Raises BadInputError for one by both names."""
+        """Return `given`, the values of options by name, with new names in place of old ones.
+
+        `where`: place that errors name. Raises BadInputError if an option has both names.
+        """
         found: dict[str, Sequence[Value]] = {}
         for old, values in given.items():
             name = in_new_name(" ".join(self.words), old, next(iter(values), ""), note)
@@ -51,7 +57,7 @@ class SweptCommand:
         return found
 
     def values_of(self, tokens: Sequence[str]) -> dict[str, list[Value]]:
-        """Return the given values by name, in order. Raises BadInputError.
+        """Return the values of each option that `tokens` give, by name, in order. Raises BadInputError.
 
         `tokens`: words of the command line after the command.
         """
@@ -66,7 +72,10 @@ class SweptCommand:
         return found
 
     def converted(self, name: str, value: Any, where: str = "") -> Value:
-        """Return `value` as the command converts it, as plain data. Raises BadInputError for one that it refuses."""
+        """Return the value of option `name` after the command's own conversion, as plain data.
+
+        `where`: place that errors name. Raises BadInputError for a value that the command refuses.
+        """
         parameter = self._named(name, where)
         words = self.words_of({name: value})
         place = f"{where or 'options'}: {name}"
@@ -84,7 +93,7 @@ class SweptCommand:
             raise BadInputError(place, repr(value), f"a value that {' '.join(self.words)} takes", str(error)) from None
 
     def words_of(self, options: Options) -> tuple[str, ...]:
-        """Return `options`, by name, as they are typed."""
+        """Return `options`, which maps names to values, as words of a command line."""
         words: list[str] = []
         for name, value in options.items():
             words += self._typed(self._named(name), value)
@@ -99,21 +108,21 @@ class SweptCommand:
         return self._parameters[name]
 
     def _option(self, token: str, left: Iterator[str]) -> tuple[str, Value]:
-        """Return name and value of the option that `token` begins; its value may be the next one of `left`."""
+        """Return name and value of the option `token`. Without a `=`, the value may be the next item of `left`."""
         spelling, has_value, value = token.partition("=")
         for name, parameter in self._parameters.items():
             if spelling in (*parameter.opts, *parameter.secondary_opts) and parameter.param_type_name == "option":
                 if _is_flag(parameter):
                     return name, spelling in parameter.opts
                 return name, value if has_value else _next(spelling, left)
-        self._named(spelling.lstrip("-"))  # raises, unless it is an argument's name
+        self._named(spelling.lstrip("-"))  # raises an error, except for the name of an argument
         raise BadInputError("options", spelling, f"an option of {' '.join(self.words)}", "it is given without a name")
 
     @staticmethod
     def _typed(parameter: Any, value: Value) -> Iterator[str]:
         if _is_flag(parameter):
             spellings = parameter.opts if value else parameter.secondary_opts
-            yield from spellings[:1]  # no word says that a flag without an opposite is off
+            yield from spellings[:1]  # none, if the flag is off and has no opposite
             return
         for each in value if isinstance(value, list) else [value]:
             if parameter.param_type_name == "argument":

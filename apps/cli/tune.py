@@ -1,7 +1,7 @@
-"""`trilane tune`: finds the fastest configuration of a grid that keeps what is asked, in few trials.
+"""`trilane tune`: finds the fastest configuration of a grid within given limits, in few trials.
 
-Rule: this file talks to the person; `trilane.apps.sweep.tuner` searches. The folder is a sweep's, and so are its
-trials and their engines. Predictions of a chip are made in this process, all other trials in processes of their own.
+Rule: this file reads options and shows results; `trilane.apps.sweep.tuner` searches. Folder, trials and engines are
+those of a sweep. Predictions for a chip are computed in this process; every other trial has its own process.
 """
 
 from __future__ import annotations
@@ -140,7 +140,10 @@ def tune(
 
 
 def _goals(words: Sequence[str]) -> tuple[tuple[str, ...], list[str]]:
-    """Return the goals and the other words. Raises BadInputError for a first word that is neither."""
+    """Return the goals, and the words that name a sweep file or a command. Raises BadInputError.
+
+    `words`: arguments as typed. Without a goal, the goal is `fps`.
+    """
     from trilane.apps.sweep.definition import COMMANDS
     from trilane.apps.sweep.tuner import METRICS
 
@@ -155,7 +158,10 @@ def _goals(words: Sequence[str]) -> tuple[tuple[str, ...], list[str]]:
 
 
 def _space(words: Sequence[str], axes: Sequence[str], chip: str | None) -> tuple[str, Definition, Space]:
-    """Return the name, the definition and the configurations of what is tuned. Raises BadInputError."""
+    """Return the name of a sweep, its definition, and the space of its configurations. Raises BadInputError.
+
+    `words`: sweep file, or command with options. `axes`: values of --axis, as typed. `chip`: value of --on.
+    """
     from trilane.apps.sweep.tuner import Space
     from trilane.hw_profiles.profile_files import load_runnable
 
@@ -202,7 +208,10 @@ def _tune(
     short: int | None,
     resume: bool,
 ) -> dict[str, Any]:
-    """Search in the sweep's folder and return the document that `--json` prints."""
+    """Search for the best configuration, keep the trials in `folder`, and return the document that `--json` prints.
+
+    `budget`: number of configurations to try. `short`: frames of a trial's first short run, if any.
+    """
     from trilane.apps.run.report_facts import made_facts
     from trilane.apps.sweep.store import Store, run_sweep
     from trilane.apps.sweep.tuner import answer, tune
@@ -237,7 +246,7 @@ def _tune(
 
 @contextmanager
 def _engine(name: EngineName, store: Store, trials: Sequence[Trial]) -> Iterator[tuple[Engine, int]]:
-    """Give the engine, and how many trials it does together."""
+    """Yield the engine, and the number of trials that it runs at the same time."""
     from trilane.apps.sweep.engines import at_once, at_once_on_ray, run_inside
 
     if name is EngineName.LOCAL and all(_is_of_chip(trial) for trial in trials):
@@ -253,7 +262,7 @@ def _is_of_chip(trial: Trial) -> bool:
 
 
 def _called(words: list[str]) -> tuple[int, str, str]:
-    """Do a command in this process. Return its exit code, stdout and stderr, as its own process would give them."""
+    """Run a command in this process, and return its exit code, stdout and stderr. `words`: command and arguments."""
     from trilane.apps.cli.main import command_of, describe
 
     out, messages = io.StringIO(), io.StringIO()
@@ -263,13 +272,16 @@ def _called(words: list[str]) -> tuple[int, str, str]:
         except Exception as error:
             said, code = describe(error)
             messages.write(f"error: {said}\n")
-    if code == INTERRUPTED:  # the command made an exit code of it, but the search shall end too
+    if code == INTERRUPTED:  # an interrupt ended the command, and shall end the search too
         raise KeyboardInterrupt
     return code or 0, out.getvalue(), messages.getvalue()
 
 
 def _print(document: Mapping[str, Any], axes: Sequence[str]) -> None:
-    """Print the answer in a line, its command, the frontier, and what failed and was not tried."""
+    """Print the best configuration and its command, the frontier, and the failed and untried configurations.
+
+    `document`: result of `_tune`. `axes`: names of the axes.
+    """
     _print_answer(document, axes)
     if document["frontier"]:
         _print_frontier(document, axes)
@@ -312,7 +324,7 @@ def _print_frontier(document: Mapping[str, Any], axes: Sequence[str]) -> None:
 
 
 def _unit(name: str) -> str:
-    """Return the unit of a figure; empty where its name says it, or where it has none."""
+    """Return the unit of measure of the figure `name`; "" if there is none, or if the name itself is the unit."""
     from trilane.apps.sweep.tuner import METRICS
 
     return METRICS[name].unit if name in METRICS and METRICS[name].unit != name else ""

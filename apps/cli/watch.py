@@ -1,9 +1,8 @@
 """`trilane watch`, `trilane show` and `trilane trace`: views of one run, during it or after it.
 
-Rule: this file reads options and shows; the figures come from `trilane.apps.watch`, the page from
-`trilane.apps.dashboard`, the trace from `trilane.apps.explain.trace`. `trilane watch` has a screen for a terminal and a
-line for anything else. Each speed is shown with the error of the avatar's pictures, and the sources of the figures
-stand below.
+Rule: this file reads options and shows results. Figures come from `trilane.apps.watch`, the page from
+`trilane.apps.dashboard`, the trace from `trilane.apps.explain.trace`. `trilane watch` redraws a screen on a terminal,
+and prints lines otherwise. Speed is shown with the error of the avatars' pictures and the sources of the figures.
 """
 
 from __future__ import annotations
@@ -115,7 +114,10 @@ def _print_lines(first: RunLook, rest: Iterator[RunLook]) -> None:
 
 
 def _show(first: RunLook, rest: Iterator[RunLook]) -> None:
-    """Show looks on a screen that is redrawn, or line by line where stdout is no terminal."""
+    """Show successive figures of a run, on a redrawn screen, or line by line if stdout is no terminal.
+
+    `first`: first figures. `rest`: later ones, which come as the run goes on.
+    """
     from rich.live import Live
 
     console = stdout_console()
@@ -184,7 +186,7 @@ def trace(run: NewestRunArgument = None, chrome_json: ChromeOption = False, out:
 BAR = 20
 FULL, EMPTY = "█", "░"
 NO_ERROR = "the run says nothing of its avatars' error"
-#: State of a run that went on when it was looked at first: what became of it.
+#: New state of a run that went on before -> sentence about its end.
 ENDINGS = {
     "finished": "finished",
     "killed": "killed: its process is gone, and the last line is as far as its journal goes",
@@ -196,7 +198,7 @@ MIB = 1 << 20
 
 
 def screen(look: RunLook, width: int) -> Group:
-    """Return everything, for a terminal of `width` columns."""
+    """Return the whole screen with the figures of a run, for a terminal of `width` columns."""
     from rich.console import Group
     from rich.text import Text
 
@@ -216,7 +218,7 @@ def screen(look: RunLook, width: int) -> Group:
 
 
 def line(look: RunLook) -> str:
-    """Return the most important figures in one line."""
+    """Return the most important figures of a run in one line."""
     figures = look.figures
     busy = ", ".join(f"{name} {unit.window.busy:.0%}" for name, unit in figures.units.items())
     waiting = ", ".join(f"{name} {stage.waiting}" for name, stage in figures.stages.items() if stage.waiting)
@@ -243,7 +245,7 @@ def _passed(figures: MomentFigures) -> str:
 
 
 def heading(look: RunLook) -> str:
-    """Return the heading above the lines."""
+    """Return the heading for the lines of `line`: the run's name and state, how figures are computed, and errors."""
     from trilane.apps.watch.followed_run import RunState
 
     of_fps = "between the first frame and the last" if look.state is RunState.FINISHED else "of the last 5 s"
@@ -252,17 +254,17 @@ def heading(look: RunLook) -> str:
 
 
 def ending(look: RunLook) -> str:
-    """Say that a run that went on has another state."""
+    """Return a sentence about the end of a run that went on before."""
     return f"run {look.name}: {ENDINGS[look.state]}"
 
 
 def errors(figures: MomentFigures) -> list[str]:
-    """Return a line for each avatar: how wrong its pictures are, or why that is not known."""
+    """Return a line for each avatar: the error of its pictures, or why this error is unknown."""
     return [accuracy_line(name, facts) for name, facts in figures.accuracy.items()] or [NO_ERROR]
 
 
 def dropped(figures: MomentFigures) -> int:
-    """Return the number of frames dropped on all edges."""
+    """Return the number of dropped frames, over all edges."""
     return sum(drop.frames for drop in figures.frames.dropped)
 
 
@@ -303,7 +305,7 @@ def _table(*names: str) -> Table:
 
 
 def _add_row(table: Table, *cells: str) -> None:
-    """Add a row whose cells are no markup: a pipeline gives its stages and units any names."""
+    """Add a row of plain texts, because names of stages and units may look like Rich's markup."""
     from rich.text import Text
 
     table.add_row(*map(Text, cells))
@@ -338,7 +340,7 @@ def _three(times: Mapping[str, float]) -> str:
 
 
 def _time(times: Mapping[str, float], key: str) -> str:
-    """Return a dash without samples; a percentile of too few says so."""
+    """Return a statistic in ms as a text: a dash without samples, marked with TOO_FEW if it needs more samples."""
     if not times["samples"]:
         return DASH
     return f"{times[key]:.1f}{TOO_FEW if times['samples'] < needed().get(key, 0) else ''}"
@@ -353,7 +355,7 @@ def _stages(figures: MomentFigures) -> Table:
 
 
 def _moved(kinds: Mapping[str, Moved]) -> tuple[str, str]:
-    """Return the MiB that a job moved, by kind and in all, and the least possible; dashes if the stage counts none."""
+    """Return two texts: the MiB that a job moves, in all and by kind, and the least possible MiB. Unknown: a dash."""
     from trilane.apps.watch.live_figures import LEAST
 
     shown = {kind: moved.per_job / MIB for kind, moved in kinds.items() if kind != LEAST and moved.total}
@@ -392,7 +394,7 @@ def _percent(share: float) -> str:
 
 
 def _short_bound(figures: MomentFigures) -> str:
-    """Return the unit with what slowing it costs, or with its share of the critical path; empty if unknown."""
+    """Return the unit that bounds, with its cost if it is slower, or its share of the critical path; "" if unknown."""
     unit = (figures.bound or {}).get("unit")
     if not unit:
         return ""
@@ -401,7 +403,7 @@ def _short_bound(figures: MomentFigures) -> str:
 
 
 def _short_error(figures: MomentFigures) -> str:
-    """Return the PSNR of each avatar in the band of zoom in which it is worst."""
+    """Return the PSNR of each avatar in its worst band of zoom, as a text."""
     known = {
         name: min(facts["psnr_db_by_band"].values())
         for name, facts in figures.accuracy.items()
@@ -411,7 +413,7 @@ def _short_error(figures: MomentFigures) -> str:
 
 
 def _sources(figures: MomentFigures) -> str:
-    """Name the sources of the figures; temperatures have one only in a run that has temperatures."""
+    """Return a text with the sources of all figures, of temperatures, and of duties, as far as the run has them."""
     said = [f"figures: {figures.sources['fps']}"]
     for place in figures.temperature_c:
         source = figures.sources.get(f"temperature_c.{place}", figures.sources["temperature_c"])

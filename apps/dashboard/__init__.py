@@ -1,4 +1,4 @@
-"""Runs in a browser: a server for one run that goes on or is over, and the page that it serves.
+"""Shows runs in a browser: a server for one live or finished run, and the page that it serves.
 
-It may use apps/ and every lower folder, but not apps/cli/.
+This folder may import apps/ and every lower folder, but not apps/cli/.
 """

@@ -1,9 +1,9 @@
-"""Where a server listens, and who may send it requests. Rule: no request is refused silently.
+"""Where the dashboard's server listens, and which requests it refuses. Rule: every refusal is counted.
 
-Only this machine may send requests, to this address, with the token of this run. A page of another site that knows the
-port is refused: its Origin is foreign, and a host name that it points here is not in the expected Host header. The
-page's own files hold no secret and need no token. The socket listens before the server starts, so the printed address
-accepts requests at once.
+The server accepts only requests from this machine, to this address, with the token of this run. A page of another site
+may know the port. Its requests are refused for their Origin header, or for a Host header with another host name. The
+files of the page contain no secret and need no token. The socket listens before the server starts, so the printed
+address accepts requests at once.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from urllib.parse import parse_qs
 from trilane import machine
 from trilane.errors import BadInputError, MissingPartError, install_line, reason
 
-SEND_BYTES: Final = 1 << 18  # that the system keeps of what a client does not take
-PATIENCE_MS: Final = 10_000
+SEND_BYTES: Final = 1 << 18  # size of the system's send buffer, for bytes that a client has not yet received
+PATIENCE_MS: Final = 10_000  # after which the system ends a connection whose client acknowledges nothing
 BACKLOG: Final = 256
 TOKEN_BYTES: Final = 24
 PACKAGES: Final = ("starlette", "uvicorn", "websockets", "prometheus_client")
 ADDRESS: Final = "127.0.0.1"
 #: Paths that need the token; all others are files of the page.
 SECRET_PATHS: Final = frozenset({"/", "/live", "/metrics", "/trace.pftrace"})
-#: Of a page that is not there: who asks for one asks for nothing that may not be asked.
+#: Status of an answer about a missing page. It does not count as a refusal, because the request is allowed.
 NOT_FOUND: Final = 404
-#: Path that could name a page; the longest name of one has 30 characters.
+#: Pattern of a path that may name a page. The page's files have names of at most 30 characters.
 SOUND_PATH: Final = re.compile(r"(/(?!\.\.?(/|$))[\w.-]{0,60}){1,4}", re.ASCII)
 MOST_FIELDS: Final = 16
 #: Most bytes of a request's target and headers together. A browser sends less than 1 kB.
@@ -45,7 +45,7 @@ Asgi = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 
 class Refusal(StrEnum):
-    """The reason why the server refused a request; the values are labels of a metric."""
+    """The reason for which the server refused a request. The values are labels of a metric."""
 
     WRONG_TOKEN = "wrong_token"  # noqa: S105 - the name of a count
     FOREIGN_HOST = "foreign_host"
@@ -57,7 +57,7 @@ class Refusal(StrEnum):
     SLOW_CLIENT = "slow_client"
 
 
-#: Status of an answer that refuses.
+#: HTTP status of a refusal.
 STATUS: Final = {
     Refusal.FOREIGN_HOST: 421,
     Refusal.FOREIGN_ORIGIN: 403,
@@ -69,7 +69,7 @@ STATUS: Final = {
 
 @dataclass(frozen=True)
 class ServerAddress:
-    """Where a server listens, and the token that a client has to know."""
+    """The listening socket of a server, and the token that requests must contain."""
 
     listener: socket.socket
     token: str
@@ -87,14 +87,17 @@ class ServerAddress:
 
 
 def require_server() -> None:
-    """Raise MissingPartError when a package of the extra is missing."""
+    """Raise MissingPartError if a package of the extra `dashboard` is missing."""
     for package in PACKAGES:
         if not machine.here.has_package(package):
             raise MissingPartError(f"the dashboard needs the package {package}", install_line("dashboard"))
 
 
 def listen(port: int | None) -> ServerAddress:
-    """Listen on `port` of this machine alone, on any free one when None. Raises BadInputError."""
+    """Return a socket that listens on `port`, for this machine only, with a new token. Raises BadInputError.
+
+    `port`: None takes any free port.
+    """
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -110,7 +113,7 @@ def listen(port: int | None) -> ServerAddress:
 
 
 class Refusals:
-    """Counts all refusals of a server; one that never happened counts 0."""
+    """Counts all refusals of a server by reason; a reason that never occurred has the count 0."""
 
     def __init__(self) -> None:
         self._counts: Counter[Refusal] = Counter(dict.fromkeys(Refusal, 0))
@@ -119,7 +122,7 @@ class Refusals:
         self._counts[why] += 1
 
     def as_json(self) -> dict[str, int]:
-        """Return the counts by name."""
+        """Return the count of each reason, by the reason's value."""
         return {why.value: count for why, count in self._counts.items()}
 
 
@@ -148,7 +151,10 @@ def headers(port: int) -> dict[str, str]:
 
 
 def refusal_of_head(scope: Mapping[str, Any]) -> Refusal | None:
-    """Return why a request is refused before its path is read: wrong version, too long, or with a body."""
+    """Return the refusal of a request for its HTTP version, the size of its head, or a body; None if all is right.
+
+    `scope`: ASGI scope of the request.
+    """
     lines = [scope["raw_path"] + scope["query_string"], *(name + value for name, value in scope["headers"])]
     if sum(map(len, lines)) > MOST_HEAD_BYTES:
         return Refusal.OVERSIZED
@@ -158,7 +164,7 @@ def refusal_of_head(scope: Mapping[str, Any]) -> Refusal | None:
 
 
 class Guard:
-    """ASGI middleware that refuses what `refusal_of` names, counts all refusals and gives every answer `headers`."""
+    """ASGI middleware that refuses requests by `refusal_of`, counts refusals, and adds `headers` to every answer."""
 
     def __init__(self, app: Asgi, port: int, token: str, refusals: Refusals) -> None:
         self._app, self._hosts, self._token, self._refusals = app, hosts(port), token, refusals
@@ -176,7 +182,7 @@ class Guard:
         await self._refuse(scope, receive, self._with_headers(send, is_refused=True), why)
 
     def refusal_of(self, scope: Mapping[str, Any]) -> Refusal | None:
-        """Return why the request is refused, None when it is not."""
+        """Return the reason for which the request is refused; None if it is allowed. `scope`: ASGI scope."""
         given = [(name.lower(), value.decode("latin-1")) for name, value in scope["headers"]]
         if [value for name, value in given if name == b"host"] not in [[host] for host in self._hosts]:
             return Refusal.FOREIGN_HOST

@@ -1,7 +1,8 @@
-"""The server's answers: the page's files, one WebSocket, metrics and the trace. Rule: it decides nothing about the run.
+"""The dashboard's HTTP server: the page's files, a WebSocket, metrics and the trace.
 
-Pictures are pulled: a client that asks gets the newest picture that it has not seen, and no other until it asks again.
-Everything else is sent to all clients as it happens. A client that does not take or send in time loses its connection.
+Rule: this module decides nothing about the run. A client gets one picture for each request: the newest one that it has
+not had. All other messages go to all clients at once. A client that does not receive or answer in time loses its
+connection.
 """
 
 from __future__ import annotations
@@ -42,21 +43,21 @@ PICTURE_S: Final = 0.02
 LAST_S: Final = 0.3
 MOST_FAULTS: Final = 16
 OPENMETRICS: Final = "application/openmetrics-text; version=1.0.0; charset=utf-8"
-#: Codes with which a WebSocket ends that said what it may not.
+#: Close code of a WebSocket whose client broke the protocol -> the refusal to count.
 PROTOCOL_FAULTS: Final = {1009: Refusal.OVERSIZED, 1002: Refusal.MALFORMED, 1007: Refusal.MALFORMED}
 REFUSED_HELP: Final = (
     "# HELP trilane_dashboard_refused Requests, messages and clients that the dashboard refused or dropped.\n"
     "# TYPE trilane_dashboard_refused counter\n"
 )
 PING_S: Final = 10.0
-SWITCHING: Final = 101  # status of a WebSocket that begins
+SWITCHING: Final = 101  # HTTP status of an accepted WebSocket
 
 
 class DashboardApp:
-    """The ASGI application `asgi` that shows `view` on `port` to clients that know `token`.
+    """The server's application. It shows `view` on `port` to clients that send `token`.
 
-    `refusals`: counts of refused requests. `stop`: function that ends the server; the app calls it when it can no
-    longer send news.
+    `asgi`: the ASGI application. `refusals`: counts of refused requests. `stop`: function that ends the server, set by
+    `server`. The app calls it when one of its own tasks has failed.
     """
 
     def __init__(self, view: RunView, port: int, token: str) -> None:
@@ -76,7 +77,7 @@ class DashboardApp:
         self.asgi: Asgi = Guard(app, port, token, self.refusals)
 
     async def finish(self) -> None:
-        """Send the remaining messages to all clients, then wait for LAST_S, in which the clients receive them."""
+        """Send the remaining messages to all clients, and give the clients LAST_S seconds to receive them."""
         await self._tell_newest()
         await asyncio.sleep(LAST_S)
 
@@ -93,7 +94,7 @@ class DashboardApp:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     def _stop_if_failed(self, task: asyncio.Task[None]) -> None:
-        """End the server with a traceback: a page that stands still without a word would be taken for the run."""
+        """Print the traceback and end the server if `task` failed. Otherwise the page would stop without a reason."""
         if not task.cancelled() and (error := task.exception()) is not None:
             traceback.print_exception(error)
             self.stop()
@@ -133,7 +134,7 @@ class DashboardApp:
             await socket.close(1008)
 
     async def _listen(self, socket: WebSocket, client: Client) -> None:
-        """Obey the client until it leaves or has sent too many malformed messages."""
+        """Carry out the client's messages until the client disconnects or has sent MOST_FAULTS malformed ones."""
         while client.faults < MOST_FAULTS:
             event = await socket.receive()
             if event["type"] == "websocket.disconnect":
@@ -195,9 +196,9 @@ class DashboardApp:
 
 
 def server(app: DashboardApp) -> Any:
-    """Return a uvicorn server of `app`; its `serve(sockets=[...])` returns when its `should_exit` is set.
+    """Return a uvicorn server for `app`. Its method `serve(sockets=[...])` returns after `should_exit` is set.
 
-    The app counts what uvicorn refuses before the app hears of it.
+    Requests that uvicorn itself refuses are counted in `app.refusals`.
     """
     import uvicorn
     from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -209,7 +210,7 @@ def server(app: DashboardApp) -> Any:
             super().send_400_response(msg)
 
         def handle_websocket_upgrade(self, event: Any) -> None:
-            if refusal_of_head(self.scope) is None:  # WebSockets are handed the request as one of HTTP/1.1
+            if refusal_of_head(self.scope) is None:  # checked here: uvicorn passes on any version as 1.1
                 super().handle_websocket_upgrade(event)
             else:
                 self.send_400_response("refused: malformed")
@@ -221,7 +222,7 @@ def server(app: DashboardApp) -> Any:
                 app.refusals.add(Refusal.MALFORMED)
 
         def handle_text(self, event: Any) -> None:
-            self.handle_bytes(event)  # uvicorn prints a traceback where a text is not UTF-8
+            self.handle_bytes(event)  # the original method prints a traceback for a text that is not UTF-8
 
     config = uvicorn.Config(
         app.asgi,

@@ -1,8 +1,8 @@
-"""The messages between a run and its server, which are two processes. Rule: msgpack, and only messages in MESSAGES.
+"""Messages between a run's process and its server's process, in msgpack. Rule: only types in MESSAGES exist.
 
-A message is an array: its place in MESSAGES, then its fields. It goes as one packet over a pair of sockets that only
-these two processes have. Neither process waits for the other: a message that cannot be sent at once is left out.
-`ServerLink` starts the server's process and ends it; if that process ends by itself, the run goes on without it.
+A message is an array: the index of its type in MESSAGES, followed by its fields. It is one packet on a pair of sockets
+that only these two processes have. Neither process waits for the other: a message that cannot be sent at once is lost.
+`ServerLink` starts and ends the server's process. If that process ends by itself, the run goes on without a server.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SERVER_ENDED: Final = "the dashboard's server has ended; the run goes on without
 
 
 class Opened(NamedTuple):
-    """To the server, first: the `token` that clients need, and the size of the window's pictures."""
+    """The first message to the server: the `token` that clients need, and the size of pictures in pixels."""
 
     token: str
     height: int
@@ -38,7 +38,10 @@ class Opened(NamedTuple):
 
 
 class RunBegins(NamedTuple):
-    """To the server: a run writes its journal into `folder`. `facts`, `controls`: fields of `RunFacts`, `Control`."""
+    """A message to the server: a run begins and writes its journal into `folder`.
+
+    `facts`: fields of the run's `RunFacts`. `controls`: fields of each `Control`.
+    """
 
     folder: str
     facts: Mapping[str, Any]
@@ -46,28 +49,35 @@ class RunBegins(NamedTuple):
 
 
 class StateIs(NamedTuple):
-    """To the server: running, paused, restarting, ended or failed, and why. Until its first frame a run is starting."""
+    """A message to the server: the state of the run has changed.
+
+    `state`: running, paused, restarting, ended or failed. `why`: reason in words, or "". The server itself shows
+    `starting` until the first frame.
+    """
 
     state: str
     why: str
 
 
 class ChangesRefused(NamedTuple):
-    """A message to the server: the requested change of a control is refused."""
+    """A message to the server: the run refuses a request. `why`: reason in words.
+
+    `control`: name of the control, `restart` for several controls, "" for a new run that did not begin.
+    """
 
     control: str
     why: str
 
 
 class ControlAsked(NamedTuple):
-    """A message to the run: somebody requests that the control gets the value."""
+    """A message to the run: the page requests `value` for `control`."""
 
     control: str
     value: str | float | None
 
 
 class ChangesAsked(NamedTuple):
-    """A message to the run: somebody requests a new run in which these controls have these values."""
+    """A message to the run: the page requests a new run. `values`: requested values of controls, by name."""
 
     values: Mapping[str, str]
 
@@ -87,13 +97,13 @@ _FIELDS: Final[dict[type[Any], tuple[type | tuple[type, ...], ...]]] = {
 
 
 def packed(message: Message) -> bytes:
-    """Return the packet of `message`."""
+    """Return `message` as the bytes of a packet."""
     data: bytes = msgpack.packb([MESSAGES.index(type(message)), *message])
     return data
 
 
 def unpacked(data: bytes) -> Message:
-    """Return the message of a packet. Raises UnexpectedValue for bytes that are no message."""
+    """Return the message in the packet `data`. Raises UnexpectedValue for bytes that are no message."""
     try:
         place, *fields = msgpack.unpackb(data)
         kind = MESSAGES[place]
@@ -107,7 +117,7 @@ def unpacked(data: bytes) -> Message:
 
 
 class ChannelEnd:
-    """One end of the pair. `fd` becomes readable when a message has come or the other end is gone."""
+    """One end of a pair of sockets. `fd` becomes readable when a message arrives or the other end is closed."""
 
     def __init__(self, end: socket.socket) -> None:
         self._end = end
@@ -118,7 +128,7 @@ class ChannelEnd:
         return self._end.fileno()
 
     def send(self, message: Message) -> bool:
-        """Send `message` and return whether it was sent. An end that is gone, or has too much to read, gets nothing."""
+        """Send `message` and return whether it was sent. It is not if the other end is closed, or its buffer full."""
         try:
             self._end.send(packed(message))
         except OSError:
@@ -126,7 +136,7 @@ class ChannelEnd:
         return True
 
     def receive(self) -> Message | None:
-        """Return the next message, None when there is none yet. Raises EOFError when the other end is gone."""
+        """Return the next message, or None if none has arrived. Raises EOFError if the other end is closed."""
         try:
             data = self._end.recv(MOST_BYTES)
         except BlockingIOError:
@@ -143,16 +153,16 @@ class ChannelEnd:
 
 
 def channel_pair() -> tuple[ChannelEnd, socket.socket]:
-    """Return this process's end, and the socket that the other process gets."""
+    """Return this process's end of a new pair of sockets, and the socket for the other process."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     return ChannelEnd(ours), theirs
 
 
 class ServerLink:
-    """The run's end of a server at `place` for pictures of `height` x `width`.
+    """Starts a server process and connects the run to it. `window`: file through which the server sees pictures.
 
-    `hear`: function that gets each request of the page, on a thread of its own. `tell`: function that gets sentences
-    for a person.
+    `place`: address of the server. `height`, `width`: size of pictures in pixels. `hear`: function that gets each
+    request of the page, on a thread of its own. `tell`: function that gets sentences for a person.
     """
 
     def __init__(
@@ -175,18 +185,18 @@ class ServerLink:
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 pass_fds=fds,
-                process_group=0,  # an interrupt of the terminal is the run's to hear; the server ends after it
+                process_group=0,  # so that Ctrl-C interrupts only the run, which then ends the server
             )
         self.send(Opened(place.token, height, width))
         self._thread = threading.Thread(target=self._listen, name="dashboard", daemon=True)
         self._thread.start()
 
     def send(self, message: Message) -> None:
-        """Send `message` to the server, if it is there and listens."""
+        """Send `message` to the server. The message is lost if the server is gone or its buffer is full."""
         self._channel.send(message)
 
     def close(self) -> None:
-        """End the server; its process is gone when this returns."""
+        """End the server, and wait for the end of its process."""
         os.eventfd_write(self._end_fd, 1)
         self._thread.join()
         self._channel.close()

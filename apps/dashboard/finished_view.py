@@ -1,7 +1,7 @@
-"""A finished run as a server shows it: any moment of it, from its journal and its video.
+"""Shows any moment of a finished run, from its journal and its video.
 
-Rule: the journal is read once, into temporary files without a name, because a run may last for days. A picture is
-decoded on request, and none is kept.
+Rule: the journal is read once, into unnamed temporary files, because a run may last for days. Pictures are decoded on
+request and not kept.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ PIECE_ROWS = 4096
 
 
 class FinishedView:
-    """The `RunView` of the run in `folder`. Raises what `_read_run` raises."""
+    """The `RunView` of the finished run in `folder`. Raises BadInputError."""
 
     def __init__(self, folder: Path) -> None:
         self._run = _read_run(folder)
@@ -104,7 +104,7 @@ class FinishedView:
         return self._run.metrics
 
     def close(self) -> None:
-        """Let go of the files."""
+        """Close the video and remove the temporary files."""
         self._run.close()
         self._video.close()
 
@@ -114,7 +114,7 @@ class FinishedView:
 
 
 def _read_run(folder: Path) -> _FinishedRun:
-    """Read the run in `folder`. Raises BadInputError for a folder that has none, or whose journal cannot be read."""
+    """Read the run in `folder`. Raises BadInputError for a folder without a journal, or with an unreadable one."""
     journal = journal_in(folder)
     if journal is None:
         raise BadInputError(folder, f"no {NAME}", "the folder of a run", "`trilane run` writes one into runs/")
@@ -130,9 +130,11 @@ def _read_run(folder: Path) -> _FinishedRun:
 
 
 class _FinishedRun:
-    """Facts about a finished run and its place on disk; `_read_run` makes it.
+    """A finished run as tables in temporary files. `_read_run` fills them; all times are ms since the first step.
 
-    `end_ms`: time of its last step.
+    `begun`: first record of the journal. `facts`: facts for the page. `end_ms`: time of the last step.
+    `jobs`, `idle`, `presented`: jobs, idle slices, and presented frames. `figures`: figures at regular times.
+    `metrics`: figures of the whole run in OpenMetrics. `notes`: messages, each after its time.
     """
 
     def __init__(self, begun: Begun, facts: RunFacts) -> None:
@@ -149,7 +151,7 @@ class _FinishedRun:
         self.notes: list[tuple[float, str]] = []
 
     def add(self, record: Record) -> None:
-        """Take the next record."""
+        """Add the next record of the journal."""
         self._timeline.add(record)
         self._meter.add(record)
         self._is_whole = isinstance(record, Ended)
@@ -170,14 +172,14 @@ class _FinishedRun:
             table.complete()
 
     def figures_at(self, t_ms: float) -> Mapping[str, Any]:
-        """Return the figures that were kept last before `t_ms`, or the first."""
+        """Return the newest stored figures from before `t_ms`, or else the first ones."""
         row = self.figures.last_before(t_ms)
         row = self.figures.near(t_ms, FIGURES_EVERY_MS, 1)[0] if row is None else row
         figures: Mapping[str, Any] = json.loads(self._written.read(int(row["offset"]), int(row["size"])))
         return figures
 
     def slices_near(self, t_ms: float, span_ms: float) -> Message:
-        """Return jobs and idle slices from `span_ms` before `t_ms` until as long after."""
+        """Return the message with the jobs and idle slices from `t_ms` - `span_ms` to `t_ms` + `span_ms`."""
         jobs = [
             (int(r["unit"]), int(r["stage"]), int(r["frame"]), float(r["begin"]), float(r["end"]), float(r["wait"]))
             for r in self.jobs.near(t_ms, span_ms, MOST_JOBS)
@@ -189,7 +191,7 @@ class _FinishedRun:
         return slices(jobs, idle)
 
     def frame_at(self, t_ms: float) -> int | None:
-        """Return the frame that was presented last at `t_ms`, None before the first."""
+        """Return the number of the newest frame that was presented by `t_ms`; None before the first frame."""
         row = self.presented.last_before(t_ms)
         return None if row is None else int(row["frame"])
 
@@ -215,9 +217,9 @@ class _FinishedRun:
 
 
 class _RunPictures:
-    """The pictures of a video of `trilane run`, which may be missing, for one thread at a time.
+    """Pictures from the video of a run. The file `path` may be missing. A lock serialises the calls of several threads.
 
-    Frame n is shown from n / `fps` on.
+    `fps`: frames a second of the scene; frame n is shown from second n / `fps` on.
     """
 
     def __init__(self, path: Path, fps: float) -> None:
@@ -233,7 +235,7 @@ class _RunPictures:
         return self._container is None
 
     def jpeg(self, frame: int) -> bytes | None:
-        """Return the picture that was shown with frame `frame`; None if there is none, or the video ends before it."""
+        """Return the picture that was shown at the time of frame `frame`, as a JPEG; None if there is none."""
         if self._container is None:
             return None
         one = 1 / Fraction(self._fps).limit_denominator(1001) / self._stream.time_base
@@ -247,7 +249,7 @@ class _RunPictures:
             return None if newest is None else jpeg_of(newest.to_image())
 
     def close(self) -> None:
-        """Let go of the video."""
+        """Close the video."""
         if self._container is not None:
             self._container.close()
 
@@ -260,11 +262,11 @@ class _Piece(NamedTuple):
 
 
 class TimeTable:
-    """Rows with a begin and an end, many more than memory should hold, found by their time.
+    """A table in a temporary file, whose rows have a begin and an end and are found by time.
 
-    `dtype`: type of a row, with the fields `begin` and `end` in any unit of time. Rows lie in a temporary file, in
-    pieces; memory holds the place, earliest begin and latest end of each piece. Rows need not be in order, but add rows
-    of about the same time together.
+    The file consists of pieces of PIECE_ROWS rows. Memory holds only the offset, earliest begin and latest end of each
+    piece. Rows need not be sorted, but searches are faster if rows of similar times are added together.
+    `dtype`: type of a row, with the fields `begin` and `end` in any unit of time.
     """
 
     def __init__(self, dtype: np.dtype[Any]) -> None:
@@ -279,7 +281,7 @@ class TimeTable:
             self.complete()
 
     def complete(self) -> None:
-        """Write the added rows, so that they can be found."""
+        """Write the rows that are still in memory to the file, so that searches find them."""
         if self._fresh:
             rows = np.array(self._fresh, self._dtype)
             offset = self._file.seek(0, os.SEEK_END)
@@ -289,7 +291,10 @@ class TimeTable:
             self._fresh = []
 
     def near(self, time: float, reach: float, most: int) -> NDArray[Any]:
-        """Return the `most` nearest rows that touch `time - reach` to `time + reach`, sorted by their begins."""
+        """Return the rows that overlap the interval from `time - reach` to `time + reach`, sorted by begin.
+
+        If there are more than `most`, only the nearest to `time` are returned.
+        """
         low, high = time - reach, time + reach
         touching = [piece for piece in self._pieces if piece.begin <= high and piece.end >= low]
         touching.sort(key=lambda piece: _away(time, piece.begin, piece.end))
@@ -305,7 +310,7 @@ class TimeTable:
         return rows[np.argsort(rows["begin"], kind="stable")]
 
     def last_before(self, time: float) -> np.void | None:
-        """Return the row that ended last of those that have ended at `time`; None when there is none."""
+        """Return the row with the latest end that is not after `time`; None if there is no such row."""
         for piece in reversed(self._pieces):
             rows = self._read(piece)
             ended = rows[rows["end"] <= time]
@@ -315,7 +320,7 @@ class TimeTable:
         return None
 
     def close(self) -> None:
-        """Remove the file; nothing is found any more."""
+        """Remove the file. Call no other method afterwards."""
         self._file.close()
 
     def _read(self, piece: _Piece) -> NDArray[Any]:
@@ -329,7 +334,7 @@ def _away(time: float, begin: float, end: float) -> float:
 
 
 class _TextStore:
-    """Texts in a temporary file; `add` returns the place and length by which `read` finds one again."""
+    """Texts in a temporary file. `add` returns the offset and the length of a text, which `read` takes."""
 
     def __init__(self) -> None:
         self._file: IO[bytes] = tempfile.TemporaryFile(prefix="trilane-", buffering=0)  # noqa: SIM115 - `close` closes it

@@ -1,8 +1,8 @@
-"""A run under a dashboard: `trilane run`'s own code, repeated whenever the page requests another configuration.
+"""Runs a scene or a pipeline file under a dashboard, with a new run for each configuration that the page requests.
 
-Rule: this process runs the pipeline; the page's server is another process, and neither waits for the other. Some
-settings change during the run. Any other change is checked as a command line is; then the run ends cleanly, and a new
-run starts with a folder of its own. A pipeline file has one run.
+Rule: this process runs the pipeline by the code of `trilane run`. The page's server is another process, and neither
+waits for the other. Some settings change during the run. Any other change is checked like a command line. After that,
+the run ends cleanly, and a new run starts with its own folder. A pipeline file has only one run.
 """
 
 from __future__ import annotations
@@ -48,21 +48,22 @@ from trilane.units import UNITS
 
 OpenHooks = Callable[[], AbstractContextManager[Hooks]]
 RUNNING, PAUSED, RESTARTING, ENDED, FAILED = "running", "paused", "restarting", "ended", "failed"
-#: Controls that hold the run or let it go: how many frames it may release, and what it does then.
+#: Control that holds or continues the run -> number of frames that the run may release, and the run's new state.
 HOLDS: Final = {"play": (ALL, RUNNING), "pause": (0, PAUSED), "step": (1, PAUSED)}
 MOST_AVATARS: Final = 20
-#: The page's name for all changes together.
+#: Name, in a refusal, that stands for several requested changes together.
 RESTART: Final = "restart"
 
 
 def run_live(
     options: RunOptions, hooks: OpenHooks, command: tuple[str, ...], port: int | None, tell: Callable[[str], None]
 ) -> RunOutcome:
-    """Run the options, then each configuration that the page requests, until an interrupt; return the last outcome.
+    """Run `options`, followed by each configuration that the page requests, and return the last outcome.
 
-    `options`: options of the first run; with a number of frames, each run ends after so many.
-    `hooks`, `command`: as `run_asked` takes them. `port`: as `listen` takes it.
-    `tell`: function that is given the page's address, and sentences for a person. Raises what `run_asked` raises.
+    `options`: options of the first run. If they state a number of frames, each run ends after this number. Otherwise,
+    the last run ends by an interrupt.
+    `hooks`, `command`: as in `run_asked`. `port`: as in `listen`.
+    `tell`: function that gets the page's address, and other sentences for a person. Raises the errors of `run_asked`.
     """
     with early_processes() as (starter, gl):
         first = prepare(options.changed(baseline_frames=0), gl, command)
@@ -81,7 +82,11 @@ def run_live(
 
 
 class _Runs:
-    """Runs one run after the other. `link`: link to the server, set before the first run."""
+    """Executes successive runs. `link`: link to the server, which the caller sets before the first run.
+
+    `prepare`: function that checks the options of a run. `gl`: function from `early_processes`.
+    `run`: function that runs a prepared run. `tell`: as in `run_live`.
+    """
 
     link: ServerLink
 
@@ -97,7 +102,11 @@ class _Runs:
         self.director = Director(prepare, lambda message: self.link.send(message))
 
     def run_all(self, first: Prepared) -> RunOutcome:
-        """Run until no other run is asked for, or one fails. Raises TrilaneError when the first presented no frame."""
+        """Run `first`, followed by each requested run, and return the last outcome. A failed run is the last one.
+
+        After a run without a presented frame, the requested run or else the previous configuration follows. Raises
+        TrilaneError if there is neither.
+        """
         now, before = first, None
         while True:
             try:
@@ -131,14 +140,14 @@ class _Runs:
 
 
 def _numbered(folder: Path, number: int) -> Path:
-    """Return the folder of run `number` under one page; the first run has the name that the user gave."""
+    """Return the folder of run `number`, counted from 1: `folder` itself for the first run, else with a number."""
     return folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
 
 
 class Director:
-    """Directs the successive runs under one page. One thread calls `do`; another one calls all other methods.
+    """Carries out the page's requests in successive runs. One thread calls `do`, another calls all other methods.
 
-    `prepare`: function that checks a run. `send`: function that hands a message to the server.
+    `prepare`: function that checks the options of a run. `send`: function that sends a message to the server.
     """
 
     def __init__(self, prepare: Callable[[RunOptions], Prepared], send: Callable[[Message], None]) -> None:
@@ -149,13 +158,13 @@ class Director:
         self._controls: RunControls | None = None
 
     def begin(self, prepared: Prepared) -> RunControls:
-        """Begin the run of `prepared` and return its controls."""
+        """Make `prepared` the present run, and return the object through which `do` steers it."""
         with self._lock:
             self._now, self._next, self._controls = prepared, None, RunControls()
             return self._controls
 
     def show(self, machine: Mapping[str, Any], folder: Path, checked: Checked) -> None:
-        """Tell the server that the run of `checked` writes into `folder`."""
+        """Tell the server that a run begins. `machine`: as in report.json. `folder`: folder with the run's journal."""
         assert self._now is not None
         options = self._now.options
         facts = facts_of_checked(run_name(folder), checked, options, machine)
@@ -165,13 +174,13 @@ class Director:
         self._send(StateIs(RUNNING, ""))
 
     def take_next(self) -> Prepared | None:
-        """Return the run that follows the ended one; the next call returns it no more."""
+        """Return and forget the run that the page requested next; None if there is no such run."""
         with self._lock:
             taken, self._next = self._next, None
             return taken
 
     def do(self, asked: ControlAsked | ChangesAsked) -> None:
-        """Carry out a request of the page, whose server has already checked name and value."""
+        """Carry out a request of the page. The server has already checked name and value."""
         with self._lock:
             controls = self._controls
         if controls is None:
@@ -204,7 +213,7 @@ class Director:
 
 
 def choices_of(config: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
-    """Return the choices of each control for a new run, including its present value in `config`."""
+    """Return the choices of each control in OF_A_NEW_RUN, by name. `config`: present values, which are choices too."""
     found = {"runtime": installed(), "avatar": (*BUILT_IN, *_neighbours(str(config["avatar"])))}
     choices = {}
     for name in OF_A_NEW_RUN:
@@ -214,30 +223,29 @@ def choices_of(config: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
 
 
 def reasons_against(options: RunOptions) -> dict[str, str]:
-    """Return, for each control of a new run that `options` forbid, its name and the reason."""
+    """Return the reasons for which controls in OF_A_NEW_RUN are disabled in a run with `options`, by name."""
     if options.pace:
         return {"performance_profile": "the run is held to a chip's pace, which is capped already"}
     return {}
 
 
 def _neighbours(avatar: str) -> Iterator[str]:
-    """Yield the folders of avatars beside that of `avatar`, where it is a folder."""
+    """Yield the avatars' folders beside `avatar`, if `avatar` is a folder and not a built-in name."""
     folder = Path(avatar)
     if avatar not in BUILT_IN and folder.is_dir():
         yield from [str(manifest.parent) for manifest in sorted(folder.parent.glob(f"*/{MANIFEST}"))[:MOST_AVATARS]]
 
 
-#: Sides of the window where the file writes no video, so that it has no picture.
+#: Height and width of the window if the pipeline file has no block `encode`, and therefore no pictures.
 NO_PICTURE: Final = (2, 2)
 
 
 def run_file_live(
     options: RunOptions, hooks: OpenHooks, command: tuple[str, ...], port: int | None, tell: Callable[[str], None]
 ) -> RunOutcome:
-    """Run the pipeline file of `options` until an interrupt, or for its number of frames.
+    """Run the pipeline file of `options` for its number of frames, else until an interrupt; return the outcome.
 
-    The page can only hold the run, step it and kill units; all other settings are in the file. The parameters and
-    errors are those of `run_live`.
+    The page can only hold the run, step it and kill units. Other parameters and errors: as in `run_live`.
     """
     from trilane.apps.run.run_file import run_file
 
@@ -260,10 +268,10 @@ def run_file_live(
 
 
 class FileWatch:
-    """A `trilane.apps.run.run_file.Watch`: the page of the run.
+    """The page as the viewer (`trilane.apps.run.run_file.Watch`) of a pipeline file's run.
 
-    `link`: function that makes the link to the page's server. It takes the height and the width of pictures, and a
-    function that gets each request on a thread of its own.
+    `link`: function that makes the link to the page's server. It takes height and width of pictures in pixels, and a
+    function that gets each request of the page, on a thread of its own.
     """
 
     def __init__(self, link: Callable[[int, int, Callable[[ControlAsked | ChangesAsked], None]], ServerLink]) -> None:
@@ -284,12 +292,12 @@ class FileWatch:
         return link.window
 
     def ends(self, state: str, why: str) -> None:
-        """Tell the page that the run is over."""
+        """Tell the page that the run is over. `state`: ended or failed. `why`: reason of a failure, or ""."""
         if self._link is not None:
             self._link.send(StateIs(state, why))
 
     def do(self, asked: ControlAsked | ChangesAsked) -> None:
-        """Carry out a request of the page, whose server has already checked it. No request asks for changes."""
+        """Carry out a request of the page. The server has already checked it. Requests for a new run are ignored."""
         if isinstance(asked, ChangesAsked):
             return
         if asked.control in HOLDS:

@@ -1,8 +1,8 @@
-"""The process that shows a live run: its growing journal, its newest picture, its controls.
+"""The server process of a live run. It shows the growing journal, the newest picture and the controls.
 
-Rule: nothing here makes the run wait. This process follows the journal, pulls pictures through the window, passes
-requests to the run, and sends the run's answers to all pages. It yields the cores to other work, and ends with the
-run's process. It starts with three descriptors: the listening socket, its end of the channel and the window.
+Rule: nothing here makes the run wait. This process reads the journal, fetches pictures through the window, sends
+requests to the run, and sends the run's answers to all pages. It has a low priority and ends with the run's process. It
+inherits three file descriptors: the listening socket, its end of the channel, and the window.
 """
 
 from __future__ import annotations
@@ -57,23 +57,23 @@ from trilane.unexpected_value import UnexpectedValue
 
 NICE: Final = 10
 FIGURES_S: Final = 0.25
-PICTURE_S: Final = 0.05  # between two that are encoded
+PICTURE_S: Final = 0.05  # least time between two encoded pictures
 MOST_RAISED_DEG: Final = 90.0
 MOST_JOBS: Final = 4000
 MOST_IDLE: Final = 4000
 MOST_NOTES: Final = 100
 RECORDS_AT_ONCE: Final = 200
-READ_S: Final = 0.05  # of each look at the journal
+READ_S: Final = 0.05  # longest time for reading the journal at once
 ASKED_A_SECOND: Final = 10
 ACCEPTED: Final = ""
 RUNNING, STARTING, NO_FRAME_YET = "running", "starting", "the units start; no frame yet"
 NO_NEW_RUN: Final = "it needs no new run"
 GOES_ON: Final = "a run that goes on has no other time than now"
-MS: Final = 1e-6  # of a nanosecond
+MS: Final = 1e-6  # milliseconds in a nanosecond
 
 
 async def serve(listener: socket.socket, channel: ChannelEnd, window_fd: int) -> None:
-    """Show runs until the other end of `channel` is gone."""
+    """Serve until the run's process closes its end of `channel`. `window_fd`: file descriptor of the window."""
     opened = await _first(channel)
     window = LiveWindow(window_fd, opened.height, opened.width)
     os.close(window_fd)
@@ -83,8 +83,8 @@ async def serve(listener: socket.socket, channel: ChannelEnd, window_fd: int) ->
     run_is_over = asyncio.Event()
     asyncio.get_running_loop().add_reader(channel.fd, _hear, channel, view, run_is_over)
     leaving = asyncio.create_task(_leave(run_is_over, app, answers))
-    os.setpriority(os.PRIO_PROCESS, 0, NICE)  # what was imported until now had to be there at once
-    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # it takes no core from a unit by waking up
+    os.setpriority(os.PRIO_PROCESS, 0, NICE)  # not earlier, so that the imports are quick
+    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # so that waking up takes no core from a unit
     await answers.serve(sockets=[listener])
     leaving.cancel()
 
@@ -115,7 +115,7 @@ def _hear(channel: ChannelEnd, view: LiveView, run_is_over: asyncio.Event) -> No
 
 
 def main() -> None:
-    """Serve for `python -m trilane.apps.dashboard.live_server LISTENER CHANNEL WINDOW`."""
+    """Run `python -m trilane.apps.dashboard.live_server LISTENER CHANNEL WINDOW`, with three file descriptors."""
     listener_fd, channel_fd, window_fd = map(int, sys.argv[1:])
     channel = ChannelEnd(socket.socket(fileno=channel_fd))
     with socket.socket(fileno=listener_fd) as listener:
@@ -126,7 +126,10 @@ def main() -> None:
 
 
 class _Course:
-    """The known facts of one run since its journal began."""
+    """The timeline and figures of one live run. `begun`: first record of its journal.
+
+    `jobs`, `idle`, `notes`: the newest ones, for clients that join later.
+    """
 
     def __init__(self, begun: Begun) -> None:
         self.begun = begun
@@ -140,7 +143,7 @@ class _Course:
         self.meter.add(record)
 
     def fresh(self) -> Iterable[Message]:
-        """Return what came since the last call, and keep it for clients that join later."""
+        """Return messages with the jobs, idle slices and notes since the last call; also store these rows."""
         jobs, idle, said = self.timeline.take()
         notes = [note(t_ms, text) for t_ms, text in said]
         self.jobs.extend(jobs)
@@ -150,9 +153,10 @@ class _Course:
 
 
 class LiveView:
-    """The `RunView` of successive runs, which `hear` announces.
+    """The `RunView` of successive live runs, which messages to `hear` announce.
 
-    `window`: window into the runs. `ask`: function that hands a request to the run, and returns whether the run got it.
+    `window`: window that has the pictures and steers the camera. `ask`: function that sends a request to the run, and
+    returns whether it was sent.
     """
 
     def __init__(self, window: LiveWindow, ask: Callable[[ControlAsked | ChangesAsked], bool]) -> None:
@@ -173,7 +177,7 @@ class LiveView:
         self._asked_s: deque[float] = deque(maxlen=ASKED_A_SECOND)
 
     def hear(self, message: FromRun) -> None:
-        """Take a message from the process of the runs."""
+        """Process a message from the run's process."""
         if isinstance(message, RunBegins):
             self._facts = RunFacts.of_row(message.facts)
             self._controls = {control.name: control for control in map(control_of, message.controls)}
@@ -241,7 +245,7 @@ class LiveView:
         return self._new_run(asked.changes)
 
     def _new_run(self, changes: Mapping[str, str]) -> dict[str, str]:
-        """Ask for a run with the changes; returns the reasons against it, by control."""
+        """Request a run with `changes`, values by control. Return the reasons of refusals by control."""
         of_another_kind = {name: NO_NEW_RUN for name in changes if name not in OF_A_NEW_RUN}
         refused = of_another_kind | {name: why for name, word in changes.items() if (why := self._refusal(name, word))}
         if refused:
@@ -254,7 +258,7 @@ class LiveView:
         return control.refusal(value) if control else f"found {name!r}, expected one of {', '.join(self._controls)}"
 
     def _hand_over(self, asked: ControlAsked | ChangesAsked) -> str:
-        """Hand a request to the run; returns why that was not possible."""
+        """Send a request to the run. Return the reason if this was not possible, else ACCEPTED."""
         now_s = time.monotonic()
         if len(self._asked_s) == ASKED_A_SECOND and now_s - self._asked_s[0] < 1.0:
             return f"more than {ASKED_A_SECOND} things were asked for within a second"
@@ -273,9 +277,9 @@ class LiveView:
         return None if folder is None else folder / "trace.pftrace"
 
     async def _read_on(self) -> None:
-        """Read the new records of the run, as far as there is time for it."""
+        """Read new records of the run's journal, for at most about READ_S."""
         if self._followed is None and self._folder is not None:
-            with suppress(BadInputError):  # the run has not begun to write, or moves its folder this very moment
+            with suppress(BadInputError):  # the journal does not exist yet, or the run just renames its folder
                 self._followed = FollowedRun(_place_of(self._folder))
         if (followed := self._followed) is None:
             return
@@ -287,7 +291,7 @@ class LiveView:
             if self._is_behind:
                 return
             await asyncio.sleep(0)
-            if self._followed is not followed:  # `hear` was told of another run meanwhile
+            if self._followed is not followed:  # `hear` got the message about another run meanwhile
                 return
         self._unread = followed.new()
 
@@ -313,16 +317,19 @@ class LiveView:
 
     @property
     def _is_starting(self) -> bool:
-        """Whether the run goes on and has shown no frame yet."""
+        """Return whether the run goes on and has presented no frame yet."""
         return self._state == RUNNING and (self._course is None or not self._course.meter.has_frames)
 
     def _values(self, facts: RunFacts) -> dict[str, Any]:
-        """Return the value in force of each control that has one."""
+        """Return the present value of each control that has a value."""
         camera = self._steering
         return {**facts.config, "orbit": [camera.azimuth_deg, camera.elevation_deg], "zoom": camera.zoom}
 
     def _steer(self, name: str, value: Value) -> None:
-        """Move the camera: a drag to the right moves it left, so the picture follows the drag; a drag down lifts it."""
+        """Steer the camera by the control `name`.
+
+        The picture follows a drag: a drag to the right moves the camera to the left, and a drag down lifts it.
+        """
         azimuth, elevation, zoom = self._steering
         if isinstance(value, list):
             azimuth = (azimuth - value[0] + 180.0) % 360.0 - 180.0
@@ -334,12 +341,15 @@ class LiveView:
         self._is_news = True
 
     def _now_ns(self) -> int | None:
-        """Return the time of the figures: now, or None for the last record's if the run is over or not fully read."""
+        """Return the time for which to compute figures, ns: the present time.
+
+        None means the time of the last record. It is returned if the run is over, or if its journal is not fully read.
+        """
         return None if self._is_behind or self._state in ("ended", "failed") else time.monotonic_ns()
 
 
 def _place_of(folder: Path) -> Path:
-    """Return the folder of a run that writes into `folder`: the one with its own name once the run is complete."""
+    """Return the place of a run's files: `folder`, or the folder with the final name if the run is complete."""
     complete = folder.with_name(run_name(folder))
     return folder if folder.is_dir() or not complete.is_dir() else complete
 

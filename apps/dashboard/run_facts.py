@@ -1,4 +1,4 @@
-"""Facts about a run for the page, apart from the run's course, and the controls that the page has.
+"""Facts about a run for the page that do not change during the run, and the controls of the page.
 
 Rule: unknown facts are null, nothing is guessed, and the words are those of report.json. Only the row of a control
 states its valid values.
@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 ACTION, CHOICE, NUMBER, DRAG = "action", "choice", "number", "drag"
 LEAST_ZOOM, MOST_ZOOM = 0.25, 4.0
 MOST_DRAG_DEG: Final = 360.0
-#: Controls that the server itself answers, by the window.
+#: Controls that the server itself carries out, through the window.
 OF_THE_CAMERA: Final = ("orbit", "zoom", "recentre")
-#: Controls for which a run starts again.
+#: Controls whose change needs a new run.
 OF_A_NEW_RUN: Final = tuple(
     name for name, field in RunOptions.model_fields.items() if option_of(field).offered is not None
 )
@@ -33,12 +33,13 @@ Value = str | float | list[float] | None
 
 @dataclass(frozen=True)
 class RunFacts:
-    """Facts about a run for the page, apart from the run's course.
+    """Facts about a run for the page that do not change during the run.
 
-    `name`: name of the run folder. `clock`: host or virtual. `machine`: line for people.
-    `fps`, `output` (width, height): rate and size of the scene. `config`: value in force of each control.
-    `plan`, `placement`, `accuracy`: as in report.json, with `notes` beside the plan. `bound`: as in report.json, with
-    the efficiencies, for a finished run. `verdict`: verdict of a finished run, with its lines.
+    `name`: name of the run folder. `scene`: name of the scene. `clock`: host or virtual. `machine`: line for people.
+    `fps`: frames a second of the scene. `output`: (width, height) of pictures in pixels.
+    `config`: present value of each control. `plan`: as in report.json, with `notes`.
+    `placement`, `accuracy`: as in report.json. `bound`: the keys BOUND of report.json, for a finished run.
+    `verdict`: verdict of a finished run, with its lines.
     """
 
     name: str
@@ -56,12 +57,12 @@ class RunFacts:
 
     @classmethod
     def of_row(cls, row: Mapping[str, Any]) -> RunFacts:
-        """Return the facts whose fields `asdict` wrote into a message."""
+        """Return the facts from the mapping `row` that `asdict` made for a message."""
         width, height = row["output"]
         return cls(**{**row, "output": (width, height)})
 
     def hello(self) -> dict[str, Any]:
-        """Return the facts that are part of the hello."""
+        """Return the facts for the message `hello`."""
         return {
             "name": self.name,
             "scene": self.scene,
@@ -72,19 +73,18 @@ class RunFacts:
         }
 
     def state(self, state: str, why: str = "") -> dict[str, Any]:
-        """Return the message with the state of the run and its configuration."""
+        """Return the message `state`, with the state of the run, its reason `why`, and facts about the run."""
         facts = {"plan": self.plan, "placement": self.placement, "accuracy": self.accuracy, "bound": self.bound}
         facts["verdict"] = self.verdict
         return {"type": "state", "is": state, "why": why, "config": self.config, **facts}
 
 
 def config_in_force(config: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the present value of each control of a new run, as its choices spell it.
+    """Return the present value of each control in OF_A_NEW_RUN, spelt as in its choices.
 
-    `config`: block of report.json, which has a value for every option that nobody gave. `options`: given options, by
-    name.
+    `config`: block `config` of report.json. `options`: given options by name, for values that `config` lacks.
     """
-    if "pipeline" in config:  # the controls before a run are those of the avatar's scenes
+    if "pipeline" in config:  # a pipeline file has no controls that need a new run
         return {name: str(config[name]) for name in ("policy", "edge")}
     scene = config["scene"]
     chosen = {**config, "size": scene["size"], "avatar": scene["avatars"][0]["bundle"]}
@@ -93,20 +93,20 @@ def config_in_force(config: Mapping[str, Any], options: Mapping[str, Any]) -> di
 
 
 def _machine_line(machine: Mapping[str, Any]) -> str:
-    """Return processor and OpenGL driver in one line."""
+    """Return processor, cores and OpenGL driver in one line. `machine`: block `machine` of report.json."""
     cpu, driver = machine["cpu"], machine.get("gl")
     cores = f"{len(cpu['cores_allowed'])} of {cpu['cores']} cores"
     drawn = f", {driver['renderer']}" if driver else ""
     return f"{cpu['model']}, {cores}{drawn}"
 
 
-#: Of a report: how well a run used its cores, and what bounded it.
+#: Keys of a report for the bound of a run, and for its efficiencies.
 BOUND: Final = ("bottleneck", "bound", "efficiency", "core_efficiency", "machine_efficiency")
 
 
 def facts_of_checked(name: str, checked: Checked, options: RunOptions, machine: Mapping[str, Any]) -> RunFacts:
-    """Return the facts of a run that begins."""
-    # here and below: the process that shows a live run asks for neither, and starts sooner without
+    """Return the facts of a scene's run that begins. `name`: name of its folder. `machine`: as in report.json."""
+    # Imports stand in functions here and below: a live run's server needs neither module, and starts sooner without.
     from trilane.apps.run.report_facts import config_facts
 
     config = checked.config
@@ -127,7 +127,7 @@ def facts_of_checked(name: str, checked: Checked, options: RunOptions, machine: 
 
 
 def facts_of_file(name: str, config: Mapping[str, Any], machine: Mapping[str, Any]) -> RunFacts:
-    """Return the facts of a run of a pipeline file that begins. `config`, `machine`: as in report.json."""
+    """Return the facts of a pipeline file's run that begins. `config`, `machine`: blocks of report.json."""
     scene = config["scene"]
     output = _output(scene)
     return RunFacts(
@@ -145,7 +145,7 @@ def facts_of_file(name: str, config: Mapping[str, Any], machine: Mapping[str, An
 
 
 def facts_of_report(name: str, report: Report) -> RunFacts:
-    """Return the facts in the report of a finished run."""
+    """Return the facts of a finished run from its report. `name`: name of the run folder."""
     from trilane.apps.run.verdict_facts import verdict_of
 
     document = report.as_json()
@@ -168,13 +168,13 @@ def facts_of_report(name: str, report: Report) -> RunFacts:
 
 
 def _output(scene: Mapping[str, Any]) -> tuple[int, int]:
-    """Return width and height of the picture; a usual size where the run does not say it."""
+    """Return (width, height) of pictures in pixels; 640x480 if `scene`, a block of report.json, has no size."""
     output = scene.get("output") or {}
     return output.get("width", 640), output.get("height", 480)
 
 
 def facts_of_folder(folder: Path, begun: Begun) -> RunFacts:
-    """Return the facts of the run in `folder`, from its report or, without one, from the first record of its journal.
+    """Return the facts of the run in `folder`, from its report, or else from `begun`, the journal's first record.
 
     Raises BadInputError for a report that cannot be read.
     """
@@ -201,11 +201,11 @@ def facts_of_folder(folder: Path, begun: Begun) -> RunFacts:
 
 @dataclass(frozen=True)
 class Control:
-    """One control.
+    """A control of the page.
 
-    `kind`: action, choice, number or drag. `live`: whether the run goes on when somebody uses the control; otherwise
-    the run starts again. `choices`: values of a choice. `min`, `max`: range of a number, and of both numbers of a drag.
-    `why_not`: reason why nobody can use the control now, "" when somebody can.
+    `kind`: action, choice, number or drag. `live`: whether a use of the control changes the running run; otherwise it
+    starts a new run. `choices`: valid values of a choice. `min`, `max`: range of a number, or of both numbers of a
+    drag. `why_not`: reason for which the control is disabled, "" if it is enabled.
     """
 
     name: str
@@ -217,7 +217,7 @@ class Control:
     why_not: str = ""
 
     def refusal(self, value: Value) -> str:
-        """Return why the control cannot have `value`, "" when it can."""
+        """Return the reason for which the control cannot get `value`; "" if it can."""
         if self.why_not:
             return self.why_not
         if self.kind == ACTION:
@@ -236,21 +236,21 @@ class Control:
         return is_number and self.min <= number <= self.max
 
     def as_json(self, value: Any) -> dict[str, Any]:
-        """Return the control's row in the hello, with its present `value`."""
+        """Return the control's row in the message `hello`, with its present `value`."""
         return {**asdict(self), "value": value}
 
 
 def control_of(row: Mapping[str, Any]) -> Control:
-    """Return the control whose fields `asdict` wrote into a message."""
+    """Return the control from the mapping `row` that `asdict` made for a message."""
     return Control(**{**row, "choices": tuple(row["choices"])})
 
 
 def controls_of_run(
     units: Sequence[str], choices: Mapping[str, Sequence[str]], why_not: Mapping[str, str]
 ) -> tuple[Control, ...]:
-    """Return the controls of a run with these `units`.
+    """Return the controls of a scene's run with these `units`.
 
-    `choices`, `why_not`: choices and reasons by name, for the controls in OF_A_NEW_RUN.
+    `choices`, `why_not`: fields of `Control` by the control's name, for the controls in OF_A_NEW_RUN.
     """
     camera = (
         Control("orbit", DRAG, True, min=-MOST_DRAG_DEG, max=MOST_DRAG_DEG),
@@ -266,7 +266,7 @@ def controls_of_run(
 
 
 def controls_of_file(units: Sequence[str]) -> tuple[Control, ...]:
-    """Return the controls of a run of a pipeline file, which has no camera that could be steered."""
+    """Return the controls of a pipeline file's run, which has no camera to steer."""
     return (
         Control("play", ACTION, True),
         Control("pause", ACTION, True),

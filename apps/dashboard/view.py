@@ -1,13 +1,13 @@
-"""What a server shows of a live run (`live_server.py`) or a finished one (`finished_view.py`), and the messages.
+"""The interface of a server to a live run (`live_server.py`) or a finished run (`finished_view.py`), and its messages.
 
-Rule: a view answers at once or awaits; it never blocks the loop that all clients share. `TimelineRows` forgets rows
-after `take` returned them. It writes times as milliseconds since the run's first step. It writes units and stages as
-their numbers in the hello. The page and /metrics get the same figures.
+Rule: a view answers at once or awaits; it never blocks the loop that all clients share. Times are milliseconds since
+the run's first step. Units and stages are their numbers in the message `hello`. The page and /metrics get the same
+figures.
 
-A message is a kind, then a payload; every message of a page is checked. Kind 1 is JSON in UTF-8, both ways. Kind 2, to
-the page alone, is a picture: the frame's number (uint32), its time in the scene and its age (float64, ms), all
-little-endian, then a JPEG. No page delays the others: each has a queue of its own, and a task sends what is in the
-queue. The server drops and counts a page whose queue is full, or that takes nothing for SEND_S.
+A message is one byte, its kind, and a payload. Kind 1 is JSON in UTF-8, in both directions. Kind 2 is a picture for the
+page: number of the frame (uint32), its time in the scene and its age (float64, ms), all little-endian, and a JPEG.
+Every message of a page is checked. No page delays other pages: each has its own queue, which a task sends. The server
+drops and counts a page whose queue is full, or that receives nothing for SEND_S.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ class Socket(Protocol):
     """The server's end of a WebSocket."""
 
     async def send_bytes(self, data: bytes) -> None:
-        """Send `data`; return when the system has the bytes or will soon have them."""
+        """Send `data`. The call may return before the system has all bytes."""
 
     async def close(self, code: int = 1000, reason: str | None = None) -> None:
         """Close the connection with `code` and `reason`."""
 
 
 class Client:
-    """A page that looks at a run. `gone`: function that is called once when the page is dropped.
+    """A page that shows a run. `gone`: function that is called once, when the server drops the page.
 
-    `asks_picture`: whether the page waits for a picture. `had_frame`: number of the last frame that the page got.
-    `faults`: number of malformed messages.
+    `asks_picture`: whether the page waits for a picture. `had_frame`: number of the newest frame that the page got.
+    `faults`: number of its malformed messages.
     """
 
     def __init__(self, socket: Socket, gone: Callable[[], None]) -> None:
@@ -70,14 +70,14 @@ class Client:
         self.faults = 0
 
     def put(self, data: bytes) -> None:
-        """Queue `data` to be sent; a client that left too much unsent is dropped."""
+        """Queue `data` to be sent. If the queue is full, drop the client."""
         try:
             self._queue.put_nowait(data)
         except asyncio.QueueFull:
             self._drop()
 
     async def send_all(self) -> None:
-        """Send the queued messages until the client is dropped or has left."""
+        """Send the queued messages until the client is dropped or disconnects."""
         sender = asyncio.ensure_future(self._send())
         dropped = asyncio.ensure_future(self._dropped.wait())
         try:
@@ -119,7 +119,7 @@ class Clients:
 
     @contextlib.contextmanager
     def joined(self, client: Client) -> Iterator[None]:
-        """Send `client` the messages to all clients while the block runs."""
+        """Count `client` among the clients while the block runs."""
         self._live.add(client)
         try:
             yield
@@ -137,13 +137,13 @@ class Clients:
 
 
 class _PageMessage(BaseModel):
-    """A message of a page, of which every key is known and has its type."""
+    """A message of a page. Unknown keys and other types are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
 class PictureAsked(_PageMessage):
-    """The page wants the newest picture that it has not had."""
+    """The page requests the newest picture that it has not had."""
 
     type: Literal["picture"]
 
@@ -183,11 +183,11 @@ _MESSAGES: TypeAdapter[Heard] = TypeAdapter(Annotated[Heard, Field(discriminator
 
 
 class MalformedError(ValueError):
-    """The bytes are no message of a client."""
+    """A client sent bytes that are no message."""
 
 
 def heard(data: bytes) -> Heard:
-    """Read a client's message `data`. Raises MalformedError."""
+    """Return the client's message in the bytes `data`. Raises MalformedError."""
     if data[:1] != bytes([JSON_KIND]):
         raise MalformedError("a kind that no client sends")
     try:
@@ -197,63 +197,69 @@ def heard(data: bytes) -> Heard:
 
 
 def said(message: Mapping[str, Any]) -> bytes:
-    """Write `message` for the page. Raises ValueError for a NaN or an infinity."""
+    """Return `message` as bytes for the page, kind 1. Raises ValueError for a NaN or an infinity."""
     text = json.dumps(message, separators=(",", ":"), allow_nan=False)
     return bytes([JSON_KIND]) + text.encode()
 
 
 def shown(frame: int, media_ms: float, age_ms: float, jpeg: bytes) -> bytes:
-    """Write a picture for the page: number of the frame, its time in the scene and its age in ms, and a JPEG."""
+    """Return a picture as bytes for the page, kind 2. `frame`: number of its frame. `jpeg`: the picture.
+
+    `media_ms`: time of the frame in the scene. `age_ms`: time since its pose was sampled.
+    """
     return _PICTURE.pack(PICTURE_KIND, frame & 0xFFFFFFFF, media_ms, age_ms) + jpeg
 
 
 Message = Mapping[str, Any]
-MS = 1e-6  # of a nanosecond
-#: unit, stage, frame, begin_ms, end_ms, wait_ms
+MS = 1e-6  # milliseconds in a nanosecond
+#: A job: unit, stage, frame, begin_ms, end_ms, wait_ms.
 JobRow = tuple[int, int, int, float, float, float]
-#: unit, cause, begin_ms, end_ms
+#: An idle slice: unit, cause, begin_ms, end_ms.
 IdleRow = tuple[int, str, float, float]
-#: What a text in OpenMetrics ends with; the server's own counts come before it.
+#: End of a text in OpenMetrics. The server inserts its own counts before this mark.
 END: Final = "# EOF\n"
 JPEG_QUALITY = 82
 
 
 class RunView(Protocol):
-    """A run as a server shows it. Messages are those of docs/dashboard.md."""
+    """The interface of a server to one run, or to successive runs. docs/dashboard.md describes the messages."""
 
     def greeting(self) -> Iterable[Message]:
         """Return the first messages to a client: the hello, the state, and recent events."""
 
     async def news(self, *, is_watched: bool) -> Iterable[Message]:
-        """Return what happened since the last call, for all clients; nothing while there is no client."""
+        """Return messages to all clients about everything since the last call.
+
+        `is_watched`: whether there are clients. Without clients, the result is empty.
+        """
 
     async def picture(self, client: Client) -> bytes | None:
-        """Return the newest picture that `client` has not had, as `shown` writes it.
+        """Return the newest picture as `shown` makes it; None if `client` has had it, or there is none yet.
 
-        The view notes that the client has it.
+        Updates `client.had_frame`.
         """
 
     def control(self, asked: ControlSaid) -> str:
-        """Carry out a request, or begin to. Return the reason for a refusal, "" without a refusal."""
+        """Carry out a request for a control, or begin to. Return the reason for a refusal, or "" without a refusal."""
 
     def restart(self, asked: ChangesSaid) -> Mapping[str, str]:
-        """Begin a new run with the changes, or do nothing. Return the reason for each refusal, by control."""
+        """Request a new run with all changes. If one is refused, do nothing and return the reasons by control."""
 
     async def seek(self, client: Client, to: Seek) -> Iterable[Message]:
-        """Return the messages to `client` about another time of the run."""
+        """Return messages to `client` about the part `to` of a finished run."""
 
     def metrics(self) -> str:
-        """Return the run's figures in OpenMetrics, without the end mark; "" before there are any."""
+        """Return the run's figures in OpenMetrics, without the end mark; "" if there are none yet."""
 
     @property
     def trace(self) -> Path | None:
-        """Return the file of the run's trace, or of the part that is written so far."""
+        """Return the file of the run's trace, which may not exist yet; None if the run has no folder yet."""
 
 
 class TimelineRows:
-    """Collects jobs, idle slices and notes until the next `take`. `begun`: first record of the run.
+    """Collects jobs, idle slices and notes of a run, which `take` returns once.
 
-    `now_ms`: time of the last step.
+    `begun`: first record of the journal. `now_ms`: time of the last step, ms since the first step.
     """
 
     def __init__(self, begun: Begun) -> None:
@@ -268,7 +274,7 @@ class TimelineRows:
         self._notes: list[tuple[float, str]] = []
 
     def add(self, record: Record) -> None:
-        """Take the next record of the journal; its first record is `begun`."""
+        """Add the next record of the journal after `begun`."""
         if isinstance(record, Stepped):
             self.now_ms = self._ms(record.now_ns)
         elif isinstance(record, Worked):
@@ -280,11 +286,11 @@ class TimelineRows:
         self._add_idle(fact for fact in self._timeline.add(record) if isinstance(fact, IdleSlice))
 
     def end(self) -> None:
-        """Collect the slices that are still open after the last record."""
+        """Add the idle slices that are still open after the last record."""
         self._add_idle(self._timeline.end())
 
     def take(self) -> tuple[list[JobRow], list[IdleRow], list[tuple[float, str]]]:
-        """Return the rows that were collected since the last call."""
+        """Return the jobs, idle slices and notes since the last call. A note is a text after its time in ms."""
         taken = self._jobs, self._idle, self._notes
         self._jobs, self._idle, self._notes = [], [], []
         return taken
@@ -295,14 +301,14 @@ class TimelineRows:
             self._idle.append((unit, cause, self._ms(piece.begin_ns), self._ms(piece.end_ns)))
 
     def _ms(self, now_ns: int) -> float:
-        """Return the time since the first step, rounded to a microsecond; the first call sets that step."""
+        """Return the time since the first step in ms, rounded to a microsecond. The first call sets the first step."""
         if self._start_ns is None:
             self._start_ns = now_ns
         return round((now_ns - self._start_ns) * MS, 3)
 
 
 def described(graph: Graph) -> dict[str, Any]:
-    """Return the part of the hello that names the units and stages by their numbers."""
+    """Return the part of the message `hello` with the stages, units and edges. Their order defines their numbers."""
     return {
         "stages": [{"name": stage.name, "unit": stage.unit} for stage in graph.stages],
         "units": list(graph.units),
@@ -311,26 +317,26 @@ def described(graph: Graph) -> dict[str, Any]:
 
 
 def slices(jobs: Sequence[JobRow], idle: Sequence[IdleRow]) -> dict[str, Any]:
-    """Return the message that holds jobs and idle slices."""
+    """Return the message with `jobs` and `idle` slices."""
     return {"type": "slices", "jobs": jobs, "idle": idle}
 
 
 def note(t_ms: float, text: str) -> dict[str, Any]:
-    """Return the message that says `text` to a person."""
+    """Return the message with a note for a person. `t_ms`: time of the note, ms since the first step."""
     return {"type": "note", "t_ms": t_ms, "text": text}
 
 
 class RunMeter:
-    """Takes the records after `begun`, in order, and gives the figures of a moment.
+    """Computes the figures of a run at a moment, from the journal's records.
 
-    `finds_bound`: as in `LiveFigures`.
+    `begun`: first record of the journal. `finds_bound`: as in `LiveFigures`.
     """
 
     def __init__(self, begun: Begun, *, finds_bound: bool = True) -> None:
         self._figures = LiveFigures(begun, finds_bound=finds_bound)
 
     def add(self, record: Record) -> None:
-        """Take the next record."""
+        """Add the next record of the journal after `begun`."""
         self._figures.add(record)
 
     def message(self, now_ns: int | None = None) -> dict[str, Any]:
@@ -339,18 +345,18 @@ class RunMeter:
 
     @property
     def has_frames(self) -> bool:
-        """Whether a frame was presented."""
+        """Return whether a frame was presented."""
         return self._figures.has_frames
 
     def metrics(self, now_ns: int | None = None, state: RunState | None = None) -> str:
         """Return the figures in OpenMetrics, without the end mark. `state`: as in `LiveFigures.now`."""
-        from trilane.apps.watch.metrics import openmetrics  # which needs a package of the extra `dashboard`
+        from trilane.apps.watch.metrics import openmetrics  # this module needs a package of the extra `dashboard`
 
         return openmetrics(self._figures.now(now_ns, state)).decode().removesuffix(END)
 
 
 def jpeg_of(image: Any) -> bytes:
-    """Return a Pillow image as a JPEG."""
+    """Return the Pillow image `image` as the bytes of a JPEG."""
     target = io.BytesIO()
     image.save(target, "JPEG", quality=JPEG_QUALITY)
     return target.getvalue()

@@ -1,4 +1,4 @@
-"""Predictions as somebody asked for them: of networks, applications and pipelines, on a chip or on this machine.
+"""Predictions for networks, applications and pipelines, on a chip or on this machine: from options to answers.
 
-Rule: what was asked for is checked and this machine is measured here; `trilane.hw_profiles` computes the answers.
+Rule: this folder checks the options and measures this machine. `trilane.hw_profiles` computes the answers.
 """

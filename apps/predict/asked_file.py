@@ -1,6 +1,6 @@
-"""A pipeline file on a chip, as somebody asked for it: the file as it is, and a variant for each `--set`.
+"""Predictions for a pipeline file on a chip: for the file as it is, and for a variant with each `--set`.
 
-Rule: nothing is printed here and no Python of the file is imported. `trilane.hw_profiles` answers.
+Rule: nothing is printed here and no Python of the file is imported. `trilane.hw_profiles` computes the answers.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ APART: Final = "networks are priced alone: units that work at once share memory 
 
 
 def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str], None]) -> dict[str, Any]:
-    """Return the prediction of a pipeline file and its variants. Raises BadInputError.
+    """Return the document of `trilane predict FILE.toml --json`: predictions for `path` and its variants.
 
-    `say`: function that is told before something takes seconds.
+    `say`: function that gets a message before an action that takes seconds. Raises BadInputError.
     """
     chips = _Chips(options, say)
     measured, of_run = Measured({}, "", chips.name), None
@@ -75,7 +75,7 @@ def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str],
 
 
 def _clock(measured: Measured) -> list[str]:
-    """Say which part of a job counts as its measured time; nothing where none is measured."""
+    """Return a list with a note on the part of a job that counts as its time; empty if no times are measured."""
     return [FROM_HAND_OVER if measured.chip == HOST else WITH_A_CORE] if measured.times else []
 
 
@@ -84,15 +84,19 @@ def _without_share(file: PipelineFile) -> list[str]:
 
 
 def _without_base(lacking: Sequence[str]) -> list[str]:
-    """Say that the file as it is has no prediction beside its variants. `lacking`: stages without a time in it."""
+    """Return a list with a note that only variants are predicted; empty if the file as it is has all times.
+
+    `lacking`: stages without a time in the file.
+    """
     return [NO_BASE.format(", ".join(lacking))] if lacking else []
 
 
 class _Chips:
-    """The chip, loaded when the first network needs it, and as each network uses it.
+    """The chip of a prediction, with its units in the precision that each network needs.
 
-    `name`: its name; this machine's where a run was measured and no chip is asked for. `used`: None until it is loaded.
-    `assumed`: stages and precisions, in order, of the networks that say none.
+    `name`: name of the requested chip. Without a request, it is HOST if a run was measured, else the default chip.
+    `used`: profile of the chip; None until it is loaded, which happens if it is requested or a network needs it.
+    `assumed`: stage and assumed precision of each network whose file states no precision, as texts in order.
     """
 
     def __init__(self, options: PredictOptions, say: Callable[[str], None]) -> None:
@@ -104,7 +108,10 @@ class _Chips:
         self.name = self.used.name if self.used else HOST if options.measured else options.profile
 
     def chip_for(self, name: str, stage: OnnxStage, graph: GraphFile, unit: UnitName) -> Profile:
-        """Return the chip with `unit` as it computes the network of `stage`; this machine measures it first."""
+        """Return the chip whose `unit` has the precision and runtime of the network `graph` of `stage`.
+
+        `name`: name of the stage. If the chip is this machine, calls of the network are measured first.
+        """
         options, asked = self._options, stage.precision or self._options.numbers
         key = graph.path, tuple(sorted(stage.shapes.items())), unit, asked, stage.runtime
         if key not in self._known:
@@ -121,12 +128,12 @@ class _Chips:
 
 
 def _measured(folder: Path, chip: str) -> Measured:
-    """Return the times of the jobs of a run, for `chip`.
+    """Return the times of a run's jobs by stage, to predict a run on `chip`. `folder`: run folder. `chip`: its name.
 
-    On this machine a job takes its unit from the moment at which it is handed over: a unit whose core is busy, with the
-    scheduler's own work or another's, begins later. On a chip, other programs of this machine take no core of it, so
-    the parts of a job do not count in which its unit had none. With one thread these parts are exact
-    (docs/decisions/preempted-time.md).
+    On this machine, a job's time counts from the moment when the unit gets the job. A unit whose core is busy with
+    other work begins later, and this delay counts too. Other programs of this machine take no core of a chip.
+    Therefore, for a chip, the time in which the unit had no core is left out. This time is exact for a unit with one
+    thread (docs/decisions/preempted-time.md).
     """
     samples: dict[str, list[float]] = {}
     free_ns: dict[str, int] = {}
@@ -142,12 +149,12 @@ def _measured(folder: Path, chip: str) -> Measured:
 
 
 def _trust_in(folder: Path) -> Trust:
-    """Return whether the machine of a run was quiet; a run without a report was not judged."""
+    """Return the judgement of a run's machine. A run without a report gets the judgement of unknown figures."""
     return trust_of(read_report(folder).as_json() if (folder / "report.json").exists() else {})
 
 
 def _with_share(file: PipelineFile, measured: Measured) -> PipelineFile:
-    """Return the file with the share of frames that took the bypass in the run, if the file says nothing of them."""
+    """Return `file` with the measured share of frames that took the bypass, unless the file has a share or pattern."""
     if file.bypass is None or file.bypass[1].taken is not None:
         return file
     (begin, way), names = file.bypass, list(file.stages)

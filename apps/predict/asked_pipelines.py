@@ -1,7 +1,7 @@
-"""The pipelines that `trilane predict` puts on one chip, from the command line: scenes, networks and pipeline files.
+"""The pipelines that share a chip in `trilane predict --beside`: scenes, networks and pipeline files.
 
-Rule: as in `trilane plan`, a run's pose stage plans each frame of a scene; a network comes from its file. A pipeline
-file is read as for `trilane predict FILE.toml`, and no Python of it is imported.
+Rule: each frame of a scene is planned by the code of a run's pose stage, as in `trilane plan`. A pipeline file is read
+as for `trilane predict FILE.toml`, and no Python of it is imported.
 """
 
 from __future__ import annotations
@@ -33,13 +33,17 @@ from trilane.stages.run_options import RunOptions
 from trilane.units import INFER, UnitName
 
 NETWORK_ENDING = ".onnx"
-#: Frames of a scene that are planned, the first ones; they are taken again from the first on.
+#: Largest number of a scene's frames that are planned. A longer prediction repeats these frames.
 MOST_FRAMES = 600
 FORM = "SCENE, SCENE@RATE or NETWORK.onnx@RATE, with :gpu or :dsp behind the rate, or FILE.toml or FILE.toml@RATE"
 
 
 class AskedPipeline(NamedTuple):
-    """A pipeline as typed. `what`: scene or file. `fps`: None for its own rate. `unit`: of the network, if said."""
+    """A pipeline as typed on the command line.
+
+    `text`: the whole text. `what`: scene or file in it. `fps`: rate, None for the pipeline's own rate.
+    `unit`: unit of the network, None if not given.
+    """
 
     text: str
     what: str
@@ -48,14 +52,14 @@ class AskedPipeline(NamedTuple):
 
     @property
     def is_file(self) -> bool:
-        """Say whether it is a pipeline file."""
+        """Return whether `what` is a pipeline file."""
         return is_pipeline_file(Path(self.what))
 
 
 def asked(text: str) -> AskedPipeline:
-    """Read a pipeline from the command line. Raises BadInputError.
+    """Return the pipeline that `text` describes: SCENE, SCENE@RATE, or another of the forms in FORM.
 
-    An @ belongs to the file's name unless a rate follows it, so that a file may have one in its name.
+    An @ in the name of a file is allowed. Raises BadInputError.
     """
     what, at, rate = text.rpartition("@")
     if not at or text.endswith((ENDING, NETWORK_ENDING)):
@@ -95,10 +99,10 @@ def _unit(text: str, asked_for: str) -> UnitName:
 
 
 def tenants(texts: Sequence[str], variant: Variant = NEWEST, precision: str | None = None) -> list[Pipeline]:
-    """Return a pipeline for each text, in order. Raises BadInputError.
+    """Return a pipeline for each of `texts`, in order. Raises BadInputError.
 
-    `variant`: policy and edge of the avatars. `precision`: int8, fp16 or fp32 for all networks, except those of a
-    pipeline file that states one; None: as each says.
+    `variant`: policy and edge of scenes. `precision`: int8, fp16 or fp32 for all networks, except stages of a pipeline
+    file that have their own `precision`. None means the precision in each network's file.
     """
     if len(texts) > MOST_TENANTS:
         raise BadInputError("--beside", f"{len(texts)} pipelines", f"at most {MOST_TENANTS} with the first one")
@@ -108,7 +112,7 @@ def tenants(texts: Sequence[str], variant: Variant = NEWEST, precision: str | No
 
 
 def answer_of(chip: Profile, pipelines: Sequence[Pipeline], options: PredictOptions) -> dict[str, Any]:
-    """Return what `pipelines` do on one chip, each with its verdict. Raises BadInputError."""
+    """Return the document of a prediction for `pipelines` on one chip, with a verdict on each. Raises BadInputError."""
     answer = predict_beside(chip, pipelines, options.cap, options.minutes, options.governor, options.turns)
     rows = [row | {"verdict": predicted_verdict(answer | row).shown()} for row in answer["pipelines"]]
     return answer | {"pipelines": rows}
@@ -121,7 +125,7 @@ def _tenant(each: AskedPipeline, name: str, variant: Variant, precision: str | N
 
 
 def _names(stems: Sequence[str]) -> list[str]:
-    """Give each pipeline a name of its own: those of the same stem are numbered."""
+    """Return a unique name for each pipeline. `stems`: file names without suffix; equal stems get numbers."""
     return [
         stem if stems.count(stem) == 1 else f"{stem} ({stems[: place + 1].count(stem)})"
         for place, stem in enumerate(stems)
@@ -148,7 +152,10 @@ def _of_file(each: AskedPipeline, name: str, precision: str | None) -> FileTenan
 
 
 def avatar(each: AskedPipeline, name: str, variant: Variant = NEWEST, precision: str | None = None) -> Tenant:
-    """Return the pipeline of a scene, every frame planned. Raises BadInputError."""
+    """Return the pipeline of the scene `each`, after planning its frames. Raises BadInputError.
+
+    `name`: unique name of the pipeline. `variant`, `precision`: as in `tenants`.
+    """
     checked = configure(RunOptions(scene=each.what, skinning="gpu"), Path.cwd())
     scene, files = checked.config.scene, networks_of(checked.assets)
     plan = ScenePlan(checked.config, checked.assets)

@@ -1,7 +1,7 @@
-"""A prediction from options to an answer, for the command line and for programs alike.
+"""Predictions from options to an answer, for the command line and for programs alike.
 
 Rule: this module neither prints nor computes. `trilane.hw_profiles` computes the answers; for this machine it uses the
-measurements of `this_machine.py`. `say`: function that gets a message before something takes seconds.
+measurements of `this_machine.py`. In all functions, `say` gets a message before an action that takes seconds.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ AS_RUN: Final = "the avatar, policy and edge are those of `trilane run` without 
 def predict_networks(
     chip: Profile, options: PredictOptions, say: Callable[[str], None] = lambda _: None
 ) -> list[dict[str, Any]]:
-    """Predict each network of `options` by itself, on each of its units. Raises BadInputError.
+    """Return a prediction for each network of `options` by itself, on each unit of `options`. Raises BadInputError.
 
-    This machine first measures them on the unit that a run has for networks.
+    With the profile `host`, calls of each network on this machine's unit for networks are measured first.
     """
     from trilane.hw_profiles.graph_file import read_graph
     from trilane.hw_profiles.network_time import Computes, predict_network
@@ -56,9 +56,9 @@ def predict_networks(
 def application_of(
     chip: Profile, options: PredictOptions, say: Callable[[str], None] = lambda _: None
 ) -> tuple[Profile, Plan]:
-    """Return the chip in the network's precision, and the application with the network of a file, an avatar or options.
+    """Return the chip in the network's precision, and the avatar application with the network that `options` select.
 
-    This machine is measured with the network. Raises BadInputError.
+    With the profile `host`, this machine is measured with this network. Raises BadInputError.
     """
     from trilane.hw_profiles.application import Plan
 
@@ -97,12 +97,12 @@ def _network_of(chip: Profile, options: PredictOptions, say: Callable[[str], Non
 
 
 def _is_measured(chip: Profile, options: PredictOptions, unit: UnitName) -> bool:
-    """Say whether the chip is this machine and would run the network on `unit` as it was asked for."""
+    """Return whether the network is to be measured: the chip is this machine, and a run would use it the same way."""
     return chip.name == HOST and unit == INFER[1] and options.precision is None
 
 
 def answer_of(chip: Profile, plan: Plan, options: PredictOptions) -> dict[str, Any]:
-    """Return the prediction, with the alternatives to it when `options` ask for them."""
+    """Return the prediction of the application `plan` on `chip`; with `what_if` in `options`, also its alternatives."""
     from trilane.hw_profiles import predict as predictions
 
     cap, wanted = options.cap, options.wanted

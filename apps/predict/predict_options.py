@@ -1,7 +1,7 @@
 """The options of a prediction, each as one field, for `trilane predict` and `trilane.predict`.
 
-Rule: a field checks its own value, and `check_together` checks combinations. Words of a chip's model are imported only
-when they are checked, because the import takes long.
+Rule: a field checks its own value, and `check_together` checks combinations. Modules of the chip's model, which define
+the valid words, are imported only when a word is checked, because their import takes long.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ if TYPE_CHECKING:
 
 ENCODER_HELP: Final = "resnet18, mobilenetv2, mobilenetv3 or efficientnet-lite0."
 NORM_HELP: Final = "batch, instance or group."
-#: Begins the help of an option of `OF_A_FILE`.
+#: Beginning of the help text of each option in `OF_A_FILE`.
 PUBLISHED: Final = "For a published network: "
 FIXED_SIZE_HELP: Final = "Tensor size in pixels: one side, or HEIGHTxWIDTH."
-#: How people call precisions -> as a hardware profile does.
+#: Precision as given by the user -> precision in a hardware profile.
 PRECISIONS: Final = {"w8a8": "int8", "int8": "int8", "float": "fp16", "fp16": "fp16", "fp32": "fp32"}
-#: Options of a network that was published, in place of an avatar's.
+#: Options that select a published network in place of an avatar's network.
 OF_A_FILE: Final = {"encoder", "norm", "size", "channels"}
 OF_THE_APPLICATION: Final = {"layout", "policy", "edge", "batch", "gpu_share", "what_if", "plot", "trace"}
-#: Option: those that have no effect beside it.
+#: Option -> options that have no effect beside it.
 IGNORED: Final = {
     "avatar": OF_A_FILE | {"input_shape"},
     "network": OF_A_FILE | {"avatar"},
@@ -49,21 +49,25 @@ WHY_IGNORED: Final = {
     "network": "the file says so itself",
     "table": "each row says so itself",
 }
-#: Options that mean something beside a scene.
+#: Options that may stand beside a scene.
 OF_A_SCENE: Final = {"scene", "beside", "turns", "profile", "minutes", "policy", "edge", "performance_profile"} | {
     "governor",
     "trace",
     "precision",
 }
-#: In place of a unit: all of them, to compare them.
+#: Value of `unit` that stands for all units, to compare them.
 ALL_UNITS: Final = "all"
-#: Options that mean nothing without a pipeline file, and all that mean something beside one.
+#: Options that need a pipeline file.
 OF_A_PIPELINE_ALONE: Final = {"changes", "frames", "measured", "seed"}
+#: All options that may stand beside a pipeline file.
 OF_A_PIPELINE: Final = OF_A_PIPELINE_ALONE | {"scene", "profile", "performance_profile", "runtime", "precision"}
 
 
 def _either(read_words: Callable[[], tuple[str, ...]], expected: str = "") -> AfterValidator:
-    """Return a validator that calls `read_words` when a value comes. `expected`: the words as an error names them."""
+    """Return a validator that accepts the words of `read_words`, which is called only when a value is checked.
+
+    `expected`: description of the valid words for error messages; the words themselves if empty.
+    """
 
     def known(text: str | None) -> str | None:
         if text is not None and text not in (words := read_words()):
@@ -224,15 +228,16 @@ class PredictOptions(Options):
 
     @property
     def is_bare(self) -> bool:
-        """Say whether networks are predicted by themselves, without the application."""
+        """Return whether networks are predicted by themselves, without the application."""
         return bool(self.network) and not self.application
 
     @property
     def cap(self) -> str:
-        """Return the performance profile that was given, or the usual one.
+        """Return the given performance profile, or else the usual one.
 
-        `burst` is usual for a network by itself, because published latencies are measured with it, and on this
-        machine, where a run has no cap. All others have `sustained_high_performance`.
+        The usual profile is `burst` for a network by itself, because published latencies are measured with it. It is
+        also `burst` for a pipeline file, and on this machine, where a run has no cap. Otherwise it is
+        `sustained_high_performance`.
         """
         if "performance_profile" in self.model_fields_set:
             return self.performance_profile
@@ -240,7 +245,7 @@ class PredictOptions(Options):
 
     @property
     def pipeline(self) -> Path | None:
-        """Return the pipeline file that is asked for by itself; None for anything else, and beside other pipelines."""
+        """Return the pipeline file to predict by itself; None if there is none, or if `beside` has other pipelines."""
         from trilane.pipeline.pipeline_file import is_pipeline_file
 
         path = None if self.scene is None or self.beside else Path(self.scene)
@@ -248,29 +253,29 @@ class PredictOptions(Options):
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Return the shapes of inputs, by name."""
+        """Return the shapes that `input_shape` gives, by the input's name."""
         return dict(map(shape_of, self.input_shape))
 
     @property
     def numbers(self) -> str | None:
-        """Return the precision by a hardware profile's name."""
+        """Return `precision` as a hardware profile names it; None if it is not given."""
         return None if self.precision is None else PRECISIONS[self.precision]
 
     @property
     def engine(self) -> EngineRuntime | None:
-        """Return the runtime of a tensor engine."""
+        """Return the runtime of a tensor engine; None if it is not given."""
         from trilane.hw_profiles.schema import ENGINE_RUNTIMES
 
         return next((runtime for runtime in ENGINE_RUNTIMES if runtime == self.runtime), None)
 
     @property
     def units(self) -> tuple[UnitName, ...]:
-        """Return the units on which each network by itself is predicted. Raises as `network_unit`."""
+        """Return the units on which each network is predicted by itself. Raises BadInputError for an unknown unit."""
         return UNITS if self.unit == ALL_UNITS else (self.network_unit,)
 
     @property
     def network_unit(self) -> UnitName:
-        """Return the unit of the network. Raises BadInputError for any other word."""
+        """Return the unit of the network. Raises BadInputError if `unit` is not the name of one possible unit."""
         units: tuple[UnitName, ...] = ("cpu", "gpu", "dsp") if self.is_bare else ("gpu", "dsp")
         for unit in units:
             if unit == self.unit:
@@ -280,27 +285,27 @@ class PredictOptions(Options):
 
     @property
     def wanted(self) -> Wanted:
-        """Return the rate and the limit of power to judge."""
+        """Return the frame rate and the power limit that the prediction judges."""
         from trilane.hw_profiles.rates import Wanted
 
         return Wanted(self.fps, self.power_limit_w)
 
     @property
     def is_published(self) -> bool:
-        """Return whether the application has a network that was published, in place of an avatar's or a file's."""
+        """Return whether the application runs a published network, not the network of an avatar or a file."""
         return bool(self.model_fields_set & (OF_A_FILE | {"table"}))
 
     @property
     def is_as_run(self) -> bool:
-        """Return whether the prediction is of what `trilane run` runs without options."""
+        """Return whether network, policy and edge are those of `trilane run` without options."""
         return not (self.is_published or self.model_fields_set & {"avatar", "network", "policy", "edge", "batch"})
 
     @property
     def variant(self) -> Variant:
-        """Return how stages are joined.
+        """Return policy, edge and batch of the application.
 
-        Without a policy they are joined as in a run, or for a published network on a chip as in the published
-        application. Raises BadInputError for an edge that the published application does not have.
+        If no policy is given, it is `pipelined`, as in a run. For a published network on a chip, it is `reference`.
+        Raises BadInputError for an edge that the published application does not have.
         """
         from trilane.hw_profiles.application import REFERENCE, Variant
 
@@ -315,7 +320,7 @@ class PredictOptions(Options):
         return REFERENCE._replace(batch=self.batch)
 
     def check_together(self) -> None:
-        """Raise BadInputError for options that leave another one without effect, or that lack another."""
+        """Raise BadInputError if an option makes another one useless, or needs another one that is not given."""
         self._check_pipeline_file()
         if self.pipeline is None:
             self._check_others()

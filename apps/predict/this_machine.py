@@ -1,8 +1,7 @@
-"""The profile `host` with measurements of this machine: calls of a network, and the stages of an avatar's run.
+"""Adds measurements of this machine to the profile `host`: calls of a network, and stages of an avatar's run.
 
-Rule: a measurement is announced, takes at most half a minute, and is kept with the machine's facts, so that it happens
-once. If something cannot be measured, a message says so; the profile stays as it is, and its predictions have no
-interval.
+Rule: a measurement is announced and takes at most half a minute. It is cached under the machine's facts, so it happens
+once. If a measurement fails, a message says so. The profile then stays as it is, and its predictions have no interval.
 """
 
 from __future__ import annotations
@@ -31,27 +30,29 @@ from trilane.stages.run_options import RunOptions
 from trilane.units import BURST, NS_PER_MS
 
 MEASURING = "measuring {} on this machine: at most half a minute, once for this machine and these packages ..."
-#: A call that is expected to take longer is not tried: warm-up and counted calls would take more than was said.
+#: Longest expected call that is measured. With longer calls, warm-up and counted calls would exceed half a minute.
 LONGEST_CALL_MS = 4000.0
 DEFAULT = "default"
 Say = Callable[[str], None]
 
 
 def with_avatar(chip: Profile, avatar: str, say: Say) -> tuple[Profile, Network]:
-    """Return `chip`, this machine, with the times by which a run of `avatar` is placed, and its usual network.
+    """Return `chip` with measured times of a run of `avatar`, and the avatar's network at the run's usual tensor shape.
 
-    The network is that of the run's usual tensor. `say`: function that gets messages on what takes time and what cannot
-    be measured. Raises BadInputError for what is no avatar.
+    `chip`: profile `host`. `avatar`: name or folder.
+    `say`: function that gets a message before a measurement, and after one that failed.
+    Raises BadInputError if `avatar` is no avatar.
     """
     measured, network = _with_run(chip, RunOptions(avatar=avatar), say)
     return measured, network._replace(facts={"avatar": avatar})
 
 
 def _with_run(chip: Profile, request: RunOptions, say: Say) -> tuple[Profile, Network]:
-    """Return `chip`, this machine, with the times by which a run is placed, and the network of its usual tensor.
+    """Return `chip` with measured times of the run that `request` describes, and its network at the usual tensor shape.
 
-    The avatars of the run share the tensor; each has an equal part of the time of their poses. `say`: as in
-    `with_avatar`. Raises BadInputError for what cannot be run.
+    The times come from the rehearsal that also chooses the run's placement. The avatars of the run share one tensor,
+    and each gets an equal share of the time for poses. `chip`, `say`: as in `with_avatar`.
+    Raises BadInputError for options that no run can have.
     """
     checked = configure(request, Path.cwd())
     network = painting(networks_of(checked.assets), one_shape(checked.config), {"scene": request.scene})
@@ -68,7 +69,10 @@ def _with_run(chip: Profile, request: RunOptions, say: Say) -> tuple[Profile, Ne
 
 
 def with_first(chip: Profile, text: str, say: Say) -> Profile:
-    """Return `chip`, this machine, with measurements of the first of several pipelines, as it was typed."""
+    """Return `chip` with measurements of the pipeline `text`, as typed: a scene, a network file or a pipeline file.
+
+    A pipeline file is not measured here. `chip`, `say`: as in `with_avatar`. Raises BadInputError.
+    """
     first = asked(text)
     if first.what.endswith(NETWORK_ENDING):
         return with_file(chip, read_graph(Path(first.what)), {}, say)
@@ -78,7 +82,7 @@ def with_first(chip: Profile, text: str, say: Say) -> Profile:
 
 
 def with_file_in_application(chip: Profile, graph: GraphFile, shapes: Mapping[str, Sequence[int]], say: Say) -> Profile:
-    """Return `chip`, this machine, with the times of a run in which a file's network takes the default avatar's place.
+    """Return `chip` with measured times of the default avatar's run, in which the file's network replaces the avatar's.
 
     The parameters are those of `with_file`.
     """
@@ -100,11 +104,12 @@ def with_file(
     counts: Sequence[int] = (),
     runtime: str = "",
 ) -> Profile:
-    """Return `chip`, this machine, with the measured time of the network of a file.
+    """Return `chip` with the measured time of the network in `graph`.
 
-    `shapes`: shapes of inputs by name, in place of the file's own. `say`: as in `with_avatar`. `counts`: numbers of
-    threads; if empty, that of the unit for networks. `runtime`: runtime of the stage of a pipeline file that it is; if
-    empty, the fastest that it may have.
+    `shapes`: shapes of inputs by name, in place of the file's own. `chip`, `say`: as in `with_avatar`.
+    `counts`: numbers of threads to measure with; if empty, the number of the unit for networks.
+    `runtime`: runtime of the pipeline stage that has this network. If empty, the network is not a stage, and the
+    fastest installed runtime that fits it is used.
     """
     why = _why_not(chip, graph)
     if why:
@@ -123,7 +128,7 @@ def with_file(
 
 
 def _why_not(chip: Profile, graph: GraphFile) -> str:
-    """Say why a network is not even tried; empty when it is."""
+    """Return the reason for which a network is not measured; "" if it is measured."""
     if graph.numbers == "not said":
         return "the file has no weights"
     ms = price(chip, graph.work, NETWORK, corners_of(chip, BURST)).total_ms

@@ -1,7 +1,7 @@
 """A run from its options to its run folder, for the command line and for programs alike.
 
-Rule: nothing is printed here. The fork server starts first and imports the units' modules while this process goes on.
-So functions here import the modules of this process when they need them.
+Rule: nothing is printed here. To save time, the fork server starts first and imports the units' modules in parallel.
+Therefore, each function here imports its own modules only when it is called.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ def run_asked(
     hooks: Callable[[], AbstractContextManager[Hooks]],
     command: tuple[str, ...] = (),
 ) -> RunOutcome:
-    """Check the options, run what they ask for and leave its run folder.
+    """Check the options, run the scene or pipeline file, and leave its run folder.
 
-    `hooks`: context manager that gives the callbacks; it opens when the input is checked and the units start.
-    `command`: words by which the run was asked for. Raises BadInputError and MissingPartError for what cannot be run,
-    TrilaneError when no frame was presented.
+    `hooks`: function that returns a context manager, which yields the callbacks. It is entered after the checks.
+    `command`: words of the command line.
+    Raises BadInputError and MissingPartError before a run that cannot begin, TrilaneError if no frame was presented.
     """
     from trilane.pipeline.pipeline_file import is_pipeline_file
 
@@ -47,11 +47,11 @@ def run_asked(
 
 
 def _require_free(options: RunOptions) -> None:
-    """Raise BadInputError if `--out` is taken, before anything is read: the run's folder makes sure of it again."""
+    """Raise BadInputError early if the folder of `--out` exists. The run folder checks this again later."""
     from trilane.apps.run.run_folder import require_free
 
     if options.out is not None:
-        with suppress(OSError):  # the run's folder says what is wrong with the place
+        with suppress(OSError):  # the run folder raises a better error about the place
             require_free(options.out.absolute())
 
 
@@ -61,10 +61,10 @@ def prepare(
     command: tuple[str, ...] = (),
     hooks: Callable[[], AbstractContextManager[Hooks]] | None = None,
 ) -> Prepared:
-    """Check the options. Raises BadInputError and MissingPartError for what cannot be run.
+    """Check the options and return the prepared run. Raises BadInputError and MissingPartError if it cannot begin.
 
-    `command`: words by which the run was asked for. `hooks`: as in `run_asked`; they open to say why a refusal takes
-    time.
+    `gl`: function from `early_processes`. `command`: words of the command line.
+    `hooks`: as in `run_asked`; entered for a message if the check takes long.
     """
 
     def say(text: str) -> None:
@@ -94,7 +94,7 @@ def prepare(
 
 
 def _with_remade_avatar(options: RunOptions) -> tuple[RunOptions, tuple[str, ...]]:
-    """Return `options` with the folder of the avatar that they ask for, and a sentence on it.
+    """Return `options` with the variant of the avatar that they request, and a note about the variant.
 
     Raises BadInputError, MissingPartError.
     """
@@ -113,9 +113,10 @@ def _with_remade_avatar(options: RunOptions) -> tuple[RunOptions, tuple[str, ...
 
 
 def _require_check(checked: Checked) -> None:
-    """Find out before the run whether there is something to compare its frames with.
+    """Raise an error before the run if `--check` is not possible.
 
-    Raises BadInputError for a scene with a HUD, MissingPartError for a library that is missing.
+    Raises BadInputError for a scene with a HUD, because the pictures to compare with have none. Raises MissingPartError
+    if a library is missing.
     """
     from trilane.apps.run.run_job import require_parts
     from trilane.avatars.bundle import load_bundle
@@ -127,10 +128,10 @@ def _require_check(checked: Checked) -> None:
 
 @contextmanager
 def early_processes() -> Iterator[tuple[UnitStarter, GlFacts]]:
-    """Start the fork server, which imports what the units need while this process goes on, and look for OpenGL.
+    """Start the fork server and a process that examines the OpenGL driver, which may crash.
 
-    Yields the server and a function that waits for the facts of OpenGL. A process of its own looks at the driver,
-    because the driver may crash. Raises TrilaneError where no run can begin for lack of memory.
+    Yields the fork server, and a function that waits for the facts about OpenGL and returns them.
+    Raises TrilaneError if there is too little memory for a run.
     """
     require_memory()
     from trilane.pipeline.unit_starter import UnitStarter
@@ -148,10 +149,10 @@ def run_prepared(
     gl: GlFacts,
     watched: Watched | None = None,
 ) -> RunOutcome:
-    """Run what was checked and leave its run folder.
+    """Run a prepared scene and leave its run folder. Raises the errors of `run_asked`.
 
-    `hooks`: as in `run_asked`. `starter`, `gl`: fork server and facts that `early_processes` gives. `watched`: viewer
-    of the run, if any. Raises what `run_asked` raises.
+    `hooks`: as in `run_asked`. `starter`, `gl`: fork server and function from `early_processes`. `watched`: viewer of
+    the run, if any.
     """
     from trilane.apps.run.report_facts import made_facts
     from trilane.apps.run.run_folder import default_place

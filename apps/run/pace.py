@@ -1,7 +1,7 @@
-"""A run at the pace of a chip: how long each job is held, and how the run compares with the same run in virtual time.
+"""A run at the pace of a chip: how long each job takes, and how the run compares with the same run in virtual time.
 
-Rule: the chip's times come from its hardware profile, the order of jobs from the scheduler. A job that the host could
-not do in time is counted, never hidden.
+Rule: the chip's times come from its hardware profile, and the order of jobs comes from the scheduler. A job that takes
+this machine longer than the chip is counted in the report.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from trilane.transport.slots import DEFAULT_EDGE
 from trilane.units import BEFORE_INFER, BYPASS, SUSTAINED
 
 MAX_SLOW_MOTION = 1000.0
-#: A job that ends this much after its pace was done in time: waking up takes this long on a quiet machine.
+#: Delay at the end of a job that does not count as late: waking up takes this long on a quiet machine.
 SLACK_NS = 200_000
-#: Frames round one that came late whose times it may have changed: as many as are in flight, and one.
+#: Number of frames, counted from a late one on, whose times it may have changed: those in flight, and one more.
 WAKE_FRAMES = 8
 
 
@@ -38,8 +38,9 @@ WAKE_FRAMES = 8
 class Pace:
     """The pace of a chip.
 
-    `stage_ns`: time for which a job of each stage is held, ns. `slow_motion`: factor by which the run is slower than
-    the chip.
+    `profile`: hardware profile of the chip, by name. `performance_profile`: performance profile of the chip.
+    `slow_motion`: factor by which the run is slower than the chip.
+    `stage_ns`: time to which a job of each stage is stretched, ns.
     """
 
     profile: str
@@ -49,10 +50,10 @@ class Pace:
 
 
 def pace_of(config: RunConfig, profile: str, slow_motion: float = 1.0, performance_profile: str = SUSTAINED) -> Pace:
-    """Return the pace of `config` on a chip. Raises BadInputError.
+    """Return the pace of a chip for the run that `config` describes. Raises BadInputError.
 
-    The times are those of the largest tensor that the scene's size allows, with all of its avatars in view.
-    `profile`: hardware profile of the chip, by name or TOML file.
+    The times are for the largest tensor that the scene's size allows, with all avatars in view.
+    `profile`: hardware profile of the chip, by name or TOML file. `slow_motion`: factor on all times.
     """
     if not 0 < slow_motion <= MAX_SLOW_MOTION:
         raise BadInputError("--slow-motion", f"{slow_motion:g}", f"above 0, at most {MAX_SLOW_MOTION:g}")
@@ -68,21 +69,17 @@ def pace_of(config: RunConfig, profile: str, slow_motion: float = 1.0, performan
 
 
 def release_fps(pace: Pace, scene_fps: float) -> float:
-    """Return the frames released a second under a policy that needs a rate: the scene's, slowed down as the chip is."""
+    """Return the rate at which a paced policy releases frames: `scene_fps`, divided by the slow motion."""
     return scene_fps / pace.slow_motion
 
 
 def compare(
     pace: Pace, policy: str, frames: int, jobs: Sequence[JobRecord], *, edge: str = DEFAULT_EDGE, fps: float = 30.0
 ) -> dict[str, Any]:
-    """Compare a paced run with the same run in virtual time; returns the block `pace` of report.json.
+    """Compare a run at a chip's pace with the same run in virtual time, and return the block `pace` of report.json.
 
-    `pace`, `policy`, `frames`, `edge`: pace, policy, number of frames and edge of the run. `fps`: rate of its scene.
-    `jobs`: jobs that it did.
-    `host_slower` counts, by stage, the jobs that the host did not do in time; `late_frames` are the numbers of their
-    frames.
-    `virtual_ms` and `measured_ms` are median times between presented frames. The measured one leaves out frames with a
-    late one among the `WAKE_FRAMES` before them. `ratio` is measured over virtual, None when no frame is left.
+    `pace`, `policy`, `frames`, `edge`: pace, policy, number of frames and edge of the run. `jobs`: jobs of the run.
+    `fps`: rate of its scene. The keys of the result are the fields of `trilane.apps.run.report.PaceComparison`.
     """
     late = [job for job in jobs if job.end_ns - job.begin_ns > pace.stage_ns[job.stage] + SLACK_NS]
     late_frames = sorted({job.frame for job in late})
@@ -110,7 +107,7 @@ def _skipping(jobs: Sequence[JobRecord]) -> set[int]:
 
 
 def _virtual_ms(pace: Pace, settings: Settings, edge: str, skipping: Set[int]) -> float:
-    """Return the median time between presented frames in virtual time; the frames `skipping` take the bypass too."""
+    """Return the median time between presented frames in virtual time, ms. `skipping`: frames that take the bypass."""
     graph = replace(application_graph(edge), bypass=BYPASS)
     result = simulate(
         graph,
@@ -123,13 +120,13 @@ def _virtual_ms(pace: Pace, settings: Settings, edge: str, skipping: Set[int]) -
 
 
 def _presented(jobs: Sequence[JobRecord]) -> tuple[list[int], list[int]]:
-    """Return the numbers of the presented frames and when each was presented, ns."""
+    """Return two lists: the numbers of the presented frames, in order, and the times of their presentation, ns."""
     ends = sorted((job.end_ns, job.frame) for job in jobs if job.stage == "present")
     return [frame for _, frame in ends], [end for end, _ in ends]
 
 
 def _in_time(jobs: Sequence[JobRecord], late_frames: Sequence[int]) -> list[tuple[int, int]]:
-    """Return (number of a frame, ns since the frame before it) for frames with no late one near."""
+    """Return (number, ns since the previous presented frame) for each frame whose time no late frame has changed."""
     frames, ends = _presented(jobs)
     disturbed = {near for frame in late_frames for near in range(frame - 1, frame + WAKE_FRAMES)}
     pairs = zip(frames[1:], np.diff(ends).tolist(), strict=True)

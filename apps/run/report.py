@@ -1,7 +1,7 @@
-"""report.json as typed records: one model writes the file and reads it.
+"""report.json as typed records: the same classes write the file and read it.
 
-Rule: fields stand in the order of the file's keys. No speed is reported without the machine it was measured on and the
-image error of the avatar it was measured with.
+Rule: fields stand in the order of the file's keys. A report states the speed of a run together with its machine and the
+image error of its avatars.
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class Cpu(Record):
     """The processor.
 
     `model`: its name. `architecture`: such as x86_64.
-    `flags`: instruction sets that decide how fast networks run.
-    `cores`: number of cores of the machine. `cores_allowed`: numbers of the cores that the run might use.
+    `flags`: present instruction sets that matter for the speed of networks.
+    `cores`: number of cores of the machine. `cores_allowed`: numbers of the cores that the run could use.
     """
 
     model: str
@@ -45,7 +45,7 @@ class Cpu(Record):
 
 
 class GlDriver(Record):
-    """The OpenGL driver. `hardware`: false when the CPU draws; `limits`: OpenGL's constants by their names."""
+    """The OpenGL driver. `hardware`: false if the CPU draws. `limits`: values of OpenGL's limits, by constant."""
 
     vendor: str
     renderer: str
@@ -58,8 +58,8 @@ class MachineFacts(Record):
     """The machine that was measured.
 
     `system`: operating system and kernel.
-    `python`, `trilane`: versions; null for a Trilane that was never installed.
-    `hardware_counters`: what was counted during each job, or `absent` and why; null in reports of an older Trilane.
+    `python`, `trilane`: versions; `trilane` is null if Trilane is not installed as a package.
+    `hardware_counters`: hardware counters that were read for each job, or `absent` and why; null in older reports.
     `memory_bytes`: physical memory.
     `gl`: OpenGL driver, null when there is none.
     `packages`: version of each installed package that Trilane uses.
@@ -76,7 +76,7 @@ class MachineFacts(Record):
 
 
 class WorkPlan(Record):
-    """What the scene's size allows. `tensor_shapes`: (height, width) in pixels of the tensors that may be drawn."""
+    """Facts that follow from the scene's size. `tensor_shapes`: (height, width) of the possible tensors, in pixels."""
 
     tensor_shapes: tuple[Shape, ...]
 
@@ -86,13 +86,13 @@ class PaceComparison(Record):
 
     `profile`: hardware profile of the chip. `performance_profile`: performance profile of the chip.
     `slow_motion`: factor by which the run is slower than the chip.
-    `stage_ms`: time for which a job of each stage was held.
-    `host_slower`: by stage, number of jobs that took the host longer. `late_frames`: numbers of the frames of such
-    jobs.
+    `stage_ms`: time to which a job of each stage was stretched.
+    `host_slower`: number of jobs, by stage, that took longer than that on this machine.
+    `late_frames`: numbers of the frames that had such a job.
     `virtual_ms`: median frame time in virtual time.
-    `measured_ms`: median frame time here, over frames with no late one near; null when there is none.
-    `compared_share`: share of the frames that were compared.
-    `ratio`: measured over virtual; null when no frame was compared.
+    `measured_ms`: median frame time of the run, without the late frames and their neighbours; null if none is left.
+    `compared_share`: share of the frames that `measured_ms` counts.
+    `ratio`: `measured_ms` / `virtual_ms`; null if no frame was compared.
     """
 
     profile: str
@@ -108,18 +108,18 @@ class PaceComparison(Record):
 
 
 class Video(Record):
-    """The file video.mp4. `frames`: number of frames in it; `seconds`: end of the last one."""
+    """The file video.mp4. `frames`: number of its frames. `seconds`: time at which the last frame ends."""
 
     frames: int
     seconds: float
 
 
 class FrameErrors(Record):
-    """The error of frames of this run `against` other pictures, in the region that holds the avatars.
+    """The error of frames of this run, compared with other pictures in the region that contains the avatars.
 
-    `psnr_db`, `mae` (steps of 1/255), `ssim`, `flip`: means over the frames; `ssim` null where the picture is too
-    small.
-    `worst_psnr_db`: PSNR of the worst frame; `p1_psnr_db`: 1st percentile, null in reports of an older Trilane.
+    `against`: the other pictures, in words.
+    `psnr_db`, `mae` (steps of 1/255), `ssim`, `flip`: means over the frames; `ssim` is null if the region is too small.
+    `worst_psnr_db`: PSNR of the worst frame. `p1_psnr_db`: 1st percentile of the PSNR, null in older reports.
     `iou`: mean overlap of the pixels that differ from the background.
     """
 
@@ -134,10 +134,10 @@ class FrameErrors(Record):
 
 
 class Check(FrameErrors):
-    """The error of frames of this run against the truth where it is known, else against the float path.
+    """The error of frames of this run, compared with the truth if it is known, else with the float path.
 
-    `frames`: number of frames that were compared; `numbers`: their numbers. `float_path`: error against the float path;
-    null where the other figures say it already.
+    `frames`: number of compared frames. `numbers`: numbers of these frames.
+    `float_path`: comparison with the float path, if the other figures compare with the truth; else null.
     """
 
     frames: int
@@ -146,13 +146,13 @@ class Check(FrameErrors):
 
 
 class Made(Record):
-    """How a report came about.
+    """The command that made a report, and its Trilane.
 
     `at`: time at which the command began, UTC, ISO 8601.
-    `command`: command line, word by word.
-    `trilane`: version; null for a Trilane that was never installed.
-    `revision`: git's revision of the checkout that Trilane ran from, null without one.
-    `modified`: whether files of that checkout differed from it; null without one.
+    `command`: words of the command line.
+    `trilane`: version; null if Trilane is not installed as a package.
+    `revision`: revision of the git checkout that Trilane ran from; null outside of a checkout.
+    `modified`: whether tracked files of that checkout were modified; null outside of a checkout.
     """
 
     at: str
@@ -163,21 +163,24 @@ class Made(Record):
 
 
 class UnitPlace(Record):
-    """The `cores` of a unit, and its `threads`: one for each core, or one that the kernel runs on any of them."""
+    """The place of a unit. `cores`: numbers of its cores.
+
+    `threads`: number of its threads: one for each core, or a single thread that the kernel runs on any of the cores.
+    """
 
     cores: tuple[int, ...]
     threads: int
 
 
 class OtherPlacement(Record):
-    """A placement that was not chosen. `units`: place of each unit; `predicted_ms`: predicted frame time."""
+    """A placement that was not chosen. `units`: place of each unit. `predicted_ms`: predicted frame time."""
 
     units: dict[str, UnitPlace]
     predicted_ms: float
 
 
 class TriedPlacementFacts(Record):
-    """A placement that real frames went through. `units`: place of each unit; `frame_ms`: measured frame time."""
+    """A placement that was tried with real frames. `units`: place of each unit. `frame_ms`: measured frame time."""
 
     units: dict[str, UnitPlace]
     frame_ms: float
@@ -186,7 +189,7 @@ class TriedPlacementFacts(Record):
 class UnitTime(Record):
     """The measured time of a unit for one frame with `threads` threads, in ms.
 
-    `ms`: duration of its jobs, without the time in which it had no core.
+    `ms`: duration of the unit's jobs, without the time in which the unit had no core.
     `core_ms`: CPU time of each thread.
     """
 
@@ -197,16 +200,16 @@ class UnitTime(Record):
 
 
 class PlacementFacts(Record):
-    """Why the units have the cores that they have (`trilane.stages.placing`).
+    """The placement of the units, and how it was chosen (`trilane.stages.placing`).
 
-    `how`: tried, measured, asked or rule. `why`: the reason in words.
+    `how`: tried, measured, asked (by the user) or rule. `why`: reason in words.
     `units`: place of each unit.
-    `measured_at`: time of the measurement, UTC; absent, as all fields below, when nothing was measured.
+    `measured_at`: time of the measurement, UTC. This field and all fields below are absent if nothing was measured.
     `predicted_ms`: predicted frame time under the run's policy.
-    `rule_ms`, `rule`: predicted frame time and places by the rule for any run.
-    `alternatives`: next best placements, the shortest frame time first.
-    `times`: medians of distinct frames, one job at a time; a row for each unit and number of threads.
-    `tried`: placements that real frames went through before this run or an earlier one; absent when none was.
+    `rule`, `rule_ms`: placement by the general rule, and its predicted frame time.
+    `alternatives`: next best placements, the shortest predicted frame time first.
+    `times`: a row for each unit and number of threads; medians over distinct frames, with one job at a time.
+    `tried`: placements that were tried with real frames before this run or an earlier one; absent if none was.
     """
 
     how: Literal["tried", "measured", "asked", "rule"]
@@ -224,10 +227,10 @@ class PlacementFacts(Record):
 class TensorSize(Record):
     """One size of a planned tensor.
 
-    `work`: share of the pixels that the network was trained for.
-    `most_pixels`: most pixels for one avatar.
-    `frames`: number of presented frames of this size.
-    `psnr_loss_db`: loss of PSNR by the avatars' validation; null where an avatar has no figures by size.
+    `work`: number of pixels, as a share of those that the network was trained for.
+    `most_pixels`: largest number of pixels for one avatar.
+    `frames`: number of presented frames with this size.
+    `psnr_loss_db`: loss of PSNR in the avatars' validation; null if an avatar has no figures by size.
     """
 
     work: float
@@ -237,10 +240,10 @@ class TensorSize(Record):
 
 
 class Resolution(Record):
-    """How the tensor was stepped down so that frames were in time.
+    """The sizes of the planned tensor, which gets smaller if frames would be late.
 
     `sizes`: sizes of the tensor, the largest first.
-    `switches`: number of presented frames of another size than the frame before.
+    `switches`: number of presented frames whose size differs from the previous frame's.
     `loss_source`: source of the losses, or why there are none.
     """
 
@@ -250,8 +253,10 @@ class Resolution(Record):
 
 
 class VerdictBound(Record):
-    """What bounds the frame time. `unit`: the report's `bottleneck`. `stages`: the stage that bounds, then the unit's
-    others with a noticeable part of the critical path. `share`: the unit's share of that path.
+    """The bound of the frame time.
+
+    `unit`: the report's `bottleneck`. `share`: share of this unit in the critical path.
+    `stages`: the stage that bounds, followed by other stages of the unit with a noticeable share of the path.
     """
 
     unit: str
@@ -260,10 +265,10 @@ class VerdictBound(Record):
 
 
 class VerdictFacts(Record):
-    """Whether the run holds its rate (`trilane.apps.run.verdict`).
+    """The verdict of the run (`trilane.apps.run.verdict`).
 
-    `passed`: `pass` in the file. `target_fps`: rate that it has to hold, in frames a second.
-    `bound`: null without a path. `trusted`: whether its machine let it be measured. `why`: the reasons in one line.
+    `passed`: `pass` in the file. `target_fps`: rate that the run must hold, in frames a second.
+    `bound`: null without a critical path. `trusted`: whether the machine was quiet. `why`: reasons in one line.
     """
 
     passed: bool = Field(alias="pass")
@@ -277,12 +282,12 @@ OptionValue = str | int | float | bool | tuple[str, ...] | None
 
 
 class Preamble(Record):
-    """The keys that a report begins with.
+    """The first keys of a report.
 
     `schema_`: `schema` in the file, 1.
     `clock`: clock of all times.
-    `machine`: machine that the run was measured on.
-    `config`: the RunConfig as JSON without its folder, with `policy` and `edge`.
+    `machine`: machine on which the run was measured.
+    `config`: the RunConfig as JSON, without folders, with `policy` and `edge`.
     `plan`: sizes that follow from the scene; absent for a pipeline file.
     `caps`: limits on the work of the units.
     """
@@ -299,24 +304,24 @@ class Report(RunMetrics, Preamble):
     """The whole document: the keys of `Preamble`, the other keys of `RunMetrics`, and these.
 
     `verdict`: whether the run holds its rate, what bounds it, and whether it can be trusted; absent in older reports.
-    `made`: time, command line and Trilane of the run; null where a program ran it.
-    `options`: every option of the run by its name, as it was asked for; empty where another Trilane left them out.
+    `made`: time, command line and Trilane of the run; null if the caller gave no such facts.
+    `options`: value of every option of the run, by name; empty in older reports.
     `pids`: process of each unit at the end.
     `startup_ms`: time until each unit was ready.
-    `stage_metrics`: `figures` in the file: mean of each metric that a stage gave with its jobs.
-    `messages`: sentences to a person on what went wrong on the way.
+    `stage_metrics`: `figures` in the file: mean of each metric of a stage's jobs.
+    `messages`: sentences for a person about faults during the run.
     `interrupted`: whether a signal ended the run.
     `failure`: reason for an early end, else null.
-    `baseline`: metrics of a `sequential` run of the same scene, null without one.
-    `placement`: reason for the cores of the units; absent for a run by a program.
-    `resolution`: sizes of a planned tensor, where frames had to be in time; else absent.
-    `pace`: comparison with virtual time of a run at a chip's pace.
-    `accuracy`: by avatar, what `trilane.avatars.validation.accuracy_of` says: its figures, or why there are none.
-    `check`: error of frames of this run; absent where none was asked for.
-    `sources`: key, dotted where it is inside another, to the source of the figures below it; the longest key decides.
-    `notes`: format that each opened file was read as, and what was chosen for the run.
-    `video`: null when no frame was recorded.
-    `checksum`: SHA-256 over the presented pictures, null when none was recorded.
+    `baseline`: metrics of a `sequential` run of the same scene, null without such a run.
+    `placement`: cores of the units and the reason for them; absent if they were not placed for this run.
+    `resolution`: sizes of a planned tensor; absent if the run does not reduce the tensor to have frames in time.
+    `pace`: comparison with virtual time, for a run at a chip's pace; else absent.
+    `accuracy`: by avatar, the result of `trilane.avatars.validation.accuracy_of`: figures, or why there are none.
+    `check`: error of frames of this run; absent if no check was requested.
+    `sources`: source of figures, by their key or by a key that contains them (dotted path); the longest key applies.
+    `notes`: format of each file that was read, and choices that were made for the run.
+    `video`: null if no frame was recorded.
+    `checksum`: SHA-256 over the presented pictures, null if no frame was recorded.
     """
 
     caps: Caps
@@ -350,9 +355,9 @@ def write_report(report: Report, target: Path) -> None:
 
 
 def read_report(path: Path) -> Report:
-    """Read the report in `path`, a file or a run folder. Raises BadInputError naming the first key that is wrong.
+    """Return the report in `path`, a file or a run folder.
 
-    A report of a newer schema is refused as such.
+    Raises BadInputError that names the first wrong key, or says that a newer Trilane wrote the report.
     """
     file = path / "report.json" if path.is_dir() else path
     try:

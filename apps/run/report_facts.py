@@ -1,11 +1,9 @@
-"""Builds report.json from the result of a run of any pipeline, with the source of every figure, and how it was made.
+"""Builds report.json from the result of a run, with the source of every figure and the command that made it.
 
-Rule: the longest matching key of `SOURCES` gives the source of a figure, and every figure matches one.
+`report_of` is for a run of any pipeline. `avatar_report` adds the facts of a run of avatars, such as tensor sizes.
 
-What a report says of a run of avatars alone: its configuration, and the sizes of its tensors.
-
-Rule: the run counts the frames of each tensor size; the error of a size comes from the avatars' validation, or is
-unknown.
+Rule: the longest matching key of `SOURCES` gives the source of a figure, and every figure matches a key. The run counts
+the frames of each tensor size. The error of a size comes from the avatars' validation, or is unknown.
 """
 
 from __future__ import annotations
@@ -29,7 +27,7 @@ from trilane.units import COMPARED, COMPUTED, MEASURED
 CHECKOUT: Final = Path(__file__).resolve().parents[2]
 GIT_S: Final = 5.0
 NO_CAP = "none: every unit works as much as its cores and threads allow"
-#: Key, dotted where it is inside another, to the source of all figures below it.
+#: Key of the report, as a dotted path -> source of all figures below this key.
 SOURCES = {
     "frames": MEASURED,
     "duration_s": MEASURED,
@@ -69,7 +67,7 @@ SOURCES = {
     "video": MEASURED,
     "check": MEASURED,
 }
-#: Keys whose numbers are settings, names of things or facts of the machine.
+#: Keys whose numbers are no figures, but settings, identifiers or facts about the machine.
 NO_FIGURES_UNDER = ("schema", "machine", "config", "options", "plan", "pids")
 
 
@@ -81,13 +79,11 @@ def report_of(
     baseline: RunResult | None = None,
     facts: Mapping[str, Any],
 ) -> Report:
-    """Build the report of a run on the host clock. Raises ValueError naming a wrong or unknown key.
+    """Build the report of a run on the host clock. Raises ValueError that names a wrong or unknown key.
 
-    `result`: result of the run. `config`: block of that name.
-    `machine`: result of `machine_facts`.
-    `baseline`: result of the same pipeline under another policy, None without one.
-    `facts`: further facts about the run: `video`, `checksum`, and any of `made`, `options`, `notes`, and keys that a
-    `Report` may have besides.
+    `result`: result of the run. `config`: block `config` of the report. `machine`: result of `machine_facts`.
+    `baseline`: result of the `sequential` run of the same pipeline, if any.
+    `facts`: further keys of the report by name: `video` and `checksum`, and any of its optional keys.
     """
     metrics = result.report
     sensor = {"sensor": here.sensor_c()}
@@ -117,13 +113,13 @@ def _compared(metrics: RunMetrics) -> PolicyMetrics:
 
 
 def sources_of(document: Mapping[str, Any]) -> dict[str, str]:
-    """Return the source of each figure in `document`, the content of a report; `accuracy` has one for each avatar."""
+    """Return the sources of all figures in a report, by dotted key. `document`: content of the report."""
     sources = {key: source for key, source in SOURCES.items() if _holds(document, key.split("."))}
     return sources | _of_bytes(document["stages"]) | dict(_of_accuracy(document.get("accuracy", {})))
 
 
 def _of_bytes(stages: Mapping[str, Any]) -> dict[str, str]:
-    """Return the sources of `least` and `ratio`, which are computed, for the stages that count their bytes."""
+    """Return the sources of `least` and `ratio`, which are not measured, for each stage that counts its bytes."""
     counting = [f"stages.{name}.bytes" for name, row in stages.items() if row.get("bytes")]
     return {f"{key}.{figure}": SOURCES[f"bytes.{figure}"] for key in counting for figure in ("least", "ratio")}
 
@@ -134,7 +130,7 @@ def _of_accuracy(accuracy: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _holds(document: Any, path: list[str]) -> bool:
-    """Say whether `document` has something at `path`."""
+    """Return whether `document` has a value other than None at the keys `path`, each inside the previous one."""
     for key in path:
         if not isinstance(document, Mapping) or key not in document:
             return False
@@ -143,9 +139,9 @@ def _holds(document: Any, path: list[str]) -> bool:
 
 
 def made_facts(command: Sequence[str], checkout: Path = CHECKOUT) -> dict[str, Any]:
-    """Return the keys of `trilane.apps.run.report.Made` as of now; what is not known is null, and nothing is an error.
+    """Return the fields of `trilane.apps.run.report.Made` at this moment. Unknown values are None.
 
-    `command`: command line, word by word. `checkout`: folder above Trilane's own, a checkout of git or not.
+    `command`: words of the command line. `checkout`: folder that contains Trilane; it may be a git checkout.
     """
     from trilane.stages.machine_facts import package_version
 
@@ -160,7 +156,7 @@ def made_facts(command: Sequence[str], checkout: Path = CHECKOUT) -> dict[str, A
 
 
 def _revision(checkout: Path) -> tuple[str | None, bool | None]:
-    """Return git's revision and whether files that git follows were changed; None for a folder that is no checkout."""
+    """Return the git revision of `checkout`, and whether tracked files were modified; None for what is unknown."""
     git = here.program("git")
     if git is None or not (checkout / ".git").exists():
         return None, None
@@ -170,7 +166,7 @@ def _revision(checkout: Path) -> tuple[str | None, bool | None]:
 
 
 def _git(git: str, checkout: Path, *words: str) -> str | None:
-    """Return what git answers, or None when it cannot."""
+    """Return the output of a git command in `checkout`; None if it fails. `git`: path of the program."""
     command = [git, "--no-optional-locks", "-C", str(checkout), *words]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=GIT_S)
@@ -187,7 +183,7 @@ def avatar_report(
     baseline: RunResult | None,
     facts: Mapping[str, Any],
 ) -> Report:
-    """Build the report of a run of avatars. `config`: its configuration. The rest is as in `report_of`.
+    """Build the report of a run of avatars. `config`: configuration of the run. Other parameters: as in `report_of`.
 
     `facts` may also have `placement`, `resolution`, `pace`, `accuracy` and `check`.
     """
@@ -197,7 +193,7 @@ def avatar_report(
 
 
 def config_facts(config: RunConfig, policy: str, edge: str) -> dict[str, Any]:
-    """Return the block `config` of the report."""
+    """Return the block `config` of the report of a run of avatars."""
     return {**config.model_dump(mode="json", exclude={"out_dir", "window", "kept"}), "policy": policy, "edge": edge}
 
 
@@ -206,8 +202,8 @@ def resolution_of(
 ) -> dict[str, Any]:
     """Return the block `resolution` of the report.
 
-    `rungs`: number of presented frames of each size. `switches`: number of frames of another size than the frame
-    before. `losses`: losses of the scene's avatars by size.
+    `rungs`: number of presented frames by rung; each rung has one tensor size. `switches`: number of frames whose rung
+    differs from the previous frame's. `losses`: loss of PSNR by size, for each avatar of the scene.
     """
     sizes = [
         {
@@ -226,14 +222,17 @@ def resolution_of(
 
 
 def worst_loss(work: int, losses: Sequence[SizeLoss]) -> float | None:
-    """Return the largest loss of an avatar, in dB; None when one of them is not known."""
+    """Return the largest loss of PSNR among avatars, in dB; None if a loss is unknown.
+
+    `work`: number of pixels, as `ALL_WORK` times the share of those that the network was trained for.
+    """
     found = [loss.at(work) for loss in losses]
     known = [db for db in found if db is not None]
     return max(known) if known and len(known) == len(found) else None
 
 
 def resolution_note(resolution: Resolution) -> str:
-    """Say to a person how many frames had smaller tensors; empty when every frame had all its pixels."""
+    """Return a message on the number of frames with smaller tensors; "" if there were none."""
     less = [size for size in resolution.sizes[1:] if size.frames]
     if not less:
         return ""

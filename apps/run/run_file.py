@@ -1,10 +1,10 @@
-"""A run of a pipeline file as somebody asked for it, from options to a run folder.
+"""A run of a pipeline file, from its options to its run folder.
 
-Rule: nothing is printed here. The modules of the file's own code are named before any of them is imported.
+`pipeline_of` turns the file into a pipeline for this machine: factories, slots, and the units' cores. `run_file` runs
+the pipeline.
 
-The pipeline that a pipeline file describes, ready for a run on this machine: factories, slots, and units' cores.
-
-Rule: the types of all ports are known before a slot is made, and nothing of the file is imported here.
+Rule: nothing is printed here. The types of all ports are known before a slot is made. Only the units' processes import
+the user's code, after a message has named its modules.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ from trilane.transport.slots import edge_rule
 
 BLOCKS: Final = "trilane.stages.blocks"
 ENCODE: Final = f"{BLOCKS}.video:build_encode"
-#: Module and factory of each block.
+#: Block -> module in BLOCKS, and factory in it.
 FACTORIES: Final = {
     "busy": "own_code:build_load",
     "discard": "own_code:build_load",
@@ -67,19 +67,19 @@ FACTORIES: Final = {
     "prepare": "pictures:build_prepare",
     "video": "video:build_video",
 }
-SEGMENTS: Final = "segments"  # of the first video, as `trilane.apps.run.run_files` reads them
-TOKEN: Final = {"": PortType("u8", (1,))}  # what a made-up load writes
+SEGMENTS: Final = "segments"  # folder of the first video's segments, where `trilane.apps.run.run_files` expects it
+TOKEN: Final = {"": PortType("u8", (1,))}  # port of a block `busy`, which writes one byte
 
 
 def pipeline_of(file: PipelineFile, run_folder: Path) -> Pipeline:
-    """Return the pipeline of a checked file; its units' cores are dealt out by `cores_of`.
+    """Return the pipeline that `file` describes, with the cores from `cores_of`.
 
-    `run_folder`: folder in which the run leaves its files. Raises BadInputError naming the key, MissingPartError for a
-    runtime that is not installed.
+    `run_folder`: folder for the files of the run.
+    Raises BadInputError that names the wrong key, MissingPartError if a runtime is not installed.
     """
     networks = read_networks(file)
     types = _all_types(file, networks)
-    rules = edge_rules(file, None)
+    rules = edge_rules(file)
     stages = tuple(_stage(file, name, types, networks, run_folder) for name in file.stages)
     if file.bypass is not None:
         stages = _bypassed(file, stages, types, rules)
@@ -97,20 +97,20 @@ def pipeline_of(file: PipelineFile, run_folder: Path) -> Pipeline:
 
 
 def preload_of(file: PipelineFile) -> tuple[str, ...]:
-    """Return the modules that the stages of a file come from, none of them the file's own."""
+    """Return the modules of Trilane that the fork server imports for the stages of a file."""
     made = [_factory(stage) for stage in file.stages.values() if not isinstance(stage, TimedStage)]
     return tuple(dict.fromkeys(factory.partition(":")[0] for factory in made))
 
 
 def imports_of(file: PipelineFile) -> list[str]:
-    """Return the modules that a run of the file imports for its own code."""
+    """Return the modules of the user's own code that a run of the file imports, sorted."""
     return sorted({each.python.partition(":")[0] for each in file.stages.values() if isinstance(each, PythonStage)})
 
 
 def frames_of(file: PipelineFile) -> int:
-    """Return the number of frames of a run: that of the file, else that of its shortest video, else DEFAULT_FRAMES.
+    """Return the number of frames of a run: as the file states it, else of its shortest video, else DEFAULT_FRAMES.
 
-    Raises BadInputError for a video that cannot be read.
+    The frames of a video are counted at the run's rate. Raises BadInputError for a video that cannot be read.
     """
     if file.run.frames is not None:
         return file.run.frames
@@ -124,7 +124,7 @@ def frames_of(file: PipelineFile) -> int:
 
 
 def _footage_of(file: PipelineFile, stage: VideoBlock) -> Footage:
-    """Return what the video of a stage holds. Raises BadInputError naming the stage's key."""
+    """Return facts about the video that `stage` reads. Raises BadInputError that names the stage's key `path`."""
     try:
         return footage(file.folder / stage.path)
     except BadInputError as error:
@@ -134,7 +134,7 @@ def _footage_of(file: PipelineFile, stage: VideoBlock) -> Footage:
 
 
 def picture_fps(file: PipelineFile) -> float:
-    """Return the rate of what the file's videos show: that of the run, else of its first video, else DEFAULT_FPS."""
+    """Return the rate of written videos in frames a second: of the run, else of its first video, else DEFAULT_FPS."""
     if file.run.fps is not None:
         return file.run.fps
     videos = [stage for stage in file.stages.values() if isinstance(stage, VideoBlock) and not stage.is_camera]
@@ -143,7 +143,7 @@ def picture_fps(file: PipelineFile) -> float:
 
 
 def picture_size(pipeline: Pipeline) -> dict[str, dict[str, int]]:
-    """Return `output`, the size of the pictures that the first stage that encodes reads; empty without such a stage."""
+    """Return `output`, the size of the pictures that the first block `encode` reads; empty without such a block."""
     for stage in pipeline.stages:
         if stage.factory == ENCODE:
             read = stage.settings["reads"][0]
@@ -153,7 +153,7 @@ def picture_size(pipeline: Pipeline) -> dict[str, dict[str, int]]:
 
 
 def with_window(pipeline: Pipeline, window: Path) -> Pipeline:
-    """Return the pipeline whose first stage that encodes shows its newest picture in `window`."""
+    """Return the pipeline with a change: its first block `encode` shows the newest picture in the file `window`."""
     name = next((stage.name for stage in pipeline.stages if stage.factory == ENCODE), "")
     stages = tuple(
         stage
@@ -167,16 +167,17 @@ def with_window(pipeline: Pipeline, window: Path) -> Pipeline:
 
 
 def segments_of(file: PipelineFile) -> dict[str, str]:
-    """Return the folder of segments of each stage that encodes, by the stage's name."""
+    """Return the name of the folder of segments for each block `encode`, by the stage's name."""
     names = [name for name, stage in file.stages.items() if isinstance(stage, EncodeBlock)]
     return {name: f"{SEGMENTS}.{name}" if place else SEGMENTS for place, name in enumerate(names)}
 
 
 def cores_of(file: PipelineFile, cores: Sequence[int]) -> dict[str, UnitSettings]:
-    """Return cores and threads of each unit: those of the file, else a share of `cores`.
+    """Return cores and threads of each unit, as the file states them or else as a share of `cores`.
 
-    Cores are dealt out to the units in turn, in the order of the stages. Cores that are left over go to the units with
-    networks, in turn. Nothing is measured for it.
+    `cores`: numbers of the cores that this process may use. The units get one core each, in the order of the stages.
+    Remaining cores go to the units with networks, in turn. If there are too few cores, units share them.
+    Raises BadInputError for a core in the file that is not in `cores`.
     """
     open_units = [unit for unit, keys in file.units.items() if keys.cores is None]
     shares: dict[str, list[int]] = {unit: [cores[place % len(cores)]] for place, unit in enumerate(open_units)}
@@ -199,7 +200,7 @@ def cores_of(file: PipelineFile, cores: Sequence[int]) -> dict[str, UnitSettings
 
 
 def _all_types(file: PipelineFile, networks: Mapping[str, GraphFile]) -> PortTypes:
-    """Return the types of all ports that are written. Raises BadInputError where one is read and not known."""
+    """Return the types of all ports. Raises BadInputError for a stage that no run can do, or a port of unknown type."""
     types = port_types(file, networks)
     for name, stage in file.stages.items():
         if isinstance(stage, VideoBlock) and stage.is_camera:
@@ -244,7 +245,10 @@ def _stage(
 def _bypassed(
     file: PipelineFile, stages: Sequence[PipelineStage], types: PortTypes, rules: Mapping[str, str]
 ) -> tuple[PipelineStage, ...]:
-    """Return the stages as a chain, whose stage at the bypass's end knows what the stage at its begin writes."""
+    """Return `stages` as a chain with the bypass. The stage at its end gets the ports of the stage where it begins.
+
+    `types`: types of all ports. `rules`: rule of each edge, by the stage that writes to it.
+    """
     assert file.bypass is not None
     begin, way = file.bypass
     found = []
@@ -260,14 +264,17 @@ def _bypassed(
 
 
 def _factory(stage: StageKeys) -> str:
-    """Return the module and the function that make a stage."""
+    """Return the factory of a stage, as `module:function`."""
     if isinstance(stage, BlockStage):
         return f"{BLOCKS}.{FACTORIES[stage.block]}"
     return f"{BLOCKS}.{'network' if isinstance(stage, OnnxStage) else 'own_code'}:build"
 
 
 def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str, GraphFile]) -> dict[str, Any]:
-    """Return the keys of a stage's own kind, and what follows from the rest of the file."""
+    """Return the settings of a stage: the keys of its kind, and facts from other tables of the file.
+
+    `networks`: networks by stage. Raises BadInputError, MissingPartError.
+    """
     common = set(StageKeys.model_fields)
     keys: dict[str, Any] = {
         key: value for key, value in stage.model_dump(mode="json").items() if key not in common and value is not None
@@ -291,7 +298,7 @@ def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str
 
 
 def _port(file: PipelineFile, name: str, each: StageInput, types: PortTypes) -> str:
-    """Return the port of a stream that an input reads. Raises BadInputError where it must be named and is not."""
+    """Return the port that input `each` of stage `name` reads. Raises BadInputError if this is not clear."""
     ports = types[each.stage]
     if each.from_port or len(ports) == 1:
         chosen = each.from_port or next(iter(ports))
@@ -307,23 +314,25 @@ def _texts(ports: Mapping[str, PortType]) -> dict[str, str]:
 
 
 AUTO: Final = "auto"
-#: Options of a run that stand for keys of [run] of a pipeline file, and all that it takes beside the file itself.
+#: Options that replace the key of the same name in [run] of the file.
 OF_THE_RUN: Final = ("frames", "fps", "policy", "edge")
+#: All options that may stand beside a pipeline file.
 TAKEN: Final = (*OF_THE_RUN, "runtime", "changes", "out")
 
 
 class Watch(Protocol):
-    """Somebody who watches a run and steers it, until it is told to end if the options say no number of frames.
+    """A viewer that shows a run and steers it. Without a number of frames, the run lasts until the viewer ends it.
 
-    `controls`: requests to the run.
+    `controls`: requests of the viewer to the run.
     """
 
     controls: RunControls
 
     def begins(self, folder: Path, pipeline: Pipeline, facts: Mapping[str, Any]) -> Path:
-        """Hear that a run begins, before its units start, and return the window for its pictures.
+        """Take note of a run that begins, and return the file of the window for its pictures.
 
-        `folder`: folder that the run's journal will be in. `facts`: `config` and `machine` of the report.
+        The call comes before the units start. `folder`: folder that will contain the journal. `pipeline`: pipeline of
+        the run. `facts`: `config` and `machine` as in the report.
         """
 
 
@@ -333,9 +342,9 @@ def run_file(
     command: tuple[str, ...] = (),
     watch: Watch | None = None,
 ) -> RunOutcome:
-    """Check the options and the pipeline file, run it and leave its run folder.
+    """Check the options and the pipeline file, run the pipeline, and leave its run folder.
 
-    `hooks`, `command`, and the errors raised: as in `trilane.apps.run.asked_run.run_asked`. `watch`: who watches.
+    `hooks`, `command`, and the errors raised: as in `trilane.apps.run.asked_run.run_asked`. `watch`: viewer, if any.
     """
     file = asked_file(options)
     require_memory()
@@ -350,7 +359,7 @@ def run_file(
 
 
 def asked_file(options: RunOptions) -> PipelineFile:
-    """Return the checked file with what the options change. Raises BadInputError, also for an option of a scene."""
+    """Return the pipeline file, changed by `options`. Raises BadInputError, also for an option that is for scenes."""
     for name in sorted(options.model_fields_set - {"scene", *TAKEN}):
         known = ", ".join(RunOptions.spelling(each) for each in TAKEN)
         found = f"{RunOptions.spelling(name)} with a pipeline file"
@@ -364,7 +373,10 @@ def asked_file(options: RunOptions) -> PipelineFile:
 
 
 class _Asked:
-    """A run that was asked for, and what its report says of it."""
+    """A checked run of a pipeline file, with the settings of its scheduler and facts for its report.
+
+    `settings`: settings of the scheduler. `config`, `machine`, `made`: blocks of report.json.
+    """
 
     def __init__(
         self,
@@ -427,7 +439,11 @@ def _run(asked: _Asked, folder: RunFolder, told: Hooks, starter: UnitStarter) ->
 
 
 def _written(file: PipelineFile, work: Path, fps: float, result: RunResult) -> tuple[dict[str, Any], RunResult]:
-    """Write the files of the folder and the file's own videos; return what the report says of them, and the result."""
+    """Write the files of the run folder `work`, and the videos at the paths that the pipeline file names.
+
+    Returns facts for the report, and `result`, which is a failure if a file could not be written.
+    `fps`: rate of the videos. Raises BadInputError.
+    """
     segments = segments_of(file)
     videos = {name: work / (VIDEO if place == 0 else f"{name}.mp4") for place, name in enumerate(segments)}
     encoded = {name: min(result.report.stages[name].jobs, 1) for name in videos}
@@ -449,7 +465,7 @@ def _written(file: PipelineFile, work: Path, fps: float, result: RunResult) -> t
 
 
 def _copied(video: Path, target: Path) -> None:
-    """Copy a video to its place, which is whole at any time. Raises BadInputError where it cannot be written."""
+    """Copy `video` to `target`, which is never incomplete. Raises BadInputError if `target` cannot be written."""
     partial = target.with_name(f"{target.name}.partial")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,6 @@
-"""The files of a run folder that are made from other files: video, contact sheet, checksum, recording and trace.
+"""Makes video, contact sheet, checksum, recording and trace of a run folder from the segments and the journal.
 
-Rule: nothing is encoded again: video.mp4 holds the packets of the segments, and the contact sheet is decoded from it.
+Rule: no frame is encoded twice. video.mp4 gets the packets of the segments, and the contact sheet is decoded from it.
 The journal is read once, record by record.
 """
 
@@ -29,17 +29,17 @@ EVENTS, VIDEO, SHEET = "events.jsonl", "video.mp4", "contact.png"
 COLUMNS, ROWS = 4, 5
 THUMB_WIDTH = 320
 KEYFRAME_EVERY = 30  # frames, as the present stage encodes them
-FAST_PNG = 1  # a fifth larger than the best compression, in a quarter of the time
+FAST_PNG = 1  # zlib level: files are a fifth larger than at the best level, but need a quarter of the time
 
 
 def write_files(work: Path, fps: float, frames: int) -> tuple[dict[str, Any], UnwrittenError | None]:
-    """Write every file of the run folder `work` except the report. Return the report's facts about these files.
+    """Write every file of the run folder `work` except the report. Return facts for the report, and an error or None.
 
-    On a full disk the error is returned too; files are then complete or absent, and the segments stay. An error about
-    segments that were removed is returned after everything else is written.
+    The facts are `video` and `checksum`. The error says that the disk is full or that segments were removed. After a
+    full disk, each file is complete or absent, and the segments stay. After removed segments, all files are written.
 
-    `fps`: frames a second of the scene. `frames`: least number of frames in the segments. Raises BadInputError for a
-    broken journal.
+    `fps`: frames a second of the scene. `frames`: least number of frames that the segments should contain.
+    Raises BadInputError for a broken journal.
     """
     segments = work / SEGMENTS
     facts: dict[str, Any] = {"video": None, "checksum": None}
@@ -61,7 +61,7 @@ def write_files(work: Path, fps: float, frames: int) -> tuple[dict[str, Any], Un
 
 @contextmanager
 def _whole_or_absent(*files: Path) -> Iterator[None]:
-    """Remove `files` when they cannot be written to their end. Raises UnwrittenError where the disk takes no more."""
+    """Remove `files` if the block, which writes them, fails. Raises UnwrittenError if the disk is full."""
     try:
         with full_disk_told(files[0]):
             yield
@@ -89,7 +89,7 @@ def _write_from_journal(journal: Path, folder: Path) -> None:
 
 @dataclass(frozen=True)
 class JoinedVideo:
-    """The file that `join_segments` wrote. `frames`: number of pictures; `seconds`: end of the last one."""
+    """A video that `join_segments` wrote. `frames`: number of pictures. `seconds`: time at which the last one ends."""
 
     frames: int
     seconds: float
@@ -98,10 +98,12 @@ class JoinedVideo:
 def join_folder(
     segments: Path, target: Path, fps: float, frames: int
 ) -> tuple[JoinedVideo | None, UnwrittenError | None]:
-    """Join the folder `segments` to the video `target`, by `join_segments`; with an error where files were removed.
+    """Join the segments in the folder `segments` to the video `target`. Return the video, and an error or None.
 
-    `frames`: least number of frames that were encoded. Each has a line in a digest file, and all but the last one of a
-    writer that was killed are in its segment. Raises UnwrittenError where the disk takes no more.
+    The error says that files are missing. It follows from counts: each encoded frame has a line in a digest file. A
+    segment contains the frames of its lines, but the last frame may be missing after its writer was killed.
+    `fps`: frames a second of the scene. `frames`: least number of frames that were encoded.
+    Raises UnwrittenError if the disk is full.
     """
     digests = sorted(segments.glob("*.sha256"))
     whole = [path for path in sorted(segments.glob("*.mp4")) if path.with_suffix(".sha256") in digests]
@@ -116,13 +118,14 @@ def join_folder(
 
 
 def join_segments(segments: list[Path], target: Path, fps: float) -> JoinedVideo | None:
-    """Copy the packets of the segments into one MP4 file; returns None when they hold no frame.
+    """Copy the packets of the segments into one MP4 file; return None if they contain no frame.
 
     `segments`: files in the order of their frames, each with a digest file beside it.
     `target`: MP4 file to write.
     `fps`: frames a second of the scene.
-    A line of the digest file holds a frame's number, which gives the time at which its packet is shown. A packet whose
-    time has passed follows the packet before it. A segment that was cut off counts up to its cut.
+    Each line of a digest file has the number of a frame. The number determines the time at which the frame's packet is
+    shown. If the video is already longer, the packet is shown right after the previous one. A truncated segment is used
+    up to its end.
     """
     readable = [path for path in segments if _has_packets(path)]
     if not readable:
@@ -149,12 +152,12 @@ def _frame_numbers(segment: Path) -> list[int]:
 
 
 def _digest_lines(path: Path) -> list[str]:
-    """Return the whole lines of a digest file; a file that was cut off may end in half a line."""
+    """Return the complete lines of a digest file, because a truncated file may end with half a line."""
     return [line for line in path.read_text(encoding="ascii").splitlines(keepends=True) if line.endswith("\n")]
 
 
 def _packets(container: Any) -> Iterator[Any]:
-    """Yield the whole packets of the video stream; a file that was cut off ends at its cut."""
+    """Yield the complete packets of the video stream, up to the end of a truncated file. `container`: PyAV's input."""
     try:
         for packet in container.demux(video=0):
             if packet.pts is not None and packet.size:
@@ -172,9 +175,10 @@ def _has_packets(path: Path) -> bool:
 
 
 def run_checksum(digests: list[Path]) -> str | None:
-    """Return the SHA-256 over the lines `frame digest` of all segments, by frame; None when there is no line.
+    """Return the SHA-256 over the lines of all digest files, sorted by frame; None if there are no lines.
 
-    Two runs that presented the same bytes as the same frames have the same checksum.
+    A line is a frame's number and the digest of its picture. Runs that presented the same pictures under the same
+    numbers have the same checksum.
     """
     lines = [line for path in digests for line in _digest_lines(path)]
     if not lines:
@@ -184,10 +188,10 @@ def run_checksum(digests: list[Path]) -> str | None:
 
 
 def contact_sheet(video: Path, target: Path, fps: float) -> int:
-    """Write a PNG sheet of up to COLUMNS x ROWS frames of `video`, evenly spaced, with the first and the last.
+    """Write a PNG with up to COLUMNS x ROWS evenly spaced frames of `video`, and return their number.
 
-    Each picture is labelled with its number. Returns the number of pictures. Raises av.error.FFmpegError when the video
-    cannot be decoded.
+    The first and the last frame are among them. Each picture is labelled with the number of its frame.
+    `fps`: frames a second of the scene. Raises av.error.FFmpegError if the video cannot be decoded.
     """
     with av.open(str(video)) as container:
         stream = container.streams.video[0]
@@ -201,7 +205,7 @@ def contact_sheet(video: Path, target: Path, fps: float) -> int:
 
 
 def _decode_all(container: Any, wanted: list[int]) -> Iterator[tuple[int, Image.Image]]:
-    """Yield the thumbnails at the times `wanted`, in one pass over the video."""
+    """Yield (pts, thumbnail) for each pts in `wanted`, in one pass over the video."""
     container.seek(0)
     for frame in container.decode(video=0):
         if frame.pts in wanted:
@@ -209,7 +213,7 @@ def _decode_all(container: Any, wanted: list[int]) -> Iterator[tuple[int, Image.
 
 
 def _decode_each(container: Any, wanted: list[int]) -> Iterator[tuple[int, Image.Image]]:
-    """Yield the same frames after a seek to each, which is faster if many frames lie between them."""
+    """Yield the same as `_decode_all`, with a seek to each frame. This is faster if many frames lie between them."""
     stream = container.streams.video[0]
     for pts in wanted:
         container.seek(pts, stream=stream)

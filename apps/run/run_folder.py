@@ -1,7 +1,7 @@
-"""The folder that a run writes: made under a temporary name beside its place and renamed when it is complete.
+"""The folder that a run writes: it has a temporary name in the same parent folder until it is complete.
 
 Rule: a folder with the run's name is complete; a folder whose name ends in `.partial` is not. If a file cannot be
-written, as on a full disk, the written files stay, and the error names their place.
+written, as on a full disk, the written files stay in the partial folder, and the error names this folder.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from trilane import machine
 from trilane.errors import FREE_SPACE, FULL, BadInputError, TrilaneError, UnwrittenError, reason, remedy
 from trilane.writing import WRITABLE
 
-#: Bytes that are kept free for the report: MOST_MESSAGES of 2000 bytes each, twice as long as JSON, and its figures.
+#: Bytes reserved for the report: MOST_MESSAGES of 2000 bytes each, doubled by JSON's escapes, and the figures.
 RESERVED_BYTES = 4 << 20
 
 
 def require_free(target: Path) -> None:
-    """Raise BadInputError if `target` exists, or if a run that goes on is to have its name."""
+    """Raise BadInputError if `target` exists, or if a live run will rename its folder to `target`."""
     found = "a file or folder" if target.exists() else ""
     for other in _partial(target):
         if _is_locked(other):
@@ -34,7 +34,7 @@ def require_free(target: Path) -> None:
 
 
 def default_place(scene: str) -> Path:
-    """Return `runs/<UTC time>-<scene>` in the working directory, a name that no run has or is to have."""
+    """Return `runs/<UTC time>-<scene>` in the working directory, with a number if another run has this name."""
     stamp = machine.here.now().strftime("%Y%m%dT%H%M%SZ")
     safe = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in scene)
     place, tries = Path("runs") / f"{stamp}-{safe}", 1
@@ -45,12 +45,14 @@ def default_place(scene: str) -> Path:
 
 
 class RunFolder:
-    """Make a run folder under a temporary name, `work`; without `complete()` it and parents that it made are removed.
+    """A context manager that makes a run folder under the temporary name `work`. `complete` gives it the name `target`.
 
-    A context manager. On entry it raises BadInputError when `target` exists, when another live run has the name, or
-    when there is no room for a report, and UnwrittenError when no file may be so long. RESERVED_BYTES stay reserved for
-    the report until `release`. On leaving by an error about a file that could not be written, it raises TrilaneError; a
-    folder that holds anything then stays. It also raises TrilaneError when `work` was removed.
+    Without `complete`, the exit removes `work` and the parent folders that the entry made. RESERVED_BYTES on the disk
+    stay reserved for the report until `release`.
+    The entry raises BadInputError if `target` exists, if another live run will get that name, or if there is no room
+    for a report. It raises UnwrittenError if a limit of this process forbids files of that size.
+    The exit raises TrilaneError if `work` was moved or removed, or if the block ends because a file could not be
+    written. In the latter case, `work` stays if it has content.
     """
 
     def __init__(self, target: Path) -> None:
@@ -69,7 +71,7 @@ class RunFolder:
             self._reserve_space()
         except OSError as error:
             self._remove()
-            if remedy(error, ""):  # of a limit of the process: no other place would help
+            if remedy(error, ""):  # a limit of the process, which holds for any other folder too
                 raise UnwrittenError(self.target, error) from None
             raise BadInputError.of_os_error(self.target, error, WRITABLE, "choose another --out") from None
         return self
@@ -81,7 +83,7 @@ class RunFolder:
             self._made.append(folder)
 
     def _claim(self) -> None:
-        """Make `work` and lock it while this process lives. Only one run at a time looks for folders of other runs."""
+        """Make `work` and lock it for the life of this process. Meanwhile, a lock on the parent excludes other runs."""
         parent = os.open(self.target.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:
             fcntl.flock(parent, fcntl.LOCK_EX)
@@ -97,17 +99,17 @@ class RunFolder:
             os.posix_fallocate(file.fileno(), 0, RESERVED_BYTES)
 
     def release(self) -> None:
-        """Give back the space that was kept free, for the files that are written last."""
+        """Give back the reserved space on the disk. Call it before the last files are written."""
         self._reserve.unlink(missing_ok=True)
 
     def named(self, text: str) -> str:
-        """Return `text` with the name that the folder is to have in place of the one that it has."""
+        """Return `text` with the path `target` in place of the path `work`."""
         return text.replace(str(self.work), str(self.target))
 
     def complete(self) -> Path:
-        """Give the folder its name.
+        """Rename the folder to `target`, and return this path.
 
-        Raises BadInputError when something else got the name in the meantime; the temporary folder stays then.
+        Raises BadInputError if `target` exists by now; the folder `work` then stays.
         """
         self.release()
         self._keep = self._is_there()
@@ -140,7 +142,7 @@ class RunFolder:
             raise TrilaneError(f"{failed}; {left}") from error
 
     def _unwritten(self, error: BaseException | None) -> str:
-        """Say which file could not be written, and why; "" for an error about anything else."""
+        """Return which file could not be written, and why; "" if `error` has another cause."""
         if isinstance(error, UnwrittenError):
             return str(error)
         if isinstance(error, BadInputError) and isinstance(error.__cause__, OSError):
@@ -150,7 +152,7 @@ class RunFolder:
         return ""
 
     def _is_there(self) -> bool:
-        """Say whether `work` is still the folder that was made."""
+        """Return whether the path `work` still leads to the folder that was made."""
         try:
             return os.path.samestat(self.work.stat(), os.fstat(self._lock))
         except OSError:
@@ -166,12 +168,12 @@ class RunFolder:
 
 
 def _partial(target: Path) -> Iterator[Path]:
-    """Yield the folders of runs to `target` that have not completed."""
+    """Yield the `.partial` folders of live and ended runs to `target`."""
     return target.parent.glob(f"{glob.escape(target.name)}.*.partial")
 
 
 def _is_locked(folder: Path) -> bool:
-    """Say whether a living process holds the lock of the folder; a folder that is gone by now has no lock."""
+    """Return whether a live process holds the lock of `folder`. A removed folder has no lock."""
     try:
         fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except OSError:

@@ -1,9 +1,10 @@
-"""One run from a checked configuration to a complete run folder, and the comparison of its frames with the truth.
+"""One run of a scene, from a checked configuration to a complete run folder, and the check of its frames.
 
-Rule: a run folder is complete. The report of an interrupted or failed run says so, and the folder keeps the presented
-frames. A run that presented none leaves no folder. `check_run` compares presented pictures, stored without loss, with
-the truth, which a person would see without Trilane. It also compares them with the float path, which shows the cost of
-integers, rasters and plans.
+Rule: a run folder is complete. If a run was interrupted or failed, its report says so, and the folder has the frames
+until then. A run without a presented frame leaves no folder.
+
+`check_run` compares losslessly stored pictures of the run with two others. The truth is the clothed body that the
+avatar was trained on. The float path has no quantisation, no GPU raster and no plan, so it shows their cost.
 """
 
 from __future__ import annotations
@@ -55,11 +56,11 @@ STEPS = 255
 
 @dataclass(frozen=True)
 class Prepared:
-    """A run whose options were checked.
+    """A run whose options are checked.
 
     `checked`: configuration that follows from `options`.
-    `pace`: pace of a chip at which jobs are held; None for a run as fast as it goes.
-    `command`: words by which the run was asked for.
+    `pace`: pace of a chip that the jobs keep; None for a run at full speed.
+    `command`: words of the command line.
     """
 
     options: RunOptions
@@ -70,7 +71,11 @@ class Prepared:
 
 @dataclass(frozen=True)
 class Hooks:
-    """Callbacks of a run: `progress(what, presented, requested)` and `message(text)`."""
+    """Callbacks of a run.
+
+    `progress(what, done, total)`: gets numbers of frames; `what` is the policy, or `check` during the check.
+    `message(text)`: gets messages for a person.
+    """
 
     progress: Callable[[str, int, int], None]
     message: Callable[[str], None]
@@ -78,11 +83,11 @@ class Hooks:
 
 @dataclass(frozen=True)
 class Watched:
-    """A live run that somebody watches and steers.
+    """The viewer of a live run, which shows and steers the run.
 
-    `frames`: number of frames; None for the scene's. `window`: file to look through (`trilane.transport.live_window`).
-    `controls`: requests to the run. `begins(folder, checked)`: function that is called when the units are placed,
-    before they start.
+    `frames`: number of frames; None for the scene's number. `window`: file of the `trilane.transport.live_window`.
+    `controls`: requests of the viewer to the run. `begins(folder, checked)`: function that is called after the units
+    are placed and before they start.
     """
 
     frames: int | None
@@ -93,7 +98,7 @@ class Watched:
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """How a run ended: the `report` as written, the `folder` that holds it, and the exit code that the run asks for."""
+    """How a run ended. `report`: report as written. `folder`: run folder. `exit_code`: exit code for the command."""
 
     report: Report
     folder: Path
@@ -116,9 +121,10 @@ def run_to_folder(
     `hooks`: callbacks of the run.
     `machine`: result of `machine_facts`.
     `made`: result of `trilane.apps.run.report_facts.made_facts`; None for a run without a command line.
-    `starter`: fork server that was started earlier; without one, the units stay where they were prepared.
-    `watched`: viewer of the run, if any. Raises BadInputError when `target` cannot be written. Raises TrilaneError when
-    no frame was presented, or when a file could not be written; then the folder stays.
+    `starter`: fork server that runs already. Without it, the units are not placed on cores for this run.
+    `watched`: viewer of the run, if any.
+    Raises BadInputError if `target` cannot be written. Raises TrilaneError if no frame was presented, or if a file
+    could not be written. In the latter case, the written files stay in a folder that the message names.
     """
     options, checked, pace = prepared.options, prepared.checked, prepared.pace
     with RunFolder(target) as folder:
@@ -179,22 +185,22 @@ def run_to_folder(
 
 
 def _renamed(result: RunResult, named: Callable[[str], str]) -> RunResult:
-    """Return `result` with what it says `named` as the reader of the report finds it."""
+    """Return `result` after applying `named` to its texts, so that they name the final folder."""
     failure = result.failure and replace(result.failure, message=named(result.failure.message))
     return replace(result, failure=failure, messages=tuple(map(named, result.messages)))
 
 
 class _Job:
-    """The runs of one job: the one that was asked for, and the sequential one to compare with."""
+    """Runs the prepared run, and after it the baseline, a `sequential` run of the same scene."""
 
     def __init__(self, prepared: Prepared, hooks: Hooks, starter: UnitStarter | None, watched: Watched | None) -> None:
         self._options, self._checked, self._pace = prepared.options, prepared.checked, prepared.pace
         self._hooks, self._starter, self._watched = hooks, starter, watched
 
     def run(self, folder: Path, facts: Mapping[str, Any]) -> RunResult:
-        """Run the prepared run and write its journal, which begins with `facts`.
+        """Run the prepared run in `folder` and write its journal, which begins with `facts`.
 
-        Raises TrilaneError when the run ended before any frame was presented.
+        Raises TrilaneError, or KeyboardInterrupt, if the run ended before any frame was presented.
         """
         file, watched = JournalFile(folder / journal.NAME, facts, sensors), self._watched
         frames, controls = (None, None) if watched is None else (watched.frames, watched.controls)
@@ -203,9 +209,10 @@ class _Job:
         return self._run(folder, self._options, frames, file, controls, kept)
 
     def run_baseline(self, folder: Path) -> tuple[RunResult | None, bool]:
-        """Run the first frames of the same scene again, one frame at a time, without keeping pictures.
+        """Run the first frames of the scene again, one frame at a time, in a folder that is removed afterwards.
 
-        Returns the result, None when it was not asked for or did not complete, and whether it was interrupted.
+        Returns two values: the result, and whether the baseline was interrupted. The result is None if no baseline was
+        requested or it did not complete.
         """
         if not self._options.baseline_frames or self._options.policy == BASELINE_POLICY:
             return None, False
@@ -256,7 +263,7 @@ class _Job:
         raise error_of(result)
 
     def _release_fps(self, policy: str) -> float | None:
-        """Return the rate of a policy that needs one, at a chip's pace; without a pace it has the scene's rate."""
+        """Return the rate at which a paced policy releases frames at a chip's pace; None means the scene's rate."""
         if self._pace is None or not policy_named(policy).paced:
             return None
         from trilane.apps.run.pace import release_fps
@@ -265,7 +272,11 @@ class _Job:
 
 
 def _checked_frames(checked: Checked, work: Path, hooks: Hooks, interrupted: Callable[[], bool]) -> dict[str, Any]:
-    """Return `check` of the report, or `notes` that say why there is none. An interrupt ends it at the next frame."""
+    """Return facts for the report: `check`, or else `notes` that say why there is no check.
+
+    `work`: run folder, whose lossless pictures are removed afterwards. `interrupted`: function that says whether the
+    check shall end; it is called before each frame.
+    """
 
     def told(done: int, of: int) -> None:
         hooks.progress("check", done, of)
@@ -294,7 +305,7 @@ def _notes(checked: Checked) -> list[str]:
 
 
 def sensors() -> dict[str, float]:
-    """Return the figures that the journal samples in passing."""
+    """Return the figures that the journal samples during a run: the temperature of the machine's sensor, in °C."""
     celsius = machine.here.sensor_c()
     return {} if celsius is None else {"temperature_c.sensor": celsius}
 
@@ -317,7 +328,7 @@ def exit_code_of(result: RunResult) -> int:
 
 
 def _tell(report: Report, hooks: Hooks) -> None:
-    """Tell a person the facts that nobody should have to search in the report."""
+    """Send messages about lost frames of the video, smaller tensors, and a scene without visible avatars."""
     if report.video is not None and report.video.frames < report.frames.presented:
         shown = f"{report.video.frames} of {report.frames.presented} frames"
         hooks.message(f"video.mp4 holds {shown}: a writer was killed before its last")
@@ -328,30 +339,30 @@ def _tell(report: Report, hooks: Hooks) -> None:
 
 
 def _import_writers() -> None:
-    """Import what writes the files while the units start and this process waits for them."""
+    """Import the modules that write the run folder's files, in the time in which the units start."""
     from trilane.apps.run import run_files  # noqa: F401
 
 
 def asked_frames(total: int, count: int) -> tuple[int, ...]:
-    """Return the numbers of at most `count` of `total` frames, evenly spread, each in the middle of its share."""
+    """Return the numbers of at most `count` frames, evenly spread over the frames 0 to `total` - 1."""
     number = min(count, total)
     return tuple((2 * index + 1) * total // (2 * number) for index in range(number))
 
 
 def require_parts(bundles: Iterable[Bundle]) -> None:
-    """Raise MissingPartError for all libraries that the check of a run with avatars `bundles` needs and lacks."""
+    """Raise MissingPartError if a library is missing that the check of a run with avatars `bundles` needs."""
     from trilane.bench.lib.full_picture import require_float_network
 
     require([require_metrics, *(partial(require_float_network, bundle) for bundle in bundles)])
 
 
 def check_run(checked: Checked, folder: Path, told: Callable[[int, int], None] = lambda *_: None) -> dict[str, Any]:
-    """Compare the frames that were kept in `folder` with the truth, where it is known, and with the float path.
+    """Compare the pictures stored in `folder` with the float path and, if it is known, the truth. Return `check`.
 
-    A frame with nobody in view is left out. Figures are of the region that holds the avatars; the IoU is of the pixels
-    that differ from the background.
-    `told(done, total)`: function that is called after each frame. Returns `check` of report.json.
-    Raises TrilaneError when no frame with somebody in view was kept, MissingPartError, BadInputError.
+    The result is the block `check` of report.json. Frames without a visible avatar are left out. The figures count the
+    region that contains the avatars. The IoU compares masks of the pixels that differ from the background.
+    `told(done, total)`: function that is called after each frame.
+    Raises TrilaneError if no stored frame shows an avatar, MissingPartError, BadInputError.
     """
     from trilane.apps.experiments.picture_errors import figures
     from trilane.apps.experiments.reference_path import ReferencePath
@@ -383,7 +394,10 @@ def check_run(checked: Checked, folder: Path, told: Callable[[int, int], None] =
 
 
 def summed_up(against: str, errors: Sequence[ErrorFigures]) -> dict[str, Any]:
-    """Return what report.json says of frames `against` other pictures."""
+    """Return one comparison as in report.json, with means over `errors`, which has an element for each frame.
+
+    `against`: name of the pictures that the frames were compared with.
+    """
     ssim = [error.ssim for error in errors if error.ssim is not None]
     return {
         "against": against,
@@ -396,7 +410,7 @@ def summed_up(against: str, errors: Sequence[ErrorFigures]) -> dict[str, Any]:
 
 
 def differs(picture: U8, background: U8) -> Mask:
-    """Return (h,w): where `picture` (h,w,3) differs from its `background`."""
+    """Return a mask (h,w) of the pixels in which `picture` (h,w,3) differs from `background` (h,w,3)."""
     return np.asarray((picture != background).any(axis=2))
 
 

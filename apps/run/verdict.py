@@ -1,12 +1,10 @@
-"""The verdict of a run or a prediction: does it hold its rate, what limits it, can it be trusted, what to try.
+"""The verdict of a run or a prediction: whether it holds its rate, what bounds it, whether to trust it, what to try.
 
-Rule: pure, and the only place that judges. report.json, the end of `trilane run`, `explain`, `watch`, the dashboard,
-notebooks, predictions and pages show what stands here. `trilane.apps.run.verdict_facts` makes the facts.
+Rule: pure, and the only place that judges. All commands, pages, notebooks and report.json show this verdict.
+`trilane.apps.run.verdict_facts` makes the facts that it rests on.
 
-Whether the machine let a run be measured: the judgement that verdicts, sweeps and gates share.
-
-Rule: a pure function of the report's facts. A run is not trusted if its machine was not quiet, or if nobody knows.
-Every reason is said with its figure. The frames themselves are not judged here.
+The trust in a run is part of the verdict; sweeps and gates use it too. A run is not trusted if its machine was not
+quiet, or if nobody knows whether it was. Each reason states its figure.
 """
 
 from __future__ import annotations
@@ -18,19 +16,19 @@ from typing import Any, Final, NamedTuple
 from trilane.scheduler.stats import samples_needed
 from trilane.units import HOST_CLOCK
 
-#: Share of the cores' time above which other programs spoil a measurement.
+#: Share of the cores' time. If other programs take more, the run is not trusted.
 MOST_OTHERS = 0.05
-#: Degrees Celsius from which processors slow themselves down: laptops and phones do so from 90 to 105.
+#: Temperature in °C at which processors may slow down. Laptops and phones begin at 90 to 105 °C.
 HOT_C = 90.0
-#: Share by which the clock may differ between the begin and the end of a run.
+#: Relative change of the processor's clock frequency, from the begin to the end of a run, that is still trusted.
 CLOCK_CHANGE = 0.1
 
 
 class Trust(NamedTuple):
-    """The judgement of one run.
+    """The judgement whether the times of a run can be trusted.
 
-    `trusted`: whether nothing else changed its times: the machine was quiet, or a model computed them.
-    `reasons`: sentences without a full stop: why it is not trusted, or the one fact that it rests on.
+    `trusted`: whether the machine was quiet, or the times are computed.
+    `reasons`: reasons against trust, or the reason for it. Each is a sentence without a full stop.
     """
 
     trusted: bool
@@ -38,14 +36,15 @@ class Trust(NamedTuple):
 
     @property
     def said(self) -> str:
-        """The judgement in one line, such as `UNSURE: other programs took 27 % of its cores`."""
+        """Return the judgement in one line, such as `UNSURE: other programs took 27 % of its cores`."""
         return ("" if self.trusted else "UNSURE: ") + "; ".join(self.reasons)
 
 
 def trust_of(report: Mapping[str, Any]) -> Trust:
-    """Return whether a run can be trusted.
+    """Return the judgement whether a run can be trusted.
 
-    `report`: the report as JSON, or as much of it as is known: `clock`, `other_programs`, `processor`, `temperature_c`.
+    `report`: mapping with the keys `clock`, `other_programs`, `processor` and `temperature_c` of report.json, as far as
+    they are known.
     """
     if report.get("clock", HOST_CLOCK) != HOST_CLOCK:
         return Trust(True, ("computed in virtual time",))
@@ -83,28 +82,28 @@ def _of_heat(celsius: float | None) -> str:
 
 
 def percent(share: float | None) -> str:
-    """Return a share in percent with two digits at least, such as `0.4 %` and `27 %`."""
+    """Return a share in percent, such as `0.4 %` and `27 %`. Values below 10 % have one decimal."""
     return "unknown" if share is None else f"{100 * share:.1f} %" if share < 0.1 else f"{100 * share:.0f} %"
 
 
-#: Frames a second that a run has to hold where neither an option nor its scene or file says a rate.
+#: Rate that a run must hold, in frames a second, if no option, scene or file states a rate.
 TARGET_FPS: Final = 30.0
-#: Share of the frames that may be late, dropped or lost in a run that passes: 99 of 100 frames are in time.
+#: Largest share of late, dropped and lost frames in a run that passes: 99 of 100 frames are in time.
 MOST_LATE: Final = 0.01
-#: Share of a unit's time from which a cause of idle time is named.
+#: Smallest share of a unit's time for which the verdict names a cause of idle time.
 LEAST_NAMED: Final = 0.05
 MOST_CAUSES: Final = 2
 MOST_TRIES: Final = 3
 LABELS: Final = ("PASS", "FAIL")
 UNKNOWN: Final = "not known"
 NO_RATE: Final = f"the rate is {UNKNOWN}: fewer than two frames were presented"
-#: What figures are of that are not a finished run's.
+#: Words beside the figures of a live run, and of a prediction.
 SO_FAR, COMPUTED = "so far", "computed"
-#: Which rate it is that a prediction names beside the one that frames come at.
+#: Words beside a predicted rate that needs a source which always has a frame.
 ALWAYS_FED: Final = "if always fed"
-#: Name of the bound of a prediction that the chip's display holds back.
+#: Name of the bound if the refresh rate of the chip's display limits a prediction.
 DISPLAY: Final = "display"
-#: Names of the path that are no unit's -> what they mean to a person.
+#: Name of a bound that is no unit -> explanation for a person.
 MEANINGS: Final = {
     "release": "no frame was released yet: frames come no more often than was asked for",
     DISPLAY: "it shows no more frames a second",
@@ -115,7 +114,7 @@ MEANINGS: Final = {
 
 
 class Rate(NamedTuple):
-    """Frames a second, with the bounds of an interval that holds `share` of the probability; None without one."""
+    """A rate in frames a second. `low`, `high`: bounds of its interval, None if unknown. `share`: the confidence."""
 
     fps: float
     low: float | None = None
@@ -126,8 +125,8 @@ class Rate(NamedTuple):
 class Lateness(NamedTuple):
     """How many frames were not in time.
 
-    `due`: number of frames that had to be in time. `late`: number of those that came late. `dropped`, `lost`: numbers
-    of those that never came. `replaced`: number of frames that gave way to newer ones although nobody asked for a rate.
+    `due`: number of frames that had to be in time. `late`: how many of them were presented late. `dropped`, `lost`: how
+    many of them were dropped or lost. `replaced`: number of frames that were evicted in a run without a fixed rate.
     """
 
     due: int
@@ -142,12 +141,14 @@ class Lateness(NamedTuple):
 
 
 class Bound(NamedTuple):
-    """What bounds the frame time, as the report's `bound` names it.
+    """The bound of the frame time, as in the report's `bound`.
 
-    `unit`: the unit, or what the path was instead. `stages`: the stage that bounds, then the unit's others; to each its
-    ms on the critical path, None where that is not known. `share`: the unit's share of the path. `cost`: growth of the
-    frame time when its jobs take 20 % longer, None where the path alone names the bound. `rivals`: units that may bound
-    as much. `of_unit`: stages of `unit`. `path`: the name that has most of the path, "" where it is `unit`.
+    `unit`: the unit, or a name in MEANINGS.
+    `stages`: the stage that bounds, followed by other stages of the unit. The value is the stage's ms on the critical
+    path, None if unknown. `share`: share of the unit in the critical path.
+    `cost`: relative growth of the frame time if the unit's jobs take 20 % longer; None if only the path is known.
+    `rivals`: units that may bound as much. `of_unit`: all stages of `unit`.
+    `path`: name with the largest share of the path, "" if that is `unit`.
     """
 
     unit: str
@@ -161,15 +162,15 @@ class Bound(NamedTuple):
 
 @dataclass(frozen=True)
 class Facts:
-    """What a verdict rests on.
+    """The facts that a verdict rests on.
 
-    `rate`: rate, None for fewer than two frames. `target_fps`: rate to hold. `is_held_to_rate`: whether frames came at
-    the target's rate, so the rate itself says nothing. `lateness`: None where frames have no times.
-    `failure`: why the run ended early. `frame_ms`: mean time of a frame. `slow`: name and value of the highest
-    percentile that the frames tell, ms. `latency_ms`: mean latency. `alone`: rate and latency of one frame at a time.
-    `idle`: by unit its idle share and the shares of the causes. `image`: error of the picture in words.
-    `tries`: what the numbers say to try, the most useful first. `source`: "" for a run that is over, else what the
-    figures are of.
+    `rate`: rate, None for fewer than two frames. `target_fps`: rate to hold.
+    `is_held_to_rate`: whether the target rate releases the frames. The rate then proves nothing, only lateness counts.
+    `lateness`: frames that were not in time, None if unknown. `failure`: reason for an early end, "" without one.
+    `frame_ms`: mean frame time. `slow`: result of `slow_percentile`. `latency_ms`: mean latency.
+    `alone`: rate (fps) and mean latency (ms) with one frame at a time. `bound`: None if unknown.
+    `idle`: idle share of each unit, and shares of its causes. `image`: image error in words.
+    `tries`: proposals, the most useful first. `source`: "" for a finished run, else SO_FAR or COMPUTED.
     """
 
     rate: Rate | None
@@ -195,14 +196,14 @@ class Facts:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The judgement of `facts`. `passed`: whether the rate is held. `why`: the reasons in one line."""
+    """The judgement of `facts`. `passed`: whether the run passes. `why`: reasons in one line."""
 
     facts: Facts
     passed: bool
     why: str
 
     def as_json(self) -> dict[str, Any]:
-        """Return `verdict` of report.json."""
+        """Return the block `verdict` of report.json."""
         bound = self.facts.bound
         return {
             "pass": self.passed,
@@ -213,7 +214,7 @@ class Verdict:
         }
 
     def lines(self) -> list[tuple[str, str]]:
-        """Return the verdict's lines for people, each with its label."""
+        """Return the lines of the verdict for people, each as a label, such as `BOUND`, and a text."""
         facts = self.facts
         found = (
             (LABELS[not self.passed], _held(facts)),
@@ -227,7 +228,7 @@ class Verdict:
         return [(label, text) for label, text in found if text]
 
     def shown(self) -> dict[str, Any]:
-        """Return what a page needs: `as_json`, and the lines for people."""
+        """Return `as_json` with a further key `lines`, which has the lines for people."""
         return {**self.as_json(), "lines": [list(line) for line in self.lines()]}
 
     def __str__(self) -> str:
@@ -235,9 +236,9 @@ class Verdict:
 
 
 def judged(facts: Facts) -> Verdict:
-    """Return the verdict: a run passes if it ended well, held its rate, and 99 of 100 frames were in time.
+    """Return the verdict: a run passes if it did not fail, held its rate, and had 99 of 100 frames in time.
 
-    The rate counts where frames come as fast as they can. At a rate from outside only the frames in time count.
+    If a fixed rate releases the frames, the measured rate does not count, only the frames in time.
     """
     against = [reason for reason in (_ended(facts), _too_slow(facts), _too_late(facts)) if reason]
     said = against or [f"{_number(facts.target_fps)} fps are held"]
@@ -274,10 +275,10 @@ def _late(found: Lateness) -> str:
 
 
 def _held(facts: Facts) -> str:
-    """Return the rate beside what is asked for, such as `96 fps (92 to 102), at 30 fps 0 of 299 frames late`.
+    """Return the rate and the frames in time, such as `96 fps (92 to 102), at 30 fps 0 of 299 frames late`.
 
-    Where frames came at a rate, it is said which rate the first one is: of the frames that were shown, or of a
-    prediction whose source always has a frame.
+    If a fixed rate releases the frames, the text says what its first number is: the rate of shown frames. In a
+    prediction, this number is the rate with a source that always has a frame.
     """
     if facts.failure:
         return f"the run ended early: {facts.failure}"
@@ -307,7 +308,7 @@ def _times(facts: Facts) -> str:
 
 
 def _bound(facts: Facts) -> str:
-    """Return what bounds the frame time, with its ms on the critical path and what it costs when it is slower."""
+    """Return the bound of the frame time, its ms on the critical path, and its cost if it is slower."""
     bound = facts.bound
     if bound is None:
         return UNKNOWN
@@ -329,9 +330,10 @@ def _bound(facts: Facts) -> str:
 
 
 def _stages(bound: Bound, *, is_own: bool) -> str:
-    """Return the stages of the bound's unit, or of other units, with their ms and a space at the end.
+    """Return the bound's stages with their ms, and a space at the end; "" if there are none.
 
-    Stages are left out whose time is none when it is rounded, such as `discard`.
+    `is_own`: whether to return the stages of the bound's unit, or those of other units. Stages whose ms are rounded to
+    0 are left out.
     """
     rows = [(stage, ms) for stage, ms in bound.stages.items() if (stage in bound.of_unit) == is_own]
     rows = [(stage, ms) for stage, ms in rows if ms is None or _ms(ms) != _ms(0.0)]
@@ -358,7 +360,10 @@ def _idle_of(unit: str, share: float, causes: Mapping[str, float]) -> str:
 
 
 def slow_percentile(times: Mapping[str, Any]) -> tuple[str, float] | None:
-    """Return name and value of the highest percentile that the samples of `times` tell; else the maximum."""
+    """Return name and value (ms) of the highest percentile that has enough samples; else the maximum, or None.
+
+    `times`: percentiles, `max` and `samples` of a frame time or a latency, as in the report.
+    """
     samples = times.get("samples")
     for name in ("p99", "p95", "p90"):
         if times.get(name) is not None and (samples is None or samples >= samples_needed(int(name[1:]) / 100)):
@@ -367,7 +372,7 @@ def slow_percentile(times: Mapping[str, Any]) -> tuple[str, float] | None:
 
 
 def _apart(one: float, other: float) -> tuple[str, str]:
-    """Return two numbers with three digits, or with as many as tell them apart."""
+    """Return two numbers as texts of three digits, or of more if the texts would otherwise be equal."""
     texts = _number(one), _number(other)
     for digits in range(4, 17) if one != other else ():
         if texts[0] != texts[1]:
@@ -377,7 +382,7 @@ def _apart(one: float, other: float) -> tuple[str, str]:
 
 
 def _number(value: float | None) -> str:
-    """Return three digits, such as `96.2`, `4.42` and `30`; more in front of the point where there are more."""
+    """Return `value` with three digits, such as `96.2` or `4.42`. Values from 100 on are rounded to whole numbers."""
     if value is None:
         return UNKNOWN
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"

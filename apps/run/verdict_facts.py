@@ -1,7 +1,7 @@
-"""The facts of a verdict, from a report, from a run that goes on, and from a prediction.
+"""Makes the facts of a verdict from a report, from the figures of a live run, or from a prediction.
 
-Rule: pure. A report, a moment of a run and a prediction have the same keys (docs/report.md), as far as each knows them;
-what is not known is left out of the verdict. The bound is the report's own, never another one.
+Rule: pure. All three sources have the keys of docs/report.md, as far as their values are known. The verdict leaves out
+unknown values. The bound is always the one that the source names.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ from trilane.units import NO_FIGURES
 if TYPE_CHECKING:
     from trilane.apps.run.report import Report
 
-#: Latency over the latency of one frame alone. From this ratio on, a later pose is worth an attempt.
+#: Ratio of latency to the latency of a frame alone. Above this ratio, the verdict proposes late latching.
 MUCH_LATER: Final = 2.0
-#: Part of a frame's time that has to be left before more work for a frame is proposed.
+#: Unused share of a frame's time from which the verdict proposes larger pictures.
 MUCH_LEFT: Final = 0.5
-#: Part of a rate by which two computations of it may differ.
+#: Relative error by which two computations of the same rate may differ.
 ROUNDED: Final = 1e-6
 NOT_YET: Final = Trust(False, ("the run goes on: its machine is judged at its end",))
 NO_TRUTH: Final = "nothing to compare with: a pipeline of your own has no true picture"
 
 
 def verdict_of(report: Report, folder: str = "") -> Verdict:
-    """Return the verdict of a run. `folder`: its run folder, for advice."""
+    """Return the verdict of a run. `folder`: run folder, which appears in commands that the verdict proposes."""
     return judged(facts_of(report.as_json(), folder))
 
 
 def facts_of(document: Mapping[str, Any], folder: str = "", *, goes_on: bool = False) -> Facts:
     """Return the facts of a run.
 
-    `document`: keys of report.json, as far as they are known. `folder`: run folder, for advice. `goes_on`: whether the
-    run goes on, so that its figures are of the run so far.
+    `document`: mapping with the known keys of report.json. `folder`: as in `verdict_of`.
+    `goes_on`: whether the run has not ended; `document` then has the figures so far.
     """
     frames, times, latency = (document.get(key) or {} for key in ("frames", "frame_time_ms", "latency_ms"))
     has_times = frames.get("presented", 0) > 1
@@ -86,21 +86,27 @@ def facts_of(document: Mapping[str, Any], folder: str = "", *, goes_on: bool = F
 
 
 def target_fps(document: Mapping[str, Any]) -> float:
-    """Return the rate that a run has to hold: that of `--fps`, its scene or its file, as slow as its pace is."""
+    """Return the rate that a run must hold, in frames a second, divided by the slow motion of its pace.
+
+    The rate comes from `--fps`, the scene or the pipeline file.
+    """
     config = document.get("config") or {}
     fps = float((config.get("scene") or {}).get("fps") or TARGET_FPS)
     return fps / float((document.get("pace") or {}).get("slow_motion", 1.0))
 
 
 def _is_paced(document: Mapping[str, Any]) -> bool:
-    """Return whether frames were released at a rate from outside."""
+    """Return whether a fixed rate or random arrivals released the frames, not the pipeline itself."""
     run = ((document.get("config") or {}).get("pipeline") or {}).get("run") or {}
     policy = POLICIES.get(document.get("policy", ""))
     return bool(run.get("fps") or run.get("arrivals") or (policy and policy.paced))
 
 
 def _lateness(document: Mapping[str, Any], *, is_paced: bool) -> Lateness | None:
-    """Return how many frames were not in time; None where the misses count against another rate."""
+    """Return how many frames were not in time; None for a run in slow motion whose frames no fixed rate releases.
+
+    The misses of such a run are counted against another rate. `is_paced`: result of `_is_paced`.
+    """
     frames, late = document["frames"], document["deadline_misses"]
     dropped = wanted_drops(frames["dropped"])
     if is_paced:
@@ -112,7 +118,7 @@ def _lateness(document: Mapping[str, Any], *, is_paced: bool) -> Lateness | None
 
 
 def bound_of(document: Mapping[str, Any]) -> Bound | None:
-    """Return the bound that a report names, with its stages' ms on the critical path; None without a path."""
+    """Return the bound that a report names, with each stage's ms on the critical path; None if there is no path."""
     bound = document.get("bound")
     if not bound:
         return None
@@ -140,7 +146,7 @@ def _causes(idle: Mapping[str, float | None]) -> dict[str, float]:
 
 
 def _image(document: Mapping[str, Any]) -> str:
-    """Return the error of the picture: of the run's own frames, and of the avatar that is worst by its validation."""
+    """Return a text on the image error: of this run's frames if they were checked, else from the worst validation."""
     avatars = document.get("accuracy") or {}
     if check := document.get("check"):
         against = str(check["against"]).partition(":")[0]
@@ -158,14 +164,18 @@ def _image(document: Mapping[str, Any]) -> str:
 
 
 def _validated(facts: Mapping[str, Any]) -> tuple[float, float | None]:
-    """Return the mean PSNR of an avatar's validation, or that of its worst distance, and the PSNR of its worst view."""
+    """Return two PSNRs from the validation of an avatar, in dB.
+
+    The first is the mean, or the PSNR of the worst band of zoom if there is no mean. The second is the PSNR of the
+    worst view, None if unknown.
+    """
     mean = facts.get("psnr_db")
     known = min(facts["psnr_db_by_band"].values()) if mean is None else mean
     return known, (facts.get("worst") or {}).get("psnr_db")
 
 
 def _tries(document: Mapping[str, Any], bound: Bound | None, target: float, folder: str) -> Iterator[str]:
-    """Yield what the run's own numbers say to try, the most useful first."""
+    """Yield proposals that follow from the run's figures, the most useful first. `target`: rate to hold, in fps."""
     others = document.get("other_programs")
     if others is not None and others > MOST_OTHERS:
         yield f"end other programs ({percent(others)}) and run again"
@@ -181,11 +191,11 @@ def _tries(document: Mapping[str, Any], bound: Bound | None, target: float, fold
 
 
 def _shorter(document: Mapping[str, Any], bound: Bound | None) -> Iterator[str]:
-    """Yield what makes the bound shorter; nothing where the run waits for its frames."""
+    """Yield proposals to shorten the bound; none if the bound is no stage of a unit, such as the rate."""
     if document.get("policy") == "sequential" and len(document["units"]) > 1:
         yield "--policy pipelined: the units then work at once"
     if bound is None or bound.unit not in document["units"] or not bound.stages:
-        return  # the time is no unit's: other programs', the rate's, the policy's
+        return  # no unit bounds the run, but other programs, the rate or the policy
     stage = next(iter(bound.stages))
     if pipeline := (document.get("config") or {}).get("pipeline"):
         units = [unit for unit in document["units"] if unit != document["stages"][stage]["unit"]]
@@ -198,9 +208,9 @@ def _shorter(document: Mapping[str, Any], bound: Bound | None) -> Iterator[str]:
 def predicted_verdict(answer: Mapping[str, Any], of_run: Trust | None = None) -> Verdict:
     """Return the verdict of a prediction: of an application, a network by itself, or a pipeline.
 
-    `answer`: what `trilane predict --json` says of it. Everything is computed; it can be trusted where the interval of
-    its frame time is known and does not hold the time that the rate leaves.
-    `of_run`: judgement of the run whose times it takes. The prediction is not trusted more than this run.
+    `answer`: part of `trilane predict --json` that has this prediction. The prediction can be trusted if the 80 %
+    interval of its rate is known and does not contain the target.
+    `of_run`: judgement of the run whose times the prediction uses, if any. The prediction is not trusted more than it.
     """
     times = _needed(answer)
     config = answer.get("config") or {}
@@ -208,7 +218,7 @@ def predicted_verdict(answer: Mapping[str, Any], of_run: Trust | None = None) ->
     low, high = times.get("low"), times.get("high")
     least, most = (None, None) if low is None or high is None or not low else (1e3 / high, 1e3 / low)
     units, latency = answer.get("units") or {}, answer.get("latency_ms")
-    is_own = "cycle" in answer or answer.get("kind") == "pipeline"  # by itself, and beside others
+    is_own = "cycle" in answer or answer.get("kind") == "pipeline"  # a pipeline file by itself, or beside others
     return judged(
         Facts(
             Rate(1e3 / times["mean"] if times["mean"] else inf, least, most, "80 %"),
@@ -227,15 +237,15 @@ def predicted_verdict(answer: Mapping[str, Any], of_run: Trust | None = None) ->
 
 
 def _predicted_lateness(answer: Mapping[str, Any]) -> Lateness | None:
-    """Return how many frames of the simulated run were not in time; None where none was released at a rate.
+    """Return how many frames of the simulated run were not in time; None if no rate released them.
 
-    Jitter, and pipelines beside this one, make frames late although a mean one fits.
+    Random times and other pipelines can make frames late although the mean frame is fast enough.
     """
     return _lateness(answer, is_paced=True) if "frames" in answer and "rate" in answer else None
 
 
 def _needed(answer: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the ms that a frame needs where nothing holds it, and the bounds of its 80 % interval."""
+    """Return the ms that a frame needs without limits by rate or display: `mean`, and 80 % interval `low` to `high`."""
     if rate := answer.get("rate"):
         keys = {"mean": "reserve", "low": "reserve_high", "high": "reserve_low"}
         left = {name: rate[key] for name, key in keys.items()}
@@ -257,22 +267,26 @@ def _trust_in(low: float | None, high: float | None, target: float, *, is_held: 
 
 
 def _resting_on(of_run: Trust | None, trust: Trust) -> Trust:
-    """Return the judgement `trust` of a prediction that takes times of a run; None: of no run."""
+    """Return `trust`, or a worse judgement if the prediction uses times of a run that is not trusted.
+
+    `of_run`: judgement of this run; None if the prediction uses no run.
+    """
     if of_run is None or of_run.trusted:
         return trust
     return Trust(False, (f"its times are from an UNSURE run: {', '.join(of_run.reasons)}", *trust.reasons))
 
 
 def _is_held_by_display(answer: Mapping[str, Any]) -> bool:
-    """Return whether only the chip's display keeps the predicted frames from being quicker."""
+    """Return whether only the refresh rate of the chip's display limits the predicted frame rate."""
     rate = answer.get("rate")
     return bool(answer.get("display_capped")) and (rate is None or answer["fps"] < rate["fps"] * (1 - ROUNDED))
 
 
 def _predicted_bound(answer: Mapping[str, Any], frame_ms: float) -> Bound | None:
-    """Return the unit whose stages take most of a frame's time: of the stages that bound a pipeline file, else of all.
+    """Return the unit whose stages take most of a frame's time, as the bound; None if no stage takes time.
 
-    A network by itself is its unit's only stage.
+    For a pipeline file, only the stages that determine the period count, unless its rate does. A network by itself is
+    the only stage of its unit. `frame_ms`: time of a frame.
     """
     stages = answer.get("stages")
     if not stages:
@@ -280,14 +294,14 @@ def _predicted_bound(answer: Mapping[str, Any], frame_ms: float) -> Bound | None
         return unit and Bound(unit, {"network": frame_ms}, 1.0, of_unit=frozenset({"network"}))
     cycle = [name for name in answer.get("cycle") or stages if name in stages]
     ms_of = {name: float(stages[name].get("alone_ms") or stages[name]["service_ms"]["mean"]) for name in stages}
-    if answer.get("limit") == "rate":  # the source waits, and what would bound it without is the fullest unit
+    if answer.get("limit") == "rate":  # without the rate, the unit with the most work would determine the period
         cycle = list(stages)
     by_unit: dict[str, float] = {}
     for name in cycle:
         by_unit[stages[name]["unit"]] = by_unit.get(stages[name]["unit"], 0.0) + ms_of[name]
     unit = max(by_unit, key=by_unit.__getitem__)
     if not by_unit[unit] or not frame_ms:
-        return None  # what takes no time is bound by nothing
+        return None
     if _is_held_by_display(answer):
         return Bound(DISPLAY, {name: ms_of[name] for name in cycle if stages[name]["unit"] == unit}, 1.0)
     own = sorted((name for name in cycle if stages[name]["unit"] == unit), key=lambda name: -ms_of[name])

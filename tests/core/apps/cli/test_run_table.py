@@ -196,3 +196,16 @@ def test_the_whole_table_is_as_it_was(
 ) -> None:
     """Every line, in printed/run-table*.txt."""
     check_printed(f"run-table{name}", table_text(make()))
+
+
+def test_frames_that_took_the_bypass_are_said_for_a_scene_with_reasons_and_for_a_file_without() -> None:
+    """A file's stages have any names; those of a scene have a `composite`, which says why 3 of 4 frames were spared."""
+    scene = make_report(baseline=None)
+    scene["frames"] = {**scene["frames"], "requested": 4, "presented": 4, "dropped": {}, "not_begun": 0, "skipped": 3}
+    scene["stages"]["composite"] = {**scene["stages"]["infer"], "jobs": 4}
+    scene["figures"] = {"composite": {"reused": 0.5, "nobody": 0.25}}
+    text = table_text(scene)
+    assert "skipped raster and infer: 3 of 4 frames (reused 2, nobody on the screen 1)" in text
+    file = make_report(baseline=None, frames=scene["frames"])
+    file["config"] = {**file["config"], "pipeline": {"file": "street.toml"}}
+    assert "took the bypass: 3 of 4 frames" in table_text(file)
