@@ -1,4 +1,4 @@
-"""An avatar's files: facts about them, an avatar assembled from parts of others, and one made again for a run.
+"""An avatar's files: facts about them, a new avatar from parts of others, and an avatar made again for a run.
 
 Rule: every fact about an avatar comes from its own files or its manifest. When a part is replaced, the figures and
 words about it are dropped. A validation is kept only if none of the validated files has changed.
@@ -52,19 +52,19 @@ from trilane.training.clothing import KEY as LOOK
 if TYPE_CHECKING:
     from trilane.training.quantising.quantise import Quantised
 
-#: Of a network that is not the replaced one's: what the manifest says of its encoder and norm, which nobody stated.
+#: Encoder and norm in the manifest for a network whose architecture nobody stated.
 OTHER = "other"
-#: A network's picture is its bytes as they are: alpha and colour in 0..1 have this scale, and zero point 0.
+#: Scale of a network's output with zero point 0: alpha and colour in 0..1, whose bytes are shown as they are.
 PICTURE_SCALE = 1 / 255
 MAX_WIDTH = 256
 NAME_LENGTH = 100
 
 
 def bundle_facts(bundle: Bundle) -> dict[str, Any]:
-    """Return the manifest's entries, sizes in bytes, and what the network's file holds. Raises BadInputError.
+    """Return facts about an avatar: entries of its manifest, sizes of its files in bytes, its network's shape and work.
 
     Keys: `name`, `folder`, `files`, `body`, `texture`, `network`, `quantisation`, `provenance`, `training_command`,
-    `validation`.
+    `validation`. Raises BadInputError.
     """
     manifest = bundle.manifest
     shaped = bundle.shaped_body()
@@ -90,7 +90,7 @@ def bundle_facts(bundle: Bundle) -> dict[str, Any]:
 
 
 def level_facts(level: MeshLevel, side: int) -> dict[str, Any]:
-    """Return the size of a level of the mesh, and how far it moves the surface at rest and the texels at its seams.
+    """Return the size of a level of the mesh and its error: of the surface at rest in mm, and at the seams in texels.
 
     `side`: side of the texture in texels.
     """
@@ -128,21 +128,21 @@ def network_facts(network: NetworkFile) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Parts:
-    """Files that replace those of an avatar; None where its own stays."""
+    """Files that replace an avatar's own files; None keeps the avatar's own."""
 
     network: Path | None = None
     texture: Path | None = None
     body: Path | None = None
 
     def files(self) -> dict[str, Path]:
-        """Return the files that replace one, by key."""
+        """Return the files that are not None, by key: `network`, `texture`, `body`."""
         return {key: file for key, file in vars(self).items() if file is not None}
 
 
 def assemble(base: Bundle, parts: Parts, out: Path) -> dict[str, Any]:
-    """Write an avatar to the folder `out`: its `parts`, and all other files from `base`. Return facts about it.
+    """Write an avatar to the folder `out`, with the files of `parts` and all others from `base`. Return facts about it.
 
-    Raises BadInputError when a part is wrong or does not fit the others; nothing is written then.
+    Raises BadInputError, before anything is written, when a part is wrong or does not fit the others.
     """
     if not parts.files():
         raise BadInputError("avatar create", "no part", "--network, --texture or --body, at least one of them")
@@ -171,7 +171,7 @@ def assemble(base: Bundle, parts: Parts, out: Path) -> dict[str, Any]:
 
 
 def _drawable(network: NetworkFile) -> NetworkFile:
-    """Return `network` if the units can feed it and show its picture. Raises BadInputError."""
+    """Return `network`. Raises BadInputError if the GPU cannot pack its input or its output bytes are no picture."""
     from trilane.stages.gpu.raster import CHANNELS
 
     check_integer_layers(network)
@@ -187,7 +187,10 @@ def _drawable(network: NetworkFile) -> NetworkFile:
 
 
 def _texture(source: Path, network: NetworkFile, parts: Parts) -> NDArray[np.float32]:
-    """Read the neural texture `source`. Raises BadInputError, also for one that `network` cannot read."""
+    """Return the neural texture in the file `source` (H,W,C).
+
+    Raises BadInputError for a broken file, and if texture and `network` have different numbers of channels.
+    """
     arrays = read_npz(source, TEXTURE_KEYS, "a neural texture")
     shape = arrays["texture"].shape if "texture" in arrays else ()
     if len(shape) == 3 and shape[2] != network.channels:
@@ -199,7 +202,7 @@ def _texture(source: Path, network: NetworkFile, parts: Parts) -> NDArray[np.flo
 
 
 def _check_body(base: Bundle, body: Body, parts: Parts) -> None:
-    """Raise BadInputError where the texture is laid out for another body than `body`."""
+    """Raise BadInputError if the base's texture stays, but `body` has another UV layout than the base's body."""
     own = load_body(base.body_path)
     pairs = ((own.uv, body.uv), (own.uv_faces, body.uv_faces))
     same = all(one.shape == other.shape and np.allclose(one, other, atol=1e-6) for one, other in pairs)
@@ -228,7 +231,7 @@ def _manifest(base: Bundle, parts: Parts, network: NetworkFile, name: str) -> Ma
 
 
 def _provenance(own: Manifest, parts: Parts) -> dict[str, Any]:
-    """Return the origin of each part. Words about the person or the weights stay only if these parts stay."""
+    """Return the new avatar's provenance. Entries about the body or the weights are kept only if that part is kept."""
     stays = {"body": (parts.body, CAPTURED), "weights": (parts.network, UNTRAINED)}
     kept = {key: word for key, (part, word) in stays.items() if part is None and own.provenance.get(key) == word}
     kept |= {LOOK: own.provenance[LOOK]} if parts.body is None and LOOK in own.provenance else {}
@@ -237,9 +240,10 @@ def _provenance(own: Manifest, parts: Parts) -> dict[str, Any]:
 
 
 def _kind(base: Bundle, network: NetworkFile) -> tuple[str, str, int]:
-    """Return encoder, norm and width of the network; encoder and norm are `OTHER` unless its operators are the base's.
+    """Return the encoder, norm and width of `network`.
 
-    The width is the number of channels of the first convolution.
+    Encoder and norm are the base's if both networks have the same operators, otherwise `OTHER`. The width is the
+    number of channels of the first convolution.
     """
     own = base.manifest.network
     before, now = ([node.op_type for node in each.model.graph.node] for each in (base.read_network(), network))
@@ -248,7 +252,7 @@ def _kind(base: Bundle, network: NetworkFile) -> tuple[str, str, int]:
 
 
 def _width(model: onnx.ModelProto) -> int:
-    """Return the channels of the first convolution of `model`; 1 where none has known weights."""
+    """Return the output channels of the first convolution of `model`, at most `MAX_WIDTH`; 1 if they are unknown."""
     weights = {tensor.name: tensor.dims[0] for tensor in model.graph.initializer if len(tensor.dims) == 4}
     makers = {name: node for node in model.graph.node for name in node.output}
     for node in model.graph.node:
@@ -261,7 +265,7 @@ def _width(model: onnx.ModelProto) -> int:
 
 
 def _shapes(network: NetworkFile) -> str:
-    """Say at which tensor shapes the network can run."""
+    """Return, in words, the tensor shapes at which the network can run."""
     _, height, width, _ = network.shape
     try:
         reshaped(network, STRIDE * 3, STRIDE * 5)
@@ -277,15 +281,19 @@ def _clipped(texture: NDArray[np.float32], network: NetworkFile) -> float:
     return float(((texture < low) | (texture > high)).mean())
 
 
-#: Of an untrained network's weights.
+#: Seed of an untrained network's weights.
 SEED = 0
-#: Grows when this file makes another avatar of the same.
+#: Part of the cache's digest. It grows when this module makes another avatar from the same inputs.
 VERSION = 2
 
 
 @dataclass(frozen=True)
 class _Recipe:
-    """The differences of the new avatar. `trained`: whether width and channels are the avatar's own."""
+    """The network of an avatar that is made again.
+
+    `trained`: whether width and channels are the avatar's own. `method`, `views`: calibration method and its number of
+    views; `method` is None if the network stays as it is.
+    """
 
     width: int
     channels: int
@@ -301,10 +309,10 @@ class _Recipe:
 def remade_avatar(name: str, options: RunOptions) -> tuple[Path, str]:
     """Make avatar `name` again with the network that `options` ask for, or find it in the cache.
 
-    Returns its folder and a sentence about it.
+    Returns the avatar's folder and a sentence about the avatar.
 
-    Raises BadInputError for an avatar whose float network is needed and not here, MissingPartError without PyTorch,
-    TrilaneError where nothing can be kept.
+    Raises BadInputError if the avatar's float network is needed but absent, MissingPartError without PyTorch,
+    TrilaneError if the cache folder cannot be written.
     """
     bundle = load_bundle(name)
     recipe = _recipe(bundle, options)
@@ -351,7 +359,7 @@ def _digest(bundle: Bundle, recipe: _Recipe) -> str:
 
 @contextmanager
 def _alone(lock: Path) -> Iterator[None]:
-    """Wait until no other process makes the same avatar, and keep others from it meanwhile."""
+    """Hold the file `lock`, so that only one process at a time makes an avatar. Raises BadInputError."""
     try:
         file = lock.open("w+")  # "w" alone would wait on a pipe
     except OSError as error:
@@ -362,8 +370,6 @@ def _alone(lock: Path) -> Iterator[None]:
 
 
 def _make(bundle: Bundle, recipe: _Recipe, folder: Path) -> None:
-    from trilane.avatars.network_file import reshaped
-
     chosen = np.arange(recipe.channels) % bundle.manifest.network.channels
     quantised = _quantised(bundle, recipe, chosen)
     network = reshaped(quantised.network, *bundle.read_network().shape[1:3])
@@ -385,7 +391,7 @@ def _remade_manifest(bundle: Bundle, recipe: _Recipe, network: Any, quantised: Q
     if not recipe.trained:
         provenance = {"weights": UNTRAINED, "made_from": own.name}
     changed = {
-        "name": f"{own.name}, {recipe}"[:100],
+        "name": f"{own.name}, {recipe}"[:NAME_LENGTH],
         "network": network_entry(network, own.network.encoder, own.network.norm, recipe.width),
         "provenance": provenance,
         "quantisation": facts,
@@ -407,7 +413,7 @@ def _quantised(bundle: Bundle, recipe: _Recipe, chosen: NDArray[np.intp]) -> Qua
 
 
 def _float_model(bundle: Bundle, recipe: _Recipe) -> onnx.ModelProto:
-    """Return the network that is quantised: the avatar's own, or an untrained one."""
+    """Return the float network to quantise: the avatar's own, or an untrained one."""
     import torch
 
     from trilane.training.make_bundle import CALIBRATION_SHAPE, float_model
@@ -422,7 +428,7 @@ def _float_model(bundle: Bundle, recipe: _Recipe) -> onnx.ModelProto:
 
 
 def _named_weights(bundle: Bundle) -> Path:
-    """Return the file of the float network of `bundle`. Raises BadInputError without one."""
+    """Return the file of the float network of `bundle`. Raises BadInputError if there is none."""
     weights = float_weights(bundle)
     if weights is None:
         remedy = "`trilane avatar validate --float-network` notes which it is"
@@ -430,16 +436,16 @@ def _named_weights(bundle: Bundle) -> Path:
     return weights
 
 
-#: The name for the network of the avatar's own file.
+#: Calibration method that means the network in the avatar's own file.
 AS_IT_IS = "as-it-is"
-#: Number of views that networks are calibrated on that are compared with each other.
+#: Number of calibration views for networks that are compared with each other.
 COMPARED_VIEWS = 50
 
 
 class Calibrations:
-    """The network of the first avatar of `checked` by several methods of calibration, each made once.
+    """Networks of the first avatar of `checked`, one for each calibration method, each made once.
 
-    It is quantised from the avatar's own float network, on views drawn as in the training. Nothing else changes.
+    Each is quantised from the avatar's own float network, on views drawn as in training.
     """
 
     def __init__(self, checked: Checked) -> None:
@@ -448,7 +454,7 @@ class Calibrations:
         self._made: dict[str, NetworkFile] = {}
 
     def changed(self, checked: Checked, method: str) -> Checked:
-        """Return `checked` with the network by `method`, which is `AS_IT_IS` or a name of METHODS.
+        """Return `checked` with its network calibrated by `method`: `AS_IT_IS` or a name of METHODS.
 
         Raises BadInputError without the float network, MissingPartError without PyTorch.
         """
@@ -469,9 +475,9 @@ class Calibrations:
 
 
 def drawn_material(avatar: str, views: int, held_out: int) -> tuple[onnx.ModelProto, list[F32]]:
-    """Return the float network of `avatar`, and inputs (H,W,C): `views` of the training's kind, then `held_out` others.
+    """Return the float network of `avatar`, and float32 inputs (H,W,C): `views` as in training, then `held_out` others.
 
-    Raises BadInputError for an avatar without a float network here, MissingPartError without PyTorch or OpenGL.
+    Raises BadInputError if the float network is absent, MissingPartError without PyTorch or OpenGL.
     """
     bundle = load_bundle(avatar)
     weights = _named_weights(bundle)

@@ -1,10 +1,10 @@
-"""What `trilane times` makes of measurements: a document, the time of a stage in a pipeline file, rows for a fit.
+"""Results of `trilane times`: a document of measurements, a stage's time in a pipeline file, a row for a fit.
 
     reads = [read_measurements(path) for path in paths]
     document(reads)
     stage_text(Path("street.toml"), "seg", read, "RPC (execute) time")
 
-Rule: nothing is written here; each function returns the text of a file, checked as its reader would check it.
+Rule: nothing is written here. A changed file is returned as text, checked as its reader would check it.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from trilane.pipeline.pipeline_file import checked_tables, tables_of, time_of
 MOST_WRITTEN: Final = 10_000  # samples that are written into a pipeline file
 #: Columns of the rows for `trilane profiles fit`.
 FIT_COLUMNS: Final = ("network", "ms", "unit", "precision", "runtime", "source")
-#: Option of `trilane times` that sets a column.
+#: Column -> option of `trilane times` that sets it.
 OPTION_OF: Final = {"unit": "--hardware", "precision": "--precision", "runtime": "--runtime"}
-#: Words in which tools name the hardware of a run -> a profile's unit.
+#: A tool's word for the hardware of a run -> unit of a hardware profile.
 UNIT_OF_WORD: Final = {
     "CPU": "cpu", "XNNPACK": "cpu", "GPU": "gpu", "NPU": "dsp", "HTP": "dsp", "DSP": "dsp", "HEXAGON": "dsp",
 }  # fmt: skip
 
 
 def document(reads: Sequence[Measurements]) -> dict[str, Any]:
-    """Return all measurements as plain data, each with its file."""
+    """Return all files, measurements and refused rows as plain data; measurements and rows name their file."""
     return {
         "files": [
             {
@@ -54,7 +54,7 @@ def document(reads: Sequence[Measurements]) -> dict[str, Any]:
 
 
 def samples_csv(reads: Sequence[Measurements]) -> str:
-    """Return every single time as a row of a CSV, which `trilane times` reads again."""
+    """Return all single times as CSV, one a row, which `trilane times` can read."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(OWN_COLUMNS)
@@ -65,9 +65,9 @@ def samples_csv(reads: Sequence[Measurements]) -> str:
 
 
 def one_of(reads: Sequence[Measurements], name: str) -> tuple[Measurements, Measurement]:
-    """Return the measurement that `name` means, with its file; with an empty name the only run.
+    """Return the file that has the measurement `name`, and that measurement. An empty `name` means the only run.
 
-    Raises BadInputError for none, and for several files that have it.
+    Raises BadInputError if no file has such a measurement, or if several have.
     """
     holding = [read for read in reads if any(each.name == name for each in read.measurements)] if name else reads
     if not holding:
@@ -82,9 +82,9 @@ def one_of(reads: Sequence[Measurements], name: str) -> tuple[Measurements, Meas
 def stage_text(path: Path, stage: str, read: Measurements, measurement: Measurement) -> str:
     """Return the text of the pipeline file `path` with the measurement as the `time_ms` of `stage`.
 
-    Everything else of the file stays, comments too. A profile in the file's folder is named, others are written out.
-    The stage may lack a time before: the file is checked with it.
-    Raises BadInputError for a stage that is not there or too many samples, MissingPartError without tomlkit.
+    Everything else in the file stays, comments too. A measurement file below the folder of `path` is named; times of
+    any other file are written out. The stage may have no time before: the new text is checked.
+    Raises BadInputError for an unknown stage or too many samples, MissingPartError without tomlkit.
     """
     try:
         import tomlkit
@@ -93,7 +93,7 @@ def stage_text(path: Path, stage: str, read: Measurements, measurement: Measurem
     before = tables_of(path)
     stages = before.get("stages")
     if not isinstance(stages, dict) or not all(isinstance(each, dict) for each in stages.values()):
-        checked_tables(before, path)  # which says what is wrong
+        checked_tables(before, path)  # it raises: the stages are no tables
     elif stage not in stages:
         expected = f"one of {', '.join(stages)}"
         raise BadInputError(f"{path}: stages", f"no stage {stage!r}", expected, did_you_mean(stage, stages))
@@ -105,7 +105,7 @@ def stage_text(path: Path, stage: str, read: Measurements, measurement: Measurem
 
 
 def _as_toml(path: Path, read: Measurements, measurement: Measurement) -> Any:
-    """Return the value of `time_ms` as an inline table."""
+    """Return the value of `time_ms`, an inline table: the measurement's file and name, its samples, or mean and sd."""
     import tomlkit
 
     inside = Path(os.path.relpath(read.path.absolute(), path.absolute().parent))
@@ -125,18 +125,18 @@ def _as_toml(path: Path, read: Measurements, measurement: Measurement) -> Any:
 
 
 def _rounded(ms: float) -> float:
-    """Return a time with as many digits as clocks have: sums of floats end in digits that nobody measured."""
+    """Return `ms` with six significant digits: sums of floats end in digits that nobody measured."""
     return float(f"{ms:.6g}")
 
 
 def with_row(
     path: Path, read: Measurements, measurement: Measurement, network: str | None, asked: Mapping[str, str | None]
 ) -> tuple[str, list[str]]:
-    """Return the text of the table `path` with one row more, and lines that say what the row has and where it is from.
+    """Return the text of the table `path` with a new row, and lines that say the row and the sources of its values.
 
-    The row has the measurement's median, or else its mean. The table may be new. `asked`: the columns of OPTION_OF;
-    None means what the file says, or else what the fit assumes. Raises BadInputError for a time that is not of a whole
-    run, and for a table with other columns.
+    The row has the measurement's median or, without one, its mean. The table need not exist. `network`: the network
+    that was measured. `asked`: values of the columns of OPTION_OF; for None, the measurement file decides or, if it is
+    silent, the fit. Raises BadInputError for a time that is not a whole run's, and for a table with other columns.
     """
     if measurement.kind == "layer":
         runs = [repr(each.name) for each in read.measurements if each.kind == "run"]
@@ -162,7 +162,10 @@ def with_row(
 
 
 def _unit_told(read: Measurements, measurement: Measurement) -> str | None:
-    """Return the unit that did a run, as its file says of it or of each layer; None where that is not one unit."""
+    """Return the unit that did a run, from the hardware that the file names for the run or else for each layer.
+
+    None if these name no unit or several.
+    """
     layers = [each.hardware for each in read.measurements if each.kind == "layer"]
     named = [measurement.hardware] if measurement.hardware else layers
     units = [{unit for word, unit in UNIT_OF_WORD.items() if word in each.upper()} for each in named]

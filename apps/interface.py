@@ -41,22 +41,22 @@ if TYPE_CHECKING:
 
 
 INTERRUPTED = 130
-#: Defaults of a program's run that are not those of the command line.
+#: Defaults of `run` that differ from those of the command line.
 DEFAULTS = {"baseline_frames": 0}
-#: Options of a prediction that a program may give: those that lead to one answer, and to no file.
+#: Options that `predict` takes: those that give a single prediction and write no file.
 PREDICTED = PredictOptions.model_fields.keys() - (
     {"scene", "beside", "turns", "what_if", "plot", "trace", "table"} | OF_A_PIPELINE_ALONE
 )
 FRAME_TYPE = np.dtype(
     [("frame", np.int64), ("presented_ns", np.int64), ("frame_ns", np.int64), ("latency_ns", np.int64)]
 )
-#: Name of a row, its value, and where that comes from.
+#: Name, value and source of a row.
 Row = tuple[str, str, str]
 TOO_SHORT = "too short to tell"
 
 
 class Run:
-    """A finished run. It keeps the parts of its journal that it has read; `records` reads without keeping.
+    """A finished run. `jobs`, `events` and `idle` read the journal once; `records` and `frames` read it at each call.
 
     `folder`: run folder. `report`: report.json (docs/report.md), with the machine and the avatars' error.
     """
@@ -76,14 +76,14 @@ class Run:
         return run_html(self.report, str(self.folder))
 
     def records(self) -> Iterator[Record]:
-        """Yield the records of the journal after the first. Raises BadInputError."""
+        """Yield the records of the journal, without its first, `Begun`. Raises BadInputError."""
         return open_journal(self.folder)[1]
 
     @cached_property
     def jobs(self) -> NDArray[Any]:
-        """Every job, by their ends: a structured array of shape (jobs,) with the fields of docs/explain.md.
+        """All jobs in the order of their ends: a structured array of shape (jobs,) with the fields of docs/explain.md.
 
-        Times are int64, ns; words `str_`; figures of the stages float64, NaN where a stage has none. Raises
+        Times are int64, ns; words `str_`; metrics of the stages float64, NaN where a stage has none. Raises
         BadInputError.
         """
         figures = figure_names(self.folder)
@@ -102,7 +102,7 @@ class Run:
 
     @cached_property
     def idle(self) -> list[IdleSlice]:
-        """The idle slices of all units in the order of their ends, each with its time without a core."""
+        """The idle slices of all units, in the order of their ends."""
         begun, records = open_journal(self.folder)
         timeline = Timeline(begun.graph, begun.settings, idle=True)
         facts = [fact for record in records for fact in timeline.add(record)]
@@ -111,9 +111,9 @@ class Run:
     def frames(self) -> NDArray[Any]:
         """Return the presented frames, in order: a structured array of shape (frames,), all int64.
 
-        `frame`: number; `presented_ns`: time of presentation; `frame_ns`: time since the frame before, -1 for the
-        first; `latency_ns`: time from its sampled pose to the end of the stage that the pipeline names, -1 where
-        this stage did not take it.
+        `frame`: number; `presented_ns`: time of presentation; `frame_ns`: time since the previous presentation, -1 for
+        the first; `latency_ns`: time from the sampling of the pose to the end of the stage that the pipeline names, -1
+        if the frame skipped this stage.
         Raises BadInputError.
         """
         begun, records = open_journal(self.folder)
@@ -134,12 +134,15 @@ class Run:
         return pandas.DataFrame({name: self.jobs[name] for name in self.jobs.dtype.names or ()})
 
     def explain(self, slowest: int = 10) -> dict[str, Any]:
-        """Say where the time went, as `trilane explain RUN --json` does (docs/explain.md). Raises BadInputError."""
+        """Return where the time went: the document of `trilane explain RUN --json` (docs/explain.md).
+
+        `slowest`: number of frames to name. Raises BadInputError.
+        """
         return explain_run(self.folder, slowest)
 
 
 class RunFailedError(TrilaneError):
-    """A run ended before it was done. `run`: what was done until then."""
+    """A run ended early. `run`: the run up to its end. `exit_code`: exit code of `trilane run` for such a run."""
 
     def __init__(self, message: str, run: Run, exit_code: int) -> None:
         super().__init__(message)
@@ -147,7 +150,7 @@ class RunFailedError(TrilaneError):
 
 
 def load_run(folder: str | Path) -> Run:
-    """Load the run in `folder`. Raises BadInputError for a folder that is none, or that is not whole yet."""
+    """Return the run in `folder`. Raises BadInputError if there is no such folder, or no complete run in it."""
     place = _place("load_run", folder)
     if not place.is_dir():
         raise BadInputError(place, "no folder", "the folder of a run")
@@ -161,16 +164,15 @@ def run(
     on_message: Callable[[str], None] | None = None,
     **options: Any,
 ) -> Run:
-    """Run a scene on the three units, each a process of its own, and load what it wrote.
+    """Run a scene or a pipeline file, each unit in a process of its own, and return the finished run.
 
-    `scene`: a scene file, the name of one that comes with Trilane, or a pipeline file.
-    `options`: fields of `trilane.stages.run_options.RunOptions`; `trilane run --help` explains them. None leaves what
-    the scene says. No `sequential` run follows unless `baseline_frames` asks for one.
-    `cores` may be a mapping, such as {"dsp": [0, 1]}.
+    `scene`: a scene file, the name of a bundled scene, or a pipeline file.
+    `options`: fields of `trilane.stages.run_options.RunOptions`; `trilane run --help` explains them. None keeps the
+    value of the scene. `baseline_frames` adds a `sequential` run for comparison. `cores` may be a mapping, such as
+    {"dsp": [0, 1]}.
     `on_progress(policy, presented, requested)`, `on_message(text)`: called from this thread.
-    Raises BadInputError and MissingPartError for what cannot be run, RunFailedError for a run that ended early and
-    keeps its folder, TrilaneError for one that presented no frame, KeyboardInterrupt after an interrupted one was
-    written.
+    Raises BadInputError or MissingPartError if the run cannot begin. Raises TrilaneError if no frame was presented,
+    RunFailedError if the run ended early, and KeyboardInterrupt if it was interrupted. The last two keep its folder.
     """
     from trilane.apps.run.run_job import Hooks
     from trilane.pipeline.pipeline_file import is_pipeline_file
@@ -193,7 +195,10 @@ def run(
 def _signature(
     function: Callable[..., Any], model: type[Options], names: Iterable[str], defaults: Mapping[str, Any] | None = None
 ) -> inspect.Signature:
-    """Return the parameters of `function`, with one for each option in `names` in place of `**options`."""
+    """Return the signature of `function`, with a parameter for each option in `names` instead of `**options`.
+
+    `model`: class with all options. `defaults`: defaults that replace those of `model`.
+    """
     signature = inspect.signature(function, eval_str=True)
     first, *told, _ = signature.parameters.values()
     options = [
@@ -213,9 +218,9 @@ run.__signature__ = _signature(run, RunOptions, RunOptions.model_fields, DEFAULT
 class Prediction:
     """A hardware profile's prediction for an application or a network; every figure is computed.
 
-    `document`: keys of `trilane predict --json`.
-    `frame_ms`: frame time; `low_ms`, `high_ms`: interval that holds it with a probability of 80 %, None where nothing
-    was measured.
+    `document`: keys of `trilane predict --json`. `profile`: name of the hardware profile. `what`: what is predicted.
+    `frame_ms`: frame time; `low_ms`, `high_ms`: interval that contains the true frame time with a probability of 80 %,
+    None if nothing was measured.
     `latency_ms`: None for a network by itself.
     `power_w`: power of the whole device.
     """
@@ -236,12 +241,12 @@ class Prediction:
 
     @property
     def is_display_capped(self) -> bool:
-        """Say whether frames would come faster if the display showed them."""
+        """Say whether the display limits the frame rate."""
         return bool(self.document.get("display_capped", False))
 
     @property
     def units(self) -> Mapping[str, Any]:
-        """Return by unit its busy share and its idle shares by cause; empty for a network by itself."""
+        """Return each unit's busy share, and its idle shares by cause; empty for a network by itself."""
         found: Mapping[str, Any] = self.document.get("units", {})
         return found
 
@@ -274,10 +279,10 @@ def predict(
 
     `profile`: a hardware profile, by name or file. `options`: fields of
     `trilane.apps.predict.predict_options.PredictOptions` in `PREDICTED`; `trilane predict --help` explains them.
-    `avatar`: the application with this avatar's network, `default` if not given. `network`: an ONNX file by itself, or
-    with `application` in the avatar's application. `encoder`, `norm`, `size` or `channels`: the published application.
-    `on_message(text)`: function that is called before this machine is measured for the profile `host`, which may take
-    half a minute.
+    `avatar`: the application with this avatar's network, `default` if not given. `network`: an ONNX file by itself,
+    or with `application` the avatar's application with this file. `encoder`, `norm`, `size` or `channels`: the
+    published application.
+    `on_message(text)`: called before this machine is measured for the profile `host`, which may take half a minute.
     Raises BadInputError.
     """
     from trilane.apps.predict import asked_prediction as asked
@@ -307,9 +312,10 @@ predict.__signature__ = _signature(predict, PredictOptions, PREDICTED)  # type: 
 
 
 def _bound(function: Callable[..., Any], first: str | Path, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of `run` or `predict` by name, with new names for old ones.
+    """Return the arguments of `function` (`run` or `predict`) by name, with new names in place of old ones.
 
-    Each old name is a DeprecationWarning. Raises TypeError for an unknown one, with the most similar option.
+    `first`: value of the first parameter. Warns with DeprecationWarning of each old name. Raises TypeError, which names
+    the most similar option, for an unknown name.
     """
     command, signature = function.__name__, inspect.signature(function)
     warned = partial(warnings.warn, category=DeprecationWarning, stacklevel=5)  # at the caller of `run` or `predict`
@@ -322,14 +328,14 @@ def _bound(function: Callable[..., Any], first: str | Path, options: Mapping[str
 
 
 def _place(where: str, given: str | Path) -> Path:
-    """Return `given` as a path. Raises BadInputError for an empty one."""
+    """Return `given` as a path. Raises BadInputError, which names `where`, if it is empty."""
     if isinstance(given, str) and not given.strip():
         raise BadInputError(where, *EMPTY_PATH)
     return Path(given)
 
 
 def table(title: str, rows: Iterable[Row]) -> str:
-    """Write a table with a caption and a row for each figure."""
+    """Return an HTML table with `title` as its caption."""
     body = "".join(
         f"<tr><th style='text-align:left'>{escape(name)}</th><td style='text-align:left'>{escape(value)}</td>"
         f"<td style='text-align:left'><small>{escape(source)}</small></td></tr>"
@@ -340,7 +346,7 @@ def table(title: str, rows: Iterable[Row]) -> str:
 
 
 def run_html(report: Report, folder: str) -> str:
-    """Write the verdict and the figures of a run that people ask for first, with the machine and the avatar's error."""
+    """Return an HTML table of a run: its verdict, its main figures, the avatars' error and the machine."""
     verdict = [(label, text, "") for label, text in verdict_of(report, folder).lines()]
     return table(f"Run {folder}", [*verdict, *_run_rows(report)])
 
@@ -373,7 +379,7 @@ def _between(low: float | None, high: float | None) -> str:
 
 
 def _error(facts: Mapping[str, Any]) -> tuple[str, str]:
-    """Return PSNR by band and its source; else why there is none."""
+    """Return the PSNR by band of distance and its source; without a PSNR, `NO_FIGURES` and the reason."""
     if "psnr_db_by_band" not in facts:
         return NO_FIGURES, str(facts.get("why", ""))
     bands = ", ".join(f"{band} {value:.1f}" for band, value in facts["psnr_db_by_band"].items())
@@ -381,5 +387,5 @@ def _error(facts: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def prediction_html(title: str, rows: Mapping[str, str]) -> str:
-    """Write the figures of a prediction; all are computed."""
+    """Return an HTML table of a prediction. `rows`: computed value of each row, as text."""
     return table(title, ((name, value, COMPUTED) for name, value in rows.items()))

@@ -16,9 +16,10 @@ GONE_IN: Final = "0.3"
 
 
 class Renamed(NamedTuple):
-    """An option of `command` that was called `old`; both are written as they are typed.
+    """An option of `command` that was called `old` and is called `new`, both with their dashes.
 
-    `values`: pattern of the values for which `old` has the old meaning, where it has another one now.
+    `values`: regular expression of the values for which `old` has its old meaning. It is needed if `old` is also the
+    name of another option now.
     """
 
     command: str
@@ -27,7 +28,7 @@ class Renamed(NamedTuple):
     values: str = ".*"
 
     def means(self, value: object) -> bool:
-        """Return whether `old` with this value is the old option."""
+        """Return whether `old` with this value has its old meaning."""
         return re.fullmatch(self.values, str(value), re.DOTALL) is not None
 
 
@@ -40,20 +41,24 @@ OPTIONS: Final = (
     Renamed("predict", "--runtime", "--unit", "cpu|gpu|dsp|all"),
     Renamed("avatar create-data", "--output", "--picture"),
 )
-#: Options with a value of `trilane explain` now, and those that it had when it explained a scene.
+#: Options of `trilane explain` that take a value.
 OF_EXPLAIN: Final = frozenset({"--slowest", "--jobs"})
+#: Options that `trilane explain` had when it explained a scene.
 OF_A_SCENE: Final = frozenset(
     {"--motion", "--camera", "--avatar", "--frames", "--fps", "--picture", "--output", "--size", "--skinning"}
     | {"--cores", "--profile", "--performance-profile"}
 )
-#: Commands that are given another command with its options.
+#: Commands whose arguments contain another command with its options.
 WITH_COMMAND: Final = ("sweep", "tune")
 
 Note = Callable[[str], object]
 
 
 def in_new_names(words: Sequence[str], note: Note) -> list[str]:
-    """Return a command line without `trilane`, with new names for old ones. `note` is called for each old name."""
+    """Return a command line with new names in place of old ones. `words`: the command line after `trilane`.
+
+    `note`: called with a message for each old name.
+    """
     if not words:
         return []
     first, rest = words[0], list(words[1:])
@@ -72,7 +77,10 @@ def in_new_names(words: Sequence[str], note: Note) -> list[str]:
 
 
 def in_new_name(command: str, name: str, value: object, note: Note = lambda _: None) -> str:
-    """Return the name of the option of `command` that `name` means, both without dashes: `output` is `picture`."""
+    """Return the present name of the option `name` of `command`: `output` gives `picture`. Both are without dashes.
+
+    `value`: value of the option. `note`: called with a message if `name` is old.
+    """
     for each in OPTIONS:
         if each.command == command and each.old == f"--{name.replace('_', '-')}" and each.means(value):
             note(_said(name, each.new.removeprefix("--")))
@@ -81,7 +89,7 @@ def in_new_name(command: str, name: str, value: object, note: Note = lambda _: N
 
 
 def _options(command: str, words: Sequence[str], note: Note) -> Iterator[str]:
-    """Yield the words of `command` with its options by their new names."""
+    """Yield `words`, the arguments of `command`, with new names in place of old options."""
     for place, word in enumerate(words):
         name, equals, own = word.partition("=")
         value: Any = own if equals else next(iter(words[place + 1 :]), "")
@@ -108,7 +116,7 @@ def _is_of_a_scene(words: Sequence[str]) -> bool:
 
 
 def _is_scene(name: str) -> bool:
-    """Return whether `name` is a scene and no run: the folder of a run may have the name of a scene."""
+    """Return whether `name` means a scene: a TOML file, or a bundled scene if no run has that name."""
     from trilane.apps.watch.followed_run import folder_of
     from trilane.scene.schema import scene_names
 

@@ -29,7 +29,7 @@ Options = Mapping[str, Value]
 ID_DIGITS = 16
 MOST_TRIALS = 100_000
 EXPECTED = "a sweep (docs/sweeps.md)"
-#: Key -> the type of its value, and what that is called.
+#: Key -> the type of its value, and a message's words for such a value.
 KEYS: dict[str, tuple[type, str]] = {
     "command": (str, "a command in quotes, such as 'run' or 'bench raster'"),
     "kind": (str, "grid, list or random"),
@@ -74,10 +74,10 @@ def _kind_named(where: str, word: str) -> SweepKind:
 
 
 def trials_of(definition: Definition, words: Callable[[Options], Sequence[str]]) -> list[Trial]:
-    """Return the trials. The last axis changes fastest. A repeat of all configurations follows the one before.
+    """Return the trials of a sweep in their order. The last axis changes fastest.
 
-    If the machine slows down, all configurations then slow down.
-    `words`: gives the options of a configuration as a command line has them.
+    All configurations run once before any is repeated: if the machine slows down, all of them slow down.
+    `words`: function that returns options as the words of a command line.
     Raises BadInputError for axes that do not fit each other, for more than `MOST_TRIALS`, and for a trial given twice.
     """
     configurations = [*_configurations(definition)]
@@ -121,7 +121,7 @@ def _check(definition: Definition) -> None:
 
 
 def _count(definition: Definition) -> int:
-    """Return the number of configurations. Raises BadInputError where more are drawn than there are."""
+    """Return the number of configurations. Raises BadInputError if RANDOM draws more than the axes have."""
     if definition.kind is SweepKind.LIST:
         return max((len(values) for values in definition.axes.values()), default=1)
     whole = math.prod(len(values) for values in definition.axes.values())
@@ -134,7 +134,7 @@ def _count(definition: Definition) -> int:
 
 
 def _numbers(definition: Definition) -> Sequence[int]:
-    """Return the numbers of the combinations, as a grid numbers them; drawn ones are in the grid's order."""
+    """Return the numbers of the combinations to try, ascending: all of the grid's or, for RANDOM, a sample of them."""
     whole = math.prod(len(values) for values in definition.axes.values())
     if definition.kind is SweepKind.RANDOM:
         return sorted(random.Random(definition.seed).sample(range(whole), _count(definition)))
@@ -142,7 +142,7 @@ def _numbers(definition: Definition) -> Sequence[int]:
 
 
 def _combination(definition: Definition, number: int) -> list[Value]:
-    """Return combination `number`: it is written with one digit per axis, in the base of that axis's length."""
+    """Return the values of combination `number` of the grid, one for each axis. The last axis changes fastest."""
     digits: list[Value] = []
     for values in reversed(list(definition.axes.values())):
         number, place = divmod(number, len(values))
@@ -151,7 +151,7 @@ def _combination(definition: Definition, number: int) -> list[Value]:
 
 
 class TrialClock(StrEnum):
-    """The clock of a trial. HOST: the trial measures, and has its machine for itself. VIRTUAL: it computes times."""
+    """The clock of a trial. HOST: the trial measures and needs its machine for itself. VIRTUAL: it computes times."""
 
     HOST = "host"
     VIRTUAL = "virtual"
@@ -189,17 +189,17 @@ class Trial:
 
     @cached_property
     def id(self) -> str:
-        """The first 16 digits of the SHA-256 of the canonical configuration."""
+        """The name of the trial: the first 16 hexadecimal digits of the SHA-256 of `canonical`."""
         return hashlib.sha256(canonical(self.command, self.options, self.repeat).encode()).hexdigest()[:ID_DIGITS]
 
     @property
     def arguments(self) -> list[str]:
-        """The words after `trilane` on its command line."""
+        """The words of the trial's command line after `trilane`."""
         return [*self.command, *self.words, "--json"]
 
     @property
     def line(self) -> str:
-        """The command line that does the trial once more, without its run folder."""
+        """The command line that repeats the trial by hand. It names no run folder."""
         return shlex.join(["trilane", *self.arguments])
 
     @property
@@ -210,8 +210,8 @@ class Trial:
 def canonical(command: tuple[str, ...], options: Options, repeat: int = 1) -> str:
     """Return a configuration as JSON without spaces, keys sorted.
 
-    The first repeat is not named, so that more repeats leave its name as it is. Raises ValueError for NaN and
-    infinities.
+    The first repeat has no key `repeat`, so a sweep that gets more repeats keeps the names of its trials. Raises
+    ValueError for NaN and infinities.
     """
     named: dict[str, Any] = {"command": list(command), "options": dict(options)}
     if repeat > 1:
@@ -233,10 +233,10 @@ class SweepFile:
 
 
 def read_sweep(path: Path) -> SweepFile:
-    """Read the file of a sweep. Raises BadInputError when it cannot be read or is no sweep."""
+    """Read a sweep file. Raises BadInputError if `path` cannot be read or is no sweep."""
     try:
         data = tomllib.loads(read_text(path, EXPECTED))
-    except (ValueError, RecursionError) as error:  # also for numbers and lists that are too long
+    except (ValueError, RecursionError) as error:  # numbers and nested lists may be too long for the reader
         raise BadInputError(path, f"no TOML ({error})", EXPECTED) from error
     for key, value in data.items():
         _check_key(path, key, value)
