@@ -1,8 +1,8 @@
 """What does a speed cost in image error, for each size of tensor on each runtime?
 
-Rule: all rows use the same moments and the same part of the picture, where the avatars are. The pictures are made
-first, as a warm-up. After that, the rows take turns, one job at a time, over the frames in the scene's order. With two
-frames or more, no frame follows itself. Time without a core does not count.
+Rule: all rows use the same frames and the same part of the picture, where the avatars are. The pictures are made
+first, as a warm-up. After that, each round times every frame, in the scene's order, on every row in turn. Time without
+a core does not count.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from trilane.stages.configure import Checked, configure
 from trilane.stages.run_options import RunOptions
 from trilane.units import MEASURED
 
-#: Jobs that an interval of 95 % needs: the median of n jobs lies between the least and the largest with 1 - 2 / 2^n.
+#: Number of jobs that a 95 % interval needs. The median lies between the extremes of n jobs with probability 1 - 2/2^n.
 LEAST_JOBS = 6
 
 
 @dataclass(frozen=True)
 class SizeRow:
-    """The results of one size on one runtime. `infer_ms`, `frame_ms`: times of the jobs. `errors`: one per frame."""
+    """The results of one size on one runtime. `infer_ms`, `frame_ms`: times of each timed frame. `errors`: by frame."""
 
     size: str
     runtime: str
@@ -41,7 +41,7 @@ class SizeRow:
     errors: list[ErrorFigures] = field(default_factory=list)
 
     def time(self, number: int) -> None:
-        """Make frame `number`, and keep its times."""
+        """Make frame `number`, and record its times."""
         _, times = self.pictures.frame(number)
         self.infer_ms.append(sum(ms for stage, ms in times.items() if stage.startswith("infer")))
         self.frame_ms.append(sum(times.values()))
@@ -120,7 +120,7 @@ def measure(
 
 
 def refuse_twice(option: str, values: Sequence[str]) -> None:
-    """Raise BadInputError unless there are `values`, each once."""
+    """Raise BadInputError if there are no `values`, or if a value occurs twice."""
     if not values or len(set(values)) < len(values):
         raise BadInputError(option, ", ".join(values) or "none", "one or more, each once")
 

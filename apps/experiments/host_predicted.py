@@ -34,7 +34,7 @@ MIN_FRAMES = 100  # frames of a run that is placed by its times
 
 
 class Predicted(NamedTuple):
-    """A predicted time in milliseconds, and its 80 % interval; None where nothing could be measured."""
+    """A predicted time in milliseconds, and the ends of its 80 % interval, None if nothing could be measured."""
 
     ms: float
     low_ms: float | None
@@ -83,7 +83,7 @@ def _of_run(avatar: str) -> Predicted:
 
 
 def _run(avatar: str, frames: int, out: Path) -> tuple[float, float | None]:
-    """Return the milliseconds between the frames of a run, and the share of the cores that other programs had."""
+    """Do a run, and return its mean frame time in ms, and the share of the cores that other programs had."""
     options = RunOptions(avatar=avatar, frames=frames, baseline_frames=0, out=out)
     report = run_asked(options, quiet, ("trilane", "bench")).report
     return report.frame_time_ms.mean or 0.0, report.other_programs
@@ -117,7 +117,7 @@ def _row(name: str, what: str, predicted: Predicted, measured_ms: float, others:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the summary of rows of one kind, at least two."""
+    """Return the summary of rows of one kind (keys: see `measure`). `rows`: at least two."""
     squares = [math.log1p(row["error"]) ** 2 for row in rows]
     left_out = [(sum(squares) - one) / (len(squares) - 1) for one in squares]
     return {
@@ -131,5 +131,5 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[Hooks]:
-    """Give the hooks of a run that nobody watches."""
+    """Give hooks that print nothing."""
     yield Hooks(lambda *_: None, lambda _: None)
