@@ -90,7 +90,7 @@ def bundle_facts(bundle: Bundle) -> dict[str, Any]:
 
 
 def level_facts(level: MeshLevel, side: int) -> dict[str, Any]:
-    """Return the size of a level of the mesh and its error: of the surface at rest in mm, and at the seams in texels.
+    """Return the size of a level of the mesh, and its distance from the whole mesh: at rest in mm, at seams in texels.
 
     `side`: side of the texture in texels.
     """
@@ -171,7 +171,10 @@ def assemble(base: Bundle, parts: Parts, out: Path) -> dict[str, Any]:
 
 
 def _drawable(network: NetworkFile) -> NetworkFile:
-    """Return `network`. Raises BadInputError if the GPU cannot pack its input or its output bytes are no picture."""
+    """Return `network` unchanged.
+
+    Raises BadInputError for an input that the GPU cannot pack, and for an output that is no picture.
+    """
     from trilane.stages.gpu.raster import CHANNELS
 
     check_integer_layers(network)
@@ -443,9 +446,9 @@ COMPARED_VIEWS = 50
 
 
 class Calibrations:
-    """Networks of the first avatar of `checked`, one for each calibration method, each made once.
+    """Makes networks for the first avatar of `checked` with several calibration methods, once for each method.
 
-    Each is quantised from the avatar's own float network, on views drawn as in training.
+    The networks are quantised from the avatar's own float network, on views drawn as in training.
     """
 
     def __init__(self, checked: Checked) -> None:

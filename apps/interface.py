@@ -97,7 +97,7 @@ class Run:
 
     @cached_property
     def events(self) -> list[tuple[int, Event]]:
-        """The events that the scheduler received: (ns, event) in order, named tuples of `trilane.scheduler.events`."""
+        """The events that the scheduler received, in order: (time in ns, event of `trilane.scheduler.events`)."""
         return [(step.now_ns, event) for step in self.records() if isinstance(step, Stepped) for event in step.events]
 
     @cached_property
@@ -236,7 +236,7 @@ class Prediction:
 
     @property
     def fps(self) -> float:
-        """Return the frames a second."""
+        """Return the predicted rate, frames a second."""
         return 1e3 / self.frame_ms
 
     @property

@@ -1,7 +1,7 @@
-"""Names of commands and options that have changed: the old ones work for one version more, with a note.
+"""Names of commands and options that have changed: an old name works for one more version, with a note.
 
-Rule: this table is the only place that has an old name. A command line, an axis of a sweep and an option of a program
-are translated before anything else reads them.
+Rule: only this module has old names. A command line, an axis of a sweep and an option of a program are translated
+before other code reads them.
 """
 
 from __future__ import annotations

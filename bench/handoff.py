@@ -347,7 +347,7 @@ def check_bytes(payload: U8, value: int) -> None:
 
 
 def build(settings: Mapping[str, Any], unit: UnitContext) -> HandoffStage:  # noqa: ARG001 - a factory's signature
-    """Build the stage that `settings["name"]` names."""
+    """Return the stage with the name `settings["name"]`. This is the factory of all stages."""
     return HandoffStage(settings["name"])
 
 

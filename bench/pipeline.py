@@ -193,9 +193,9 @@ def _run(checked: Checked, plan: Setting, slowest_ms: float = 0.0) -> dict[str, 
 
 
 def finished_run(checked: Checked, what: str, least: int = 2, **options: Any) -> RunResult:
-    """Run `checked` with `options` of `run_avatar`, in a folder that is removed.
+    """Run `checked` in a temporary run folder, and return the result. `options`: further arguments of `run_avatar`.
 
-    Raises TrilaneError, which begins with `what`, when the run fails or presents fewer than `least` frames.
+    Raises TrilaneError if the run fails or presents fewer than `least` frames. `what`: beginning of its message.
     """
     with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
         placed = checked.changed(out_dir=Path(folder))
@@ -319,7 +319,7 @@ class Asked:
 class Ran(NamedTuple):
     """The result of a run.
 
-    `jobs`: all jobs that ended. `seats`: each unit's cores, as text.
+    `jobs`: all jobs that ended. `seats`: unit -> its cores, as text such as "0,1".
     """
 
     jobs: tuple[JobRecord, ...]

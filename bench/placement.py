@@ -156,7 +156,7 @@ class _Trial:
         ]
 
     def summary(self) -> dict[str, Any]:
-        """Compare the chosen placement with the best other one and the rule's, and the model with the trial."""
+        """Return the row of `sizes` in `measure`: the chosen placement against others, predictions against trials."""
         place = self._places["chosen"]
         mine = self._further[place]
         best = min(self._further, key=lambda other: (median(self._further[other]), other != place))

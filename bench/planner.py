@@ -138,9 +138,9 @@ class _Moment:
 
 
 class _Scene:
-    """One scene by both plans.
+    """Runs and compares one scene by both plans.
 
-    `name`: name of the scene. `driver`: OpenGL driver, once the scene was compared.
+    `name`: name of the scene. `driver`: facts about the OpenGL driver; empty before `compare`.
     """
 
     def __init__(self, name: str, frames: int, runtime: str, *, video: bool) -> None:

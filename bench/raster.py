@@ -149,7 +149,7 @@ def split_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int]) -> Draw:
 
 
 def uv_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int]) -> Draw:
-    """Return a function that draws the UV coordinates of the body as two bytes a pixel."""
+    """Return a function that draws the UV coordinates of the body, two bytes a pixel, and reads them."""
     image = UvBytes(ctx, SkinnedMesh(ctx, fixture.arrays))
 
     def draw_and_read(images: Any, number: int) -> None:

@@ -258,7 +258,7 @@ class SubUpload:
         """Do nothing: no memory is needed."""
 
     def write(self, texture: Any, image: U8) -> None:
-        """Copy at once."""
+        """Let the driver copy from `image` at once."""
         texture.write(image, alignment=1)
 
 

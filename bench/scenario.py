@@ -229,12 +229,12 @@ class Queries:
     _frames: int = 0
 
     def ask(self, requests: FrameRequestQueue, count: int = 1) -> None:
-        """Ask `count` queries now."""
+        """Ask `count` queries now, and note the time."""
         self.asked_s += [time.monotonic()] * count
         requests.request(count * self.size)
 
     def answered(self, _frame: int) -> None:
-        """Note a presented frame; the `FrameRequestQueue` calls this."""
+        """Note a presented frame, which may complete a query. The `FrameRequestQueue` calls this."""
         with self.changed:
             self._frames += 1
             if self._frames % self.size == 0:
@@ -279,7 +279,7 @@ class Queries:
 
     @property
     def latencies_ms(self) -> list[float]:
-        """Latencies of the answered queries, in the order in which they were asked."""
+        """The latencies of the answered queries, ms, in the order in which these were asked."""
         return [(end - begin) * 1e3 for begin, end in zip(self.asked_s, self.answered_s, strict=False)]
 
 

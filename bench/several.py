@@ -119,7 +119,7 @@ class _CrowdFixture:
         return rows
 
     def _picture(self, view: _View, shown: Sequence[int]) -> U8:
-        """Return the network's picture (h,w,4) with only the avatars `shown`."""
+        """Return the network's picture (h,w,4) uint8 of a tensor with only the avatars `shown`, given by number."""
         shape = view.layout.shape
         tensor, image, binding = self._binding(shape)
         target = self.packed.begin(shape)

@@ -131,7 +131,7 @@ class Comparison:
         return tuple(spoilt((*self.base.runs, *self.other.runs)))
 
     def as_json(self) -> dict[str, Any]:
-        """Return one entry of `comparisons`."""
+        """Return the comparison as an entry of `comparisons` in the document of `trilane compare --json`."""
         return {
             "run": self.other.name,
             "verdict": self.verdict,
@@ -200,7 +200,7 @@ def _differing(rows: Rows, figures: Sequence[Figure]) -> tuple[Figure, ...]:
 
 
 def _stages(report: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Return the names of each unit's stages."""
+    """Return the names of the stages, by unit. `report`: report as JSON."""
     found: dict[str, list[str]] = {}
     for name, row in report["stages"].items():
         found.setdefault(row["unit"], []).append(name)
@@ -223,7 +223,7 @@ def spoilt(runs: Sequence[ComparedRun]) -> Iterator[str]:
 
 
 def _about(told: ComparedRun) -> Iterator[str]:
-    """Yield remarks on the data of a run."""
+    """Yield remarks on what is known of a run: kind of data, number of frames, end of the journal."""
     if told.kind is RunKind.REPORT:
         yield "a report without a journal, so only summaries are compared, each as uncertain as the mean frame time"
     if told.kind is RunKind.TIMES:
@@ -340,7 +340,10 @@ def _heads(found: Rows) -> Iterator[str]:
 
 
 def _works(found: Rows, rows: Rows, changes: Sequence[Change]) -> Iterator[str]:
-    """Yield stages that take longer or shorter, the largest change in ms first. Stages with counts are left out."""
+    """Yield stages that take longer or shorter, the largest change in ms first.
+
+    Stages with counted instructions are left out: `_programs` names them.
+    """
     by_stage: dict[str, tuple[Figure, Difference]] = {}
     counted = {figure.of for figure in found if figure.measure in (INSTRUCTIONS, INSTRUCTION_TIME)}
     measure = WORK if any(figure.measure == WORK for figure in rows) else SERVICE
@@ -431,7 +434,7 @@ def name_of(figure: Figure) -> str:
 
 
 def value_of(value: float, unit: str) -> str:
-    """Return a value in its unit; a share is in percent."""
+    """Return a value with its unit; a share is in percent."""
     if unit == BYTES:
         return f"{value:,.0f} {unit}"
     if unit == "" and abs(value) >= IN_THOUSANDS:
@@ -440,7 +443,7 @@ def value_of(value: float, unit: str) -> str:
 
 
 def change_of(row: Difference, unit: str) -> str:
-    """Return the change: a ratio in percent, a share in points, anything else in its unit."""
+    """Return the change with its unit: a ratio in percent, a share in percentage points, other changes in `unit`."""
     return _scaled(row.change, row, unit)
 
 

@@ -52,8 +52,8 @@ class Finding(StrEnum):
 class Series:
     """One figure of every frame of a run, in order.
 
-    `frames` (n,): numbers of the frames. `values` (n,): figure of each frame. `weights` (n,): ones; for a share, the
-    totals that `values` are parts of, in the same unit.
+    `frames` (n,): numbers of the frames. `values` (n,): figure of each frame; for a share, its numerator. `weights`
+    (n,): for a share, its denominator in the same unit; otherwise 1.
     """
 
     frames: I64
@@ -218,7 +218,10 @@ def combined(pairs: Sequence[Difference]) -> Difference:
 
 
 def unsure(base: float, other: float, *, is_ratio: bool) -> Difference:
-    """Return a difference whose uncertainty is unknown."""
+    """Return the difference of `other` from `base` with unknown uncertainty.
+
+    `is_ratio`: whether the change is a share of the base; not if a value is 0 or less.
+    """
     is_ratio = is_ratio and min(base, other) > 0
     return _told((base, other), log(other / base) if is_ratio else other - base, None, is_ratio=is_ratio)
 

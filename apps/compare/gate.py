@@ -192,7 +192,7 @@ class JudgedLimit(NamedTuple):
         return f"{self.gate.text}: {self.outcome}: {self.reason}"
 
     def as_json(self) -> dict[str, Any]:
-        """Return one entry of `gates`."""
+        """Return the judgement as an entry of `gates` in the output of `trilane compare --json`."""
         return {
             "run": self.name,
             "limit": self.gate.text,
@@ -268,7 +268,10 @@ def _chance_of(least: float, row: Difference) -> float:
 
 
 def _settled(each: Weighed, is_sure: bool, tests: int, pair: GatedPair) -> Weighed:
-    """Return a figure with its outcome. `is_sure`: whether it is surely worse. `tests`: number of figures tested."""
+    """Return `each` with its outcome or, if that is unknown, with the number of runs that would decide.
+
+    `is_sure`: whether the figure is surely worse. `tests`: number of figures that are tested together.
+    """
     row = each.row
     if row.deviation is None:
         return each

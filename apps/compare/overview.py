@@ -314,7 +314,7 @@ def _shows(scene: Mapping[str, Any]) -> str:
 
 
 def _unusual(scene: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the keys of `scene` with values that differ from the defaults, such as `frames 60`."""
+    """Yield key and value of the settings of `scene` that differ from the defaults, such as `frames 60`."""
     usual = dict(_settings(Scene().model_dump(mode="json")))
     for key, value in _settings(scene):
         plain = re.sub(r"^avatars\[\d+\]", "avatars[0]", key)

@@ -314,7 +314,7 @@ def _names(dots: Sequence[Dot], across: _Axis, up: _Axis) -> Iterator[str]:
 
 
 def still(video: Path) -> bytes | None:
-    """Return the frame nearest before the middle of `video` as JPEG, at most `STILL_WIDTH` wide; None if unreadable."""
+    """Return a frame from about the middle of `video` as JPEG, at most `STILL_WIDTH` wide; None if unreadable."""
     try:
         with av.open(str(video)) as container:
             stream = container.streams.video[0]

@@ -326,26 +326,26 @@ class Noise(NamedTuple):
     held: frozenset[str] = frozenset()
 
     def of_time(self, statistic: str = "mean") -> Chance:
-        """Return the chance of times on the clock. The speed of the cores explains nothing: only stages show it."""
+        """Return the `Chance` of times on the clock. The speed of the cores explains no change: only stages show it."""
         return self._chance(TAILS.get(statistic, 1.0) * WALL_DEVIATION, explained=self.others[0])
 
     def of_wait(self, statistic: str) -> Chance:
-        """Return the chance of a wait in ms, which may be almost 0. No part of a change is explained."""
+        """Return the `Chance` of a wait in ms, which may be almost 0. No change is explained."""
         return self._chance(TAILS.get(statistic, 1.0) * (WALL_DEVIATION + self.others[0]), WAIT_FLOOR_MS)
 
     def of_share(self) -> Chance:
-        """Return the chance of shares of the time."""
+        """Return the `Chance` of shares of the time."""
         return self._chance(0.0, SHARE_DEVIATION, explained=self.others[2])
 
     def of_work(self, stage: str, statistic: str) -> Chance:
-        """Return the chance of a stage's time on its core."""
+        """Return the `Chance` of a stage's time on its core. `statistic`: as in `MEASURES`."""
         tail = TAILS.get(statistic, 1.0)
         if stage in self.held:
             return self._chance(tail * HELD_DEVIATION)
         return self._chance(tail * WORK_DEVIATION, explained=max(self.others[1], self.slower.get(stage, 0.0)))
 
     def of_count(self) -> Chance:
-        """Return the chance of counted instructions."""
+        """Return the `Chance` of counted instructions."""
         return self._chance(COUNT_DEVIATION)
 
     def _chance(self, relative: float, absolute: float = 0.0, explained: float = 0.0) -> Chance:
@@ -370,10 +370,10 @@ def noise_between(base: Documents, other: Documents, effects: Mapping[str, float
 
 
 def relief_of(base: Side, other: Side) -> float:
-    """Return how the ratio of times on the clock changes if other programs' share is taken out, as a logarithm.
+    """Return the largest change that other programs explain in the ratio of times, other to base, as a logarithm.
 
-    It is negative if other programs had more of the cores in `other`: without them, frames would take at most that much
-    less time.
+    The result is negative if other programs had more of the cores in `other`: without them, frames would take less
+    time, at most by this factor.
     """
     sides = [[told.document for told in side.runs if told.document["clock"] == HOST_CLOCK] for side in (base, other)]
     return _wall(*map(_others, sides)) if all(sides) else 0.0
@@ -388,7 +388,7 @@ def _wall(base: Sequence[float], other: Sequence[float]) -> float:
 
 
 def _left(others: float) -> float:
-    """Return the logarithm of the share of the cores that is left by other programs' share `others`."""
+    """Return log(1 - others): the logarithm of the share of the cores that other programs left to the run."""
     return log1p(-min(others, 1 - LEAST_LEFT))
 
 

@@ -148,7 +148,7 @@ def _plain(frames: I64, ns: I64) -> Series:
 
 
 def _stage(name: str, jobs: Sequence[JobRecord]) -> dict[Key, Series]:
-    """Return the times of a stage's jobs, by subject: `work` on the core, `service` from begin to end, and `wait`.
+    """Return times of a stage's jobs, by subject: `work` on the core, `service` from begin to end, `wait` before begin.
 
     The CPU time of all threads is added if the journal has it.
     """
@@ -219,7 +219,7 @@ def _figures(figures: Mapping[Key, Sequence[tuple[int, float]]]) -> dict[Key, Se
 
 
 def _instruction_times(series: Mapping[Key, Series]) -> dict[Key, Series]:
-    """Return the time on the core per instruction, ns, for each stage whose instructions were counted."""
+    """Return the series of time on the core per instruction, ns, for each stage with counted instructions."""
     found = {}
     for key, counted in series.items():
         if key.measure == INSTRUCTIONS:

@@ -64,7 +64,7 @@ ALWAYS_DIFFERENT: Final = ("made.at", "made.command")
 
 
 class RunKind(StrEnum):
-    """The known data of a run.
+    """How much is known of a run.
 
     RUN: every frame; REPORT: summaries; PREDICTION: summaries that a model computed; TIMES: imported measurements.
     """
@@ -99,9 +99,9 @@ class Side:
 
 
 def read_side(text: str) -> Side:
-    """Read the runs of a side. `text`: a path, or several joined by commas.
+    """Read the runs of a side. `text`: a path, or several paths joined by commas.
 
-    Raises BadInputError, also for a run that is named twice.
+    Raises BadInputError, also if a run is named twice.
     """
     names = [text] if text.strip() and _is_there(text) else text.split(",")
     for name in names:

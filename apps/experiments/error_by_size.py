@@ -47,7 +47,7 @@ class SizeRow:
         self.frame_ms.append(sum(times.values()))
 
     def as_json(self) -> dict[str, Any]:
-        """Return the row of `measure`."""
+        """Return the results as a row of `measure`."""
         low, high = median_interval(self.infer_ms) if len(self.infer_ms) >= LEAST_JOBS else (None, None)
         ssim = [error.ssim for error in self.errors if error.ssim is not None]
         return {
@@ -74,13 +74,13 @@ def measure(
 ) -> dict[str, Any]:
     """Image error and time of `frames` frames, evenly spread over the scene, by size of tensor and runtime.
 
-    Each frame is made once for its error, then `rounds` times for its times.
+    Each frame is made once for its error, then `rounds` times to measure times.
 
     Keys: `rows`: `size`, `runtime`, `threads`, `infer_ms` (median of timed jobs) with its 95 % interval `infer_low_ms`,
-    `infer_high_ms` (null of fewer than 6 jobs), `frame_ms` (median sum of all stages but present), and the error where
-    the avatars are: `psnr_db`, `mae` (steps of 1/255), `ssim`, `flip`, means over the frames, `worst_psnr_db` and
-    `p1_psnr_db`, the 1st percentile; `against`: what they are compared with; `frames`; `empty_frames`: with nobody in
-    view, not counted; `sources`; `config`.
+    `infer_high_ms` (null for fewer than 6 jobs), `frame_ms` (median time of all stages except present). Errors cover
+    the part of the picture with avatars: means over the frames `psnr_db`, `mae` (steps of 1/255), `ssim`, `flip`; the
+    worst frame `worst_psnr_db`; the 1st percentile `p1_psnr_db`. Other keys: `against`: name of the reference;
+    `frames`; `empty_frames`: frames with nobody in view, which do not count; `sources`; `config`.
 
     Raises BadInputError, MissingPartError.
     """

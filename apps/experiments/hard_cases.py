@@ -96,7 +96,7 @@ class Case:
 
     @property
     def tells(self) -> bool:
-        """Whether every wrong picture is above the bound."""
+        """Whether the error of every wrong picture is above the bound."""
         return self.bound < min(self.wrong.values())
 
     def verdict(self, error: float) -> str:
@@ -107,14 +107,14 @@ class Case:
 
 
 def make_pair(name: str) -> NetworkPair:
-    """Return the pair of row `name` of `NETWORKS`. Raises MissingPartError without PyTorch."""
+    """Return the network `name` of `NETWORKS`, in float and in integers. Raises MissingPartError without PyTorch."""
     network = float_network(name)
     quantised = quantise(network, calibration_frames())
     return NetworkPair(network, quantised, noise_model(quantised))
 
 
 def make_case(pair: NetworkPair, case: str) -> Case:
-    """Return row `case` of `INPUTS` on the networks of `pair`."""
+    """Return the case of the networks `pair` with the input `case` of `INPUTS`."""
     encoding = pair.quantised.network.input
     steps = np.round(case_input(case) / encoding.scale) + encoding.zero_point
     tensor = np.ascontiguousarray(np.clip(steps, 0, 255).astype(np.uint8)[None])
@@ -223,7 +223,7 @@ def case_input(case: str) -> F32:
 
 
 def calibration_frames() -> list[F32]:
-    """Return usual frames, each (SIDE, SIDE, CHANNELS)."""
+    """Return `CALIBRATION_FRAMES` inputs of the kind "usual", each (SIDE, SIDE, CHANNELS)."""
     rng = np.random.default_rng(NETWORK_SEED)
     return [INPUTS["usual"](rng) for _ in range(CALIBRATION_FRAMES)]
 

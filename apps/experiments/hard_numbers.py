@@ -204,7 +204,7 @@ def _left_out(shaped: ShapedBody) -> Iterator[HardNumber]:
 def _fewer(shaped: ShapedBody, count: int, poses: Sequence[F64], metres: float, what: str) -> HardNumber:
     """Return the row about skinning with the `count` largest weights. `metres`: distance of the body from the origin.
 
-    The bound is the proof's, plus the rounding of both weighted sums: gamma_n times the reach of the body each.
+    The bound is the proof's, plus gamma_n times the reach of the body for the rounding of each of the weighted sums.
     """
     skeleton = Skeleton(shaped.joints, shaped.body.parents)
     few, whole = CpuSkinner(shaped, count, pose_blend=False), CpuSkinner(shaped, pose_blend=False)
@@ -469,7 +469,7 @@ def _is_taken(value: float) -> bool:
 
 
 def scene_cases() -> Iterator[HardNumber]:
-    """Yield a row for each scene of `JUMPS`."""
+    """Yield a row for each scene of `JUMPS`: bytes of tensors that depend on the frames drawn before."""
     for scene, frames in JUMPS.items():
         checked = configure(RunOptions(scene=scene, runtime=RUNTIME), Path.cwd())
         last = checked.config.scene.frames - 1

@@ -44,16 +44,16 @@ class Predicted(NamedTuple):
 def measure(
     avatar: str = "default", width: tuple[int, ...] = (8, 24, 32, 40, 48), frames: int = 200, seconds: float = 3.0
 ) -> dict[str, Any]:
-    """Predicted beside measured: the avatar with its own network, then with an untrained one of each `width`.
+    """Predicted and measured times: the avatar with its own network, then with an untrained network of each `width`.
 
-    Two rows for each network: `what` is `run` (time between frames of a run of `frames` frames) or `network` (median of
-    the calls of `seconds` seconds). `predicted_ms`, `low_ms`, `high_ms`; `measured_ms`; `error`: predicted over
-    measured, less 1; `inside`: whether the measured time is in the 80 % interval; `others`: share of the cores that
+    Two rows for each network: `what` is `run` (mean frame time of a run of `frames` frames) or `network` (median time
+    of calls in `seconds` seconds). `predicted_ms`, with the 80 % interval `low_ms`, `high_ms`; `measured_ms`; `error`:
+    predicted / measured - 1; `inside`: whether the measured time is in the interval; `others`: share of the cores that
     other programs had in the run. Above 0.1, the row says little.
 
     `run`, `network`: summary of the rows of that kind. `inside`: number of rows in their interval, out of `of` rows.
-    `median_error`: median of the absolute errors. `leave_one_out_error`: root mean square of the errors as logarithms.
-    `inside_left_out`: number of rows in the interval that follows from the other rows' errors alone.
+    `median_error`: median of the absolute errors. `leave_one_out_error`: root mean square of log(predicted / measured).
+    `inside_left_out`: number of rows in the 80 % interval that follows from the errors of all other rows.
 
     Raises BadInputError, MissingPartError without PyTorch, TrilaneError when a run fails.
     """

@@ -218,7 +218,7 @@ class ReferencePath:
         return self.frames.gl
 
     def network_of(self, seen: CastView) -> int:
-        """Return the number of the network that paints an avatar."""
+        """Return the number of the network that paints the visible avatar `seen`."""
         return self._network_of(seen.index)
 
     def frame(self, number: int) -> ReferenceFrame:

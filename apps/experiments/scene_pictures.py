@@ -183,7 +183,7 @@ def _row(pair: tuple[str, str], steps: list[tuple[float, int, int]]) -> dict[str
 
 
 class _Sessions:
-    """A network on each runtime, by tensor shape."""
+    """Runs a network on several runtimes. Sessions are kept by runtime and tensor shape."""
 
     def __init__(self, network: NetworkFile, runtimes: Sequence[str]) -> None:
         self._network = network
@@ -191,7 +191,7 @@ class _Sessions:
         self._bound: dict[tuple[str, Shape], tuple[U8, U8, Binding]] = {}
 
     def picture(self, runtime: str, tensor: U8) -> U8:
-        """Return the picture (h,w,4) that `runtime` makes of `tensor` (h,w,C)."""
+        """Return the picture (h,w,4) uint8 by `runtime` from `tensor` (h,w,C) uint8."""
         shape = (int(tensor.shape[0]), int(tensor.shape[1]))
         if (runtime, shape) not in self._bound:
             slots = np.empty((1, *tensor.shape), np.uint8), np.empty((1, *shape, 4), np.uint8)
@@ -216,7 +216,7 @@ def _tensors(checked: Checked, frames: Sequence[int]) -> Iterator[tuple[int, int
 
 
 class DrawnTensors:
-    """The pose and raster stages of the scene in `checked`, as in a run, and the slots between them."""
+    """Draws the tensors of the scene in `checked` with a run's pose and raster stages."""
 
     def __init__(self, checked: Checked) -> None:
         config, assets = checked.config, checked.assets

@@ -100,7 +100,7 @@ class RunExplanation:
         self._said: deque[str] = deque(maxlen=MOST_MESSAGES)
 
     def add(self, record: Record) -> None:
-        """Take the next record."""
+        """Take the next record of the journal."""
         if isinstance(record, Said):
             self._said.append(record.text)
         for fact in self._timeline.add(record):
@@ -196,9 +196,9 @@ class RunExplanation:
         }
 
     def _of_cores(self, frame_ms: float | None, efficiency: float | None) -> dict[str, Any] | None:
-        """Return the run's cores, and per frame the CPU time of all jobs and the time of these cores, ms.
+        """Return the run's cores and, for a mean frame, the time that the cores had and the CPU time of all jobs.
 
-        None if one of them is unknown.
+        `frame_ms`: mean frame time. `efficiency`: machine efficiency. None if a part is unknown.
         """
         cores = sorted({core for place in self._places.values() for core in place.cores})
         if frame_ms is None or efficiency is None or not cores or len(self._places) < len(self._begun.graph.units):
@@ -406,7 +406,7 @@ class Joins:
         self._after_ns = {name: Counter[str]() for name in self._reads}
 
     def add(self, explained: ExplainedJob) -> None:
-        """Take the next job, in the order of their ends."""
+        """Count a job. Jobs must come in the order of their ends."""
         job = explained.job
         if read := self._reads.get(job.stage):
             ends = sorted((self._ends[name].get(job.frame, -1), name) for name in read)

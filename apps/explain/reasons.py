@@ -1,8 +1,8 @@
 """Why a run takes its time, in words: its slowest frames with their reasons, what bounded it, and what to try.
 
-Rule: each cause names its evidence. A frame's time is the path that ends with it, from the presentation of the frame
-before to its own. The usual length of a part of the path is its median over the run's frames. Parts that took longer
-than usual made the frame slow.
+Rule: each cause names its evidence. A frame's time is the critical path between the presentation of the frame before
+and its own presentation. The usual length of a part of the path is its median over the run's frames. Parts that took
+longer than usual made the frame slow.
 """
 
 from __future__ import annotations
@@ -67,7 +67,10 @@ class Usual(NamedTuple):
 
 
 class Reason(NamedTuple):
-    """Why a frame was slow. `cause`, `stage`: part of the path that took longer, by `longer_ms`. `text`: in words."""
+    """Why a frame was slow: the part (`cause`, `stage`) of its path took `longer_ms` more than usual.
+
+    `text`: the reason in words.
+    """
 
     cause: str
     stage: str
@@ -222,7 +225,10 @@ def _text(shown: ShownFrame, usual: Usual, part: Part, longer_ns: float) -> str:
 
 
 def _work(shown: ShownFrame, usual: Usual, job: JobRecord, longer_ns: float) -> str:
-    """Return why a stage had a larger part: its job was long, or more of the job lay between the two frames."""
+    """Return, in words, why a stage's work took a larger part of the path.
+
+    Either its job took longer, or less of the job overlapped with the frame before.
+    """
     service_ns, usual_ns = job.end_ns - job.begin_ns, usual.service_ns.get(job.stage, 0.0)
     times = f"{service_ns / NS_PER_MS:.1f} ms, median {usual_ns / NS_PER_MS:.1f}"
     whose = "" if job.frame == shown.now.frame else f" of frame {job.frame}"
@@ -236,7 +242,7 @@ def _work(shown: ShownFrame, usual: Usual, job: JobRecord, longer_ns: float) -> 
 def bound_text(bound: Mapping[str, Any]) -> str:
     """Return a report's `bound` in words: the unit and the stage, what slowing them costs and their shares of the path.
 
-    Units and stages with most of the path, if others than the bound, come last.
+    If another unit or stage has most of the path, it is named last.
     """
     named = ", and of stages most ".join(part_text(part) for part in (bound["unit"], bound["stage"]) if part)
     path = bound.get("path") or {}
@@ -245,7 +251,7 @@ def bound_text(bound: Mapping[str, Any]) -> str:
 
 
 def part_text(part: Mapping[str, Any]) -> str:
-    """Return a unit or stage of a report's `bound` in words, with its interval and its rivals."""
+    """Return an entry of a report's `bound`, a unit or a stage, in words, with its interval and its rivals."""
     cost = part.get("cost")
     key, value = ("share", part["share"]) if cost is None else ("cost", cost)
     low, high = part[f"{key}_low"], part[f"{key}_high"]

@@ -211,8 +211,8 @@ ALWAYS = ("pose", "composite", "present")
 class PlanExplanation:
     """An explained plan.
 
-    `document`: keys of `trilane plan --json`. `plan`, `first_frames`: plan and first frame of each phase, to be
-    drawn.
+    `document`: document of `trilane plan --json`. `plan`: the plan, and `first_frames`: the first frame of each phase,
+    both for the drawing.
     """
 
     document: dict[str, Any]
@@ -221,7 +221,7 @@ class PlanExplanation:
 
 
 def explain(checked: Checked, profile: str, performance_profile: str, most_measured: int = 24) -> PlanExplanation:
-    """Explain the plan of a scene that was checked.
+    """Return the explained plan of a checked scene.
 
     `profile`, `performance_profile`: hardware profile and performance profile that the costs are computed with.
     `most_measured`: number of phases whose error is measured, at one frame each.

@@ -107,7 +107,7 @@ class RunTracks:
         self._now_ns = now_ns
 
     def _count(self) -> None:
-        """Write the counters of the last step, whose records are all known now."""
+        """Write the counters of the last step. Call it when all records of the step are known."""
         if self._now_ns is not None:
             line, stages = self._timeline, self._begun.graph.stages
             self._frames.count(self._now_ns, len(line.frames))
@@ -135,13 +135,13 @@ class TraceWriter:
         self._tracks.add(record)
 
     def close(self) -> None:
-        """Complete the trace."""
+        """Write the rest of the trace. The file stays open."""
         self._tracks.close()
         self._sink.close()
 
 
 def write_trace(records: Iterable[Record], file: IO[bytes]) -> None:
-    """Write the trace of a journal's `records` as Perfetto's packets."""
+    """Write the trace of a journal's `records` to `file` as Perfetto's packets."""
     write_tracks(PacketSink(file), {"trilane": records})
 
 
@@ -213,7 +213,7 @@ class _FrameTracks:
         self._before_ns: int | None = None
 
     def add(self, frame: Presented | Gone) -> None:
-        """Take a frame that has left the pipeline: presented, lost or dropped."""
+        """Write a frame that has left the pipeline: presented, lost or dropped."""
         if isinstance(frame, Gone):
             if frame.frame != UNKNOWN:
                 self._expect(frame.frame, frame.release_ns)
@@ -291,7 +291,7 @@ class _UnitTracks:
             tiles.start(at_ns)
 
     def work(self, worked: Worked) -> None:
-        """Take a job that has ended."""
+        """Write a job that has ended, and the counters that it changed."""
         job = worked.job
         self._tiles[job.unit].add(job.begin_ns, job.end_ns, job)
         self._sink.slice(self._stages[job.stage], job.begin_ns, job.end_ns, f"{job.frame}")
@@ -299,7 +299,7 @@ class _UnitTracks:
         self._write(job.unit)
 
     def idle(self, piece: IdleSlice) -> None:
-        """Take a slice of a unit's idle time."""
+        """Write a slice of a unit's idle time."""
         self._tiles[piece.unit].add(piece.begin_ns, piece.end_ns, piece)
         self._write(piece.unit)
 
@@ -369,7 +369,7 @@ class Tiles(Generic[Item]):
         heappush(self._waiting, (begin_ns, end_ns, self._count, item))
 
     def start(self, at_ns: int) -> None:
-        """Begin the track's time."""
+        """Set the time at which the first slice of the track begins."""
         self._until_ns = at_ns
 
     def take(self, *, rest: bool = False) -> Iterator[tuple[int, int, Item]]:

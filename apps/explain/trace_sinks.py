@@ -40,10 +40,10 @@ class FlowArrow(NamedTuple):
 
 
 class Sink(Protocol):
-    """A trace file that is being written."""
+    """A writer of a trace file. Tracks have numbers, which its methods return and take."""
 
     def recurring(self, names: Iterable[str]) -> None:
-        """Announce names of slices and instants that come again and again."""
+        """Announce names of slices and instants that will occur often."""
 
     def process(self, name: str) -> int:
         """Begin a group of tracks; return the number of its top track."""

@@ -53,8 +53,9 @@ class SweepKind(StrEnum):
 class Definition:
     """A sweep to be done.
 
-    `command`: its words. `options`: fixed options. `axes`: option -> its values, at least one. `count`: number of
-    configurations that RANDOM draws. `seed`: seed of RANDOM. `repeats`: trials of every configuration.
+    `command`: words of the command. `options`: fixed options. `axes`: option -> values to try, at least one. `kind`:
+    how axes are combined. `count`: number of configurations that RANDOM draws. `seed`: seed of RANDOM. `repeats`:
+    number of trials of each configuration.
     """
 
     command: tuple[str, ...]
@@ -178,8 +179,8 @@ COMMANDS = {
 class Trial:
     """One configuration of a command, to be run once.
 
-    `command`: its words, such as `bench raster`. `options`: options by name, without dashes. `words`: the options as
-    typed. `repeat`: number of the repeat, from 1.
+    `command`: words of the command, such as `bench raster`. `options`: values by name, without dashes. `words`: options
+    and values as words of a command line. `repeat`: number of the repeat, from 1.
     """
 
     command: tuple[str, ...]
@@ -221,7 +222,7 @@ def canonical(command: tuple[str, ...], options: Options, repeat: int = 1) -> st
 
 @dataclass(frozen=True)
 class SweepFile:
-    """The content of a sweep file."""
+    """The content of a sweep file (docs/sweeps.md). The values of options are not checked."""
 
     command: tuple[str, ...]
     kind: SweepKind = SweepKind.GRID

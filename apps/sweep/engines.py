@@ -252,7 +252,7 @@ def _text(file: Any) -> str:
 
 
 def _remove(own: Path) -> None:
-    """Remove the run folder of a trial, whole or partial."""
+    """Remove the run folder `own` of a trial, complete or partial."""
     shutil.rmtree(own, ignore_errors=True)
     for draft in own.parent.glob(f"{own.name}.*.partial"):
         shutil.rmtree(draft, ignore_errors=True)

@@ -38,7 +38,7 @@ Do = Callable[[Sequence[Trial]], Mapping[str, Record]]
 
 
 class GoalMetric(NamedTuple):
-    """A figure of a result. `path`: its keys in the `--json` document, empty for the PSNR, which has several places."""
+    """A figure of a result. `path`: keys that lead to it in the `--json` document; empty for the PSNR (`entry_of`)."""
 
     unit: str
     more_is_better: bool
@@ -152,7 +152,7 @@ def figures_of(record: Record | None, names: Sequence[str] = ()) -> dict[str, fl
 
 
 def _is_no_time(name: str, value: float) -> bool:
-    """Say whether `value` is 0 although `name` is a time, as in a run without times. It would win every comparison."""
+    """Say whether `name` is a time, but `value` is 0, because the run has no times. 0 would win every comparison."""
     return name in METRICS and METRICS[name].unit == "ms" and value <= 0
 
 
@@ -256,7 +256,7 @@ class Search:
 
     @property
     def left(self) -> int:
-        """The number of configurations that were not proposed."""
+        """The number of configurations that were not proposed yet."""
         return len(self.space.trials) - len(self._given)
 
     def propose(self) -> tuple[Any, Trial]:

@@ -74,7 +74,7 @@ class StageFigures:
 
 @dataclass(frozen=True)
 class DropCount:
-    """Frames dropped at `edge`, "producer->consumer", for `cause`."""
+    """Number of frames that were dropped at `edge` ("producer->consumer") for `cause`."""
 
     edge: str
     cause: str

@@ -1,7 +1,7 @@
-"""A run that others follow, during it or after it: the place of its journal, and its state.
+"""A run that is followed while it goes on or afterwards: the place of its journal, and its state.
 
-Rule: a follower changes nothing of the run. A live run writes into `NAME.PID.partial` beside its place (run_folder.py).
-A request for NAME finds that folder, and still follows it after the folder gets its name.
+Rule: following a run does not change it. A live run writes into the partial folder `NAME.PID.partial` (run_folder.py).
+A request for NAME finds the partial folder, and follows the run when the folder is renamed to NAME.
 """
 
 from __future__ import annotations

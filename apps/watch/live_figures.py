@@ -115,7 +115,7 @@ class LiveFigures:
 
     @property
     def last_ns(self) -> int:
-        """Return the time of the last record that has one; 0 before the first."""
+        """Return the time of the last record with a time, ns; 0 before the first such record."""
         return self._last_ns
 
     @property

@@ -56,9 +56,9 @@ class _Actor:
 
 
 class Cast:
-    """The avatars and the camera of a scene.
+    """The avatars and the camera of the scene in `checked`.
 
-    `avatars`: each distinct avatar, by the folder of its bundle.
+    `avatars`: distinct avatars, by the folder of the bundle.
     """
 
     def __init__(self, checked: Checked) -> None:
@@ -135,7 +135,7 @@ class Box(NamedTuple):
         return Rect(self.left * across - 1, 1 - self.bottom * down, self.right * across - 1, 1 - self.top * down)
 
     def within(self, other: Box) -> Rect:
-        """Return the box in normalised device coordinates of a picture that fills `other`."""
+        """Return the box in the normalised device coordinates of a picture with the pixels of `other`."""
         moved = Box(self.top - other.top, self.left - other.left, self.bottom - other.top, self.right - other.left)
         return moved.rect(other.shape)
 

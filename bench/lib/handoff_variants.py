@@ -28,7 +28,7 @@ SHM = Path("/dev/shm")  # noqa: S108 - only files with this program's prefix are
 
 
 class Producer(Protocol):
-    """The end that writes."""
+    """The end of a channel that writes."""
 
     def buffer(self) -> U8:
         """Return an array for the next bytes."""
@@ -38,7 +38,7 @@ class Producer(Protocol):
 
 
 class Consumer(Protocol):
-    """The end that reads."""
+    """The end of a channel that reads."""
 
     def receive(self) -> U8:
         """Wait for the next bytes, and return them. They are valid until `release`."""
@@ -123,7 +123,7 @@ class _SlotEnd:
 
 
 class _OwnEnd:
-    """An end with an array of its own process."""
+    """An end of a channel that copies bytes: its array belongs to its own process."""
 
     def __init__(self, size: int) -> None:
         self._own = np.zeros(size, np.uint8)

@@ -84,7 +84,7 @@ def error_maps(picture: U8, reference: U8) -> tuple[F64, F64, F64]:
 
 
 def ssim_map(picture: F64, reference: F64) -> F64:
-    """Return SSIM (h,w) of two pictures (h,w,3) in 0..1, mean over the colours, by windows of 7 x 7 pixels."""
+    """Return the SSIM (h,w) of two pictures (h,w,3) in 0..1: windows of 7 x 7 pixels, mean over the colours."""
     from skimage.metrics import structural_similarity
 
     _, similar = structural_similarity(picture, reference, channel_axis=2, data_range=1.0, full=True)
@@ -92,7 +92,7 @@ def ssim_map(picture: F64, reference: F64) -> F64:
 
 
 def flip_map(picture: F64, reference: F64) -> F64:
-    """Return FLIP (h,w) of two pictures (h,w,3), sRGB in 0..1."""
+    """Return the FLIP error (h,w) of two pictures (h,w,3), sRGB in 0..1."""
     import flip_evaluator
 
     real = [np.ascontiguousarray(image, np.float32) for image in (reference, picture)]

@@ -81,7 +81,7 @@ class StageChain:
 
 
 class AvatarFrames:
-    """Makes the frames of a scene, as a run presents them."""
+    """Makes the frames of the scene in `checked`, as a run presents them. `units`: contexts of its units, by name."""
 
     def __init__(self, checked: Checked, units: Units | None = None) -> None:
         """Build the stages. Raises BadInputError, MissingPartError.
@@ -140,7 +140,7 @@ class AvatarFrames:
 
     @property
     def posed(self) -> NDArray[np.void]:
-        """Return the pose stage's header of the latest frame, as in `stages/config.py`."""
+        """Return the header that the pose stage wrote for the latest frame (`pose_dtype` of `stages/config.py`)."""
         return self._chain.packets[0].header
 
     @property
