@@ -1,6 +1,6 @@
-"""Measurements of this machine: a module for each question, whose `measure` answers it, and `lib/` for what they share.
+"""Measurements of this machine: a module for each question, with a function `measure`, and shared parts in `lib/`.
 
-It may use every folder but apps/. The parameters of `measure` are options of `trilane bench`, explained in its help.
+This folder may import from every folder but apps/. The parameters of `measure` are options of `trilane bench`.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 from trilane import machine
 from trilane.errors import BadInputError
 
-#: Least and greatest value of each option. It means the same in every bench; one that needs a narrower range checks it.
+#: Least and greatest value of each option, which means the same in every bench. A bench may check a narrower range.
 LIMITS: dict[str, tuple[float, float]] = {
     "repeats": (1, 100_000),
     "threads": (0, 4 * machine.here.core_count()),
@@ -33,10 +33,7 @@ LIMITS: dict[str, tuple[float, float]] = {
 
 
 def check_limits(asked: Mapping[str, Any]) -> None:
-    """Raise BadInputError for a number that is out of its option's range.
-
-    `asked`: value or values of each option.
-    """
+    """Raise BadInputError if a value is outside its option's range. `asked`: value or values of each option."""
     for option, values in asked.items():
         low, high = LIMITS.get(option, (None, None))
         if low is None or high is None:

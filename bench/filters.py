@@ -1,7 +1,7 @@
 """What do MIP maps and anisotropic filtering of the neural texture cost, and what do they change?
 
-Rule: there is one avatar and one view, in poses that take turns, and the filters are interleaved; every filter's last
-picture is compared with the same ground truth.
+Rule: all filters read the same avatar in the same view and poses, interleaved. The last picture of every filter is
+compared with the same ground truth.
 """
 
 from __future__ import annotations
@@ -35,10 +35,11 @@ MAX_SIDE = 2048
 
 
 def measure(sizes: tuple[int, ...] = (64, 128, 256, 512), repeats: int = 20) -> dict[str, Any]:
-    """The default avatar, standing, in square tensors of `sizes`, read with every filter of the packed pass.
+    """The default avatar, standing, drawn into square tensors with every texture filter of the packed pass.
 
-    Keys: `rows`, one per size and filter: `raster_ms` (median), `steps_mean` (mean difference from `linear` over the
-    body's bytes), `psnr_db` (of the painted picture; the network was trained with `linear`); `sources`; `driver`;
+    `sizes`: sides of the tensors, pixels. `repeats`: timed draws of each filter.
+    Keys: `rows`, one per size and filter: `raster_ms` (median), `steps_mean` (mean difference of the body's bytes from
+    those of `linear`), `psnr_db` (of the painted picture; the network was trained with `linear`); `sources`; `driver`;
     `config`.
 
     Raises BadInputError, MissingPartError.
@@ -58,7 +59,7 @@ def measure(sizes: tuple[int, ...] = (64, 128, 256, 512), repeats: int = 20) -> 
 
 
 class _FilterFixture:
-    """The default avatar drawn with every filter."""
+    """The default avatar, ready to be drawn with every filter, with its network and ground truth."""
 
     def __init__(self) -> None:
         bundle, assets = load_bundle("default"), load_drawable("default")
@@ -71,7 +72,7 @@ class _FilterFixture:
             self._drawn[name] = packed, PackedAvatar(packed, SkinnedMesh(self.ctx, assets.arrays), assets.texture)
 
     def rows(self, shape: tuple[int, int], repeats: int) -> list[dict[str, Any]]:
-        """Return one row per filter."""
+        """Return one row of `measure` per filter. `shape`: (height, width) of the tensor."""
         slots = {name: np.empty((SLOTS, *shape, drawn[0].channels), np.uint8) for name, drawn in self._drawn.items()}
         variants = {name: partial(self._draw, name, shape, tensors) for name, tensors in slots.items()}
         times = interleaved_ms(variants, repeats)

@@ -1,8 +1,8 @@
 """How soon after the producer's last write can the consumer process read all bytes, and when has it read them?
 
 Rule: one definition holds for all variants, which run interleaved. The producer writes every byte again, then reads the
-clock. The variant that is judged and compared with the peers is a real run through the scheduler. Its units form a
-chain: the second one fills its slot, the third one reads every byte of it, and the others do nothing.
+clock. The variant that is judged and compared with the peers is a real run through the scheduler. Its pipeline is a
+chain of four stages: the second fills its slot, the third reads every byte of the slot, the first and last do no work.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from trilane.pipeline.stage import UnitContext
 from trilane.scheduler.stats import median_interval, samples_needed
 from trilane.transport.packets import Packet
 
-#: KiB of a tensor of 16 channels at 128, 256, 512 and 1024 squared; no other sizes are accepted.
+#: Accepted sizes in KiB: tensors of 16 channels at 128, 256, 512 and 1024 pixels a side.
 SIZES_KIB = (256, 1024, 4096, 16384)
 PIPELINE = "slot through the scheduler"
 OURS = (SLOT, BARE, PIPELINE)
@@ -39,7 +39,7 @@ MIN_FRAMES = 10
 ANSWER_S = 120
 LIMITS_US = {"p50": 150, "p99": 500}
 ENDS = ("producer", "consumer")
-#: Microseconds of each frame of a round until every byte could be read, and until every byte was read.
+#: Times of the frames of a round, microseconds: until every byte could be read, and until every byte was read.
 Times = tuple[list[float], list[float]]
 FACTORY = "trilane.bench.handoff:build"
 PAUSE_S = 0.001
@@ -54,23 +54,24 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 300, rounds
     `frames`: hand-overs of each variant and size in a round.
     `rounds`: number of rounds, in which all variants take part.
 
-    Rows: `way` (the variant), `kib`, `frames`; `p50_us` and `p99_us` until every byte can be read, `read_p50_us` and
-    `read_p99_us` until every byte was read and checked: medians of the rounds' percentiles, with the 95 % interval of
-    that median as `_low_us` and `_high_us` (with fewer than six rounds the least and largest). No p99 is given of fewer
-    than 299 frames a round (`samples_needed`). `max_us`: of all rounds. Before each hand-over the consumer waits at
-    least 1 ms, as an idle unit does.
+    Rows: `way` (the variant), `kib`, `frames`; `p50_us` and `p99_us`: time until every byte can be read; `read_p50_us`
+    and `read_p99_us`: time until every byte was read and checked. These are medians of the rounds' percentiles, with
+    the 95 % interval of the median as `_low_us` and `_high_us`; with fewer than six rounds, the least and the largest.
+    With fewer than 299 frames a round there is no p99. `max_us`: the largest of all rounds. Before each hand-over the
+    consumer waits at least 1 ms, as an idle unit does.
 
-    Our variants: `slot through the scheduler`: what a run does; between two stages of a real run the message goes to
-    the scheduler's process, through its core, and on. `slot`: one such message, from process to process; `slot, 256
-    KiB of it written`: the same, without what filling all of it does to the caches. Peers, each in its best form and
-    without a scheduler between: `iceoryx2` with an event, `zeromq` without copies of its own, `pipe` (bytes through
-    multiprocessing.Pipe into an array), and `pickled queue` (multiprocessing.Queue).
+    Trilane's variants: `slot through the scheduler`: as between two stages of a run, the message goes to the
+    scheduler's process, through its core, and on to the next unit. `slot`: the message goes directly from process to
+    process. `slot, 256 KiB of it written`: the same, but most of the slot is not written, so the caches hardly change.
+    Peers, each in its best form and without a scheduler between: `iceoryx2` with an event, `zeromq` without copies of
+    its own, `pipe` (bytes through multiprocessing.Pipe into an array), `pickled queue` (multiprocessing.Queue).
 
-    `absent`: peers that are not installed. `met`: our variants against p50 <= 150 us and p99 <= 500 us at the largest
-    size; null without a p99. `slower_us`: of each peer and size, its p50 less that of `slot through the scheduler` in
-    the same round: the interval of the median. `read_slower_us`: the same, until every byte was read.
-    `slower_than_slot_us`, `read_slower_than_slot_us`: the same less `slot`. `ahead`, `read_ahead`: for each peer,
-    whether our slot through the scheduler is faster at every size (the interval lies above 0).
+    `absent`: peers that are not installed. `met`: whether Trilane's variants keep p50 <= 150 us and p99 <= 500 us at
+    the largest size; null without a p99. `slower_us`: by peer and size, the interval of the median of the peer's p50
+    minus the p50 of `slot through the scheduler` in the same round. `read_slower_us`: the same, until every byte was
+    read. `slower_than_slot_us`, `read_slower_than_slot_us`: the same against `slot`. `ahead`, `read_ahead`: for each
+    peer, whether `slot through the scheduler` is faster at every size: all intervals lie above 0.
+
     Raises BadInputError for other sizes than 256, 1024, 4096, 16384 KiB.
     """
     if unknown := set(kib) - set(SIZES_KIB):
@@ -99,7 +100,10 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 300, rounds
 
 
 class ChannelPair:
-    """A producer and a consumer process that wait until they are asked."""
+    """A producer and a consumer process, connected by `channel`, that wait for requests.
+
+    `written`: number of bytes that are written and read in each hand-over.
+    """
 
     def __init__(self, context: SpawnContext, channel: Channel, written: int) -> None:
         self._channel = channel
@@ -124,7 +128,7 @@ class ChannelPair:
             raise
 
     def run(self, frames: int) -> Times:
-        """Return microseconds from written to readable, and to all read, of `frames` hand-overs."""
+        """Do `frames` hand-overs, and return their times from all bytes written to readable, and to all read."""
         for pipe in reversed(self._pipes):
             pipe.send(frames)
         written, (readable, read) = (_answer(pipe) for pipe in self._pipes)
@@ -142,7 +146,10 @@ class ChannelPair:
 
 
 def produce(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[int, ...], written: int) -> None:
-    """Run the writing process, which answers a number of frames with the instants at which it wrote them, ns."""
+    """Run the writing process. It receives a number of frames, and answers with the time at which each was written, ns.
+
+    `pipe`: pipe to the parent. `ack`: pipe on which the reading process acknowledges each frame.
+    """
     with _child(pipe, cores):
         end = channel.producer()
         pipe.send("ready")
@@ -158,7 +165,10 @@ def produce(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[in
 
 
 def consume(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[int, ...], written: int) -> None:
-    """Run the reading process, which answers with two times in ns: all bytes could be read, and all had been read."""
+    """Run the reading process. It receives a number of frames, and answers with two lists of times, ns.
+
+    The lists say when all bytes of each frame could be read, and when they had been read. `pipe`, `ack`: see `produce`.
+    """
     with _child(pipe, cores):
         end = channel.consumer()
         pipe.send("ready")
@@ -199,7 +209,7 @@ def _answer(pipe: Connection) -> Any:
 
 
 def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, int], ChannelPair], dict[str, str]]:
-    """Return waiting processes for each variant and size, and why a variant is absent."""
+    """Return waiting processes for each variant and size, and the reason for each absent variant."""
     context = multiprocessing.get_context("spawn")
     pairs, absent = {}, {}
     for variant, make in CHANNELS.items():
@@ -215,10 +225,7 @@ def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, in
 
 
 def _through_pipeline(size: int, frames: int) -> Times:
-    """Run units sequentially that only write and read; return the times to infer's begin, and to its end.
-
-    Times count from raster's end.
-    """
+    """Run a pipeline whose stages only write and read; return the times from raster's end to infer's begin and end."""
     result = run_pipeline(handoff_pipeline(size * 1024), frames, policy="sequential")
     if result.interrupted:
         raise KeyboardInterrupt
@@ -248,7 +255,10 @@ def _row(variant: str, size: int, rounds: list[Times]) -> dict[str, Any]:
 
 
 def over_rounds(key: str, rounds: Sequence[list[float]], percent: float) -> dict[str, float | None]:
-    """Return the median of the rounds' percentiles and its interval; None where a round has too few values for it."""
+    """Return the median of the rounds' percentiles and its interval; None if a round has too few values.
+
+    `key`: beginning of the result's keys. `percent`: percentile, 0 to 100.
+    """
     names = (f"{key}_us", f"{key}_low_us", f"{key}_high_us")
     if min(map(len, rounds)) < samples_needed(percent / 100):
         return dict.fromkeys(names)
@@ -274,7 +284,7 @@ def _met(row: dict[str, Any]) -> bool | None:
 
 
 def against_peers(times: dict[tuple[str, int], list[Times]]) -> dict[str, Any]:
-    """Return how much longer each peer takes than ours, in the same round; see `measure`."""
+    """Return how much longer each peer takes than Trilane's variants; keys: see `measure`."""
     slower, read_slower = _slower(times, PIPELINE, 0), _slower(times, PIPELINE, 1)
     return {
         "ahead": _ahead(slower),
@@ -289,9 +299,9 @@ def against_peers(times: dict[tuple[str, int], list[Times]]) -> dict[str, Any]:
 def _slower(
     times: dict[tuple[str, int], list[Times]], ours: str, until: int
 ) -> dict[str, dict[int, tuple[float, float]]]:
-    """Return the ends of an interval, by peer and size.
+    """Return, by peer and size, the interval of the median of the peer's p50 minus that of the variant `ours`.
 
-    `until`: 0 for readable, 1 for read.
+    `until`: 0 for the time until readable, 1 for the time until read.
     """
     p50 = {key: np.array([np.percentile(of_round[until], 50) for of_round in of]) for key, of in times.items()}
     sizes = sorted({size for _, size in times})
@@ -306,7 +316,7 @@ def _ahead(slower: dict[str, dict[int, tuple[float, float]]]) -> dict[str, bool]
 
 
 class HandoffStage:
-    """A `trilane.pipeline.stage.Stage` whose work follows from its name."""
+    """A `trilane.pipeline.stage.Stage`; its name decides what it does."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -330,19 +340,19 @@ class HandoffStage:
 
 
 def check_bytes(payload: U8, value: int) -> None:
-    """Read every byte of `payload`, whose size is a multiple of 8. Raises TrilaneError when one is not `value`."""
+    """Sum all bytes of `payload`, a multiple of 8. Raises TrilaneError if the sum is not that of bytes `value`."""
     words = payload.view(np.uint64)
     if int(words.sum(dtype=np.uint64)) != len(words) * value * 0x0101010101010101 % 2**64:
         raise TrilaneError(f"a slot of {payload.size} bytes holds others than were written")
 
 
 def build(settings: Mapping[str, Any], unit: UnitContext) -> HandoffStage:  # noqa: ARG001 - a factory's signature
-    """Build the stage that `settings["name"]` names."""
+    """Return the stage with the name `settings["name"]`. This is the factory of all stages."""
     return HandoffStage(settings["name"])
 
 
 def handoff_pipeline(payload_bytes: int) -> Pipeline:
-    """Return a chain whose edge from the GPU unit to the DSP unit carries `payload_bytes`; the others carry nothing."""
+    """Return a chain of four stages. Only its edge from the GPU unit to the DSP unit has a payload, `payload_bytes`."""
     sizes = [payload_bytes if before == WRITER else 0 for before, _ in STAGES[:-1]]
     return Pipeline(
         stages=tuple(

@@ -1,7 +1,6 @@
-"""How long does a network take on each runtime, run continuously on random inputs that take turns?
+"""How long does a network take on each runtime, run continuously on random inputs?
 
-Rule: the runtimes and ONNX Runtime in FP32 run interleaved, a period each, on the same cores, in processes of their
-own.
+Rule: the runtimes and ONNX Runtime in FP32 run in turn, a period each, on the same cores, each in a process of its own.
 """
 
 from __future__ import annotations
@@ -47,13 +46,12 @@ def measure(
 ) -> dict[str, Any]:
     """One row per network and runtime. Times are for one frame; FP32 always infers one frame at a time.
 
-    Rows: the network's settings, `parameters`, `gmac`, `runtime`, `startup_cold_ms` and `startup_warm_ms` (libraries
-    imported and network loaded, with an empty and with a filled cache), `frames`, `min_ms`, `mean_ms`, `p50_ms`,
-    `p90_ms`, `p99_ms`, `max_ms`, `periods` (min, mean, max of each), `int8_over_fp32` (how many times faster than ONNX
-    Runtime in FP32), `share_of_roofline` (of the best INT8 layer of the same runtimes, measured in the same bench),
-    `share_of_instruction_peak` (of what the instruction set allows, by the clock measured in the same bench; null where
-    it is not known),
-    `temperature_c` where it can be read.
+    Rows: the network's settings, `parameters`, `gmac`, `runtime`, `startup_cold_ms` and `startup_warm_ms` (to import
+    libraries and load the network, with an empty and with a filled cache), `frames`, `min_ms`, `mean_ms`, `p50_ms`,
+    `p90_ms`, `p99_ms`, `max_ms`, `periods` (min, mean, max of each), `int8_over_fp32` (speed divided by that of ONNX
+    Runtime in FP32), `share_of_roofline` (rate divided by that of the runtimes' best INT8 layer, measured in the same
+    bench), `share_of_instruction_peak` (rate divided by the peak of the instruction set, at the clock measured in the
+    same bench; null if unknown), `temperature_c` (null if it cannot be read).
 
     Raises BadInputError, MissingPartError.
     """
@@ -80,7 +78,7 @@ def _fixtures(
     size: tuple[str, ...],
     batch: tuple[int, ...],
 ) -> Iterator[tuple[NetworkFixture, onnx.ModelProto | None]]:
-    """Yield integer networks, each with its float network where there is one."""
+    """Yield (integer network, its float network) for each combination of settings; None for no float network."""
     if network:
         file = read_network(Path(network)) if network.endswith(".onnx") else load_bundle(network).read_network()
         for frames in batch:
@@ -109,7 +107,7 @@ def _variants(
 
 @contextmanager
 def _cache(folder: Path) -> Iterator[None]:
-    """Make processes started inside the block keep compiled networks in `folder`."""
+    """Let processes that are started inside the block keep compiled networks in `folder`."""
     before = os.environ.get(CACHE)
     os.environ[CACHE] = str(folder)
     try:
@@ -122,7 +120,7 @@ def _cache(folder: Path) -> Iterator[None]:
 
 
 def _measure_periods(variants: dict[str, ProcessVariant], seconds: float, period: float) -> dict[str, dict[str, Any]]:
-    """Return start-up times of each variant, and the times of its runs in each period, ms."""
+    """Return, for each variant, its cold and warm start-up times and the times of its runs by period, all in ms."""
     with runners(variants) as by_name:
         cold = {name: runner.startup_ms for name, runner in by_name.items()}
     with runners(variants) as by_name:

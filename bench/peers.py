@@ -1,6 +1,7 @@
 """Are Trilane's runtimes as fast as the libraries themselves, and how near are they to the machine's peak?
 
-Rule: the libraries run as in their first examples, Trilane's runtimes on as many threads; all run interleaved.
+Rule: the libraries run as in their own introductory examples, Trilane's runtimes on as many threads. All run
+interleaved.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ ORT, OPENVINO, FP32 = "trilane ort", "trilane openvino", "onnxruntime fp32"
 APP = "benchmark_app"
 APP_STATS = "benchmark_report.json"
 APP_TIMEOUT_S = 600
-#: For each ratio, the peak that it is a share of.
+#: Ratio -> the peak of which it is a share, in words.
 PEAKS = {
     "openvino_of_roofline": "the best INT8 layer of the same runtimes, measured here (roofline.int8_gmac_s)",
     "openvino_of_instruction_peak": "the instruction set: documented multiply-accumulates a cycle x clock measured "
@@ -42,15 +43,15 @@ PEAKS = {
 def measure(
     width: int = 64, size: str = "512x512", threads: int = 0, rounds: int = 8, seconds: int = 2
 ) -> dict[str, Any]:
-    """Ratios of speed from medians: 1 is equal, more is faster than what stands after `over`.
+    """Ratios of median speeds. Above 1, Trilane's runtime before `over` is faster than the variant after it.
 
-    `ratios.ort_over_fp32`, `ratios.openvino_over_fp32`: ours in INT8 over ONNX Runtime in FP32 with its defaults.
+    `ratios.ort_over_fp32`, `ratios.openvino_over_fp32`: Trilane's runtime in INT8 against ONNX Runtime in FP32 with its
+    defaults. `ratios.openvino_over_benchmark_app`: against OpenVINO's own tool on the same file.
     `ratios.openvino_of_roofline`: share of the rate of the best INT8 layer of the same runtimes, measured here.
-    `ratios.openvino_of_instruction_peak`: share of what the instruction set allows (null where that is not known).
-    `peaks`: peak that each of these two shares refers to. `ratios.openvino_over_benchmark_app`: ours over OpenVINO's
-    own tool on the same file. `low`, `high`: 95 % interval of each ratio's median over the rounds (with fewer than six
-    rounds the least and largest). `rows`: median and number of runs of each variant. Each variant runs for `seconds` in
-    each round.
+    `ratios.openvino_of_instruction_peak`: share of the peak of the instruction set, null if that is unknown. `peaks`:
+    the peaks of these two shares, in words. `low`, `high`: 95 % interval of each ratio's median over the rounds; with
+    fewer than six rounds, the least and the largest. `rows`: median time and number of runs of each variant. Each
+    variant runs for `seconds` in each round.
 
     Raises MissingPartError without OpenVINO or PyTorch.
     """
@@ -84,7 +85,7 @@ def measure(
 def compared(
     times: Mapping[str, Sequence[Sequence[float]]], gmac: float, layer_gmac_s: float, instruction_gmac_s: float | None
 ) -> dict[str, dict[str, Any]]:
-    """Return the ratios and their intervals.
+    """Return `ratios`, `low` and `high` of `measure`.
 
     `times`: milliseconds of each variant's runs, by round. `gmac`: 1e9 multiply-accumulates of a run. `layer_gmac_s`,
     `instruction_gmac_s`: the two peaks, 1e9 multiply-accumulates a second.
@@ -120,7 +121,7 @@ def _variants(integer: Path, plain: Path, threads: int) -> dict[str, ProcessVari
 def _measure_rounds(
     variants: dict[str, ProcessVariant], integer: Path, threads: int, rounds: int, seconds: int
 ) -> dict[str, list[list[float]]]:
-    """Return milliseconds of each variant's runs, by round; for `benchmark_app`, the median that it printed."""
+    """Return the times of each variant's runs, ms, by round; for `benchmark_app`, only its own median."""
     times: dict[str, list[list[float]]] = {name: [] for name in (*variants, APP)}
     with runners(variants) as by_name:
         for _ in range(rounds):
@@ -131,7 +132,7 @@ def _measure_rounds(
 
 
 def _benchmark_app(network: Path, threads: int, seconds: int) -> float:
-    """Return the median latency in milliseconds by OpenVINO's tool, with one request at a time."""
+    """Return the median latency that OpenVINO's tool measures, ms, with one request at a time."""
     tool = machine.here.program(APP, first=Path(sys.executable).parent)
     if tool is None:
         raise MissingPartError(f"{APP} is not there", extra="openvino")

@@ -1,8 +1,8 @@
 """Does the pipeline keep its slowest unit busy, and what does that gain over one frame at a time?
 
-Rule: every run is compared with the `sequential` runs before and after it on the same cores. In those, every stage does
-the same frames in the same order while the other units are quiet. Settings run interleaved in many short rounds,
-because a shared machine grows slower and faster within seconds; a row is the median over the rounds.
+Rule: every run is compared with the `sequential` runs before and after it on the same cores. In a sequential run, every
+stage does the same frames in the same order while the other units are quiet. Settings run interleaved in many short
+rounds, because the speed of a shared machine changes within seconds; a row is the median over the rounds.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ from trilane.units import AFTER_INFER, BEFORE_INFER, COMPARED, COMPUTED, MEASURE
 SEQUENTIAL, PIPELINED = "sequential", "pipelined"
 MIN_FRAMES = 20
 LATENCIES = "latencies_ns"  # key of a run's latencies; a row has their percentiles over all rounds
-UNITS_MS = "units_ms"  # key of what each unit takes for a frame in a run
-PACE = 1.25  # factor on the slowest unit's rate: paced policies always get more frames than they can present
+UNITS_MS = "units_ms"  # key of the time that each unit takes for a frame in a run
+PACE = 1.25  # factor on the slowest unit's rate: more frames are released than paced policies can present
 
 
 @dataclass(frozen=True)
@@ -73,25 +73,26 @@ def measure(
     """A row for each avatar, size, number of cores, policy and edge; figures are medians over the `rounds`.
 
     Rows: `frame_ms`, `fps`; `latency_p50_ms`, `latency_p99_ms`: from a frame's sampled pose to its composited picture,
-    over the presented frames of all rounds (no p99 of fewer than 299); `efficiency`: the slowest unit's work over the
-    frame time, by CPU time; `slowest`: the unit that takes longest for a frame in the `sequential` runs before and
-    after, without the time in which it had no core; `alone_ms`: that time; `busiest`: the unit with the most work,
-    `idle`: its share without a job from its first job's begin to its last one's end, and the causes: `starved` (no
-    input), `undispatched` (input, but no free slot, or not dispatched yet), `overhead` (dispatched, but not begun).
+    over the presented frames of all rounds; without 299 frames there is no p99. `efficiency`: the slowest unit's work
+    divided by the frame time, by CPU time. `slowest`: the unit that takes longest for a frame in the `sequential` runs
+    before and after; `alone_ms`: that time, without the time in which the unit had no core. `busiest`: the unit with
+    the most work; `idle`: its share of time without a job, between its first and last job, with the causes `starved`
+    (no input), `undispatched` (input, but no free slot, or not dispatched yet) and `overhead` (dispatched, but not
+    begun).
 
-    `gain`: over the mean of the `sequential` runs before and after. `bound`: sum(t) / max(t), where sum(t) is what all
-    units take in those runs (`all_alone_ms`) and their hand-overs, and max(t) what the slowest takes.
-    `in_run_over_alone`: time of the unit `slowest` in this run, without the time in which it had no core, over
-    `alone_ms`. `gain_of_bound`: `gain` over `bound`; `of_bound_low`, `of_bound_high`: the 95 % interval of its median
-    (with fewer than six rounds the least and largest). `hops_ms`: what a sequential run takes for a frame beyond its
-    stages. `dropped`, `lost`: frames of all rounds. `accuracy`: the error of the avatar's pictures and its
-    source, or why there are no figures.
+    `gain`: mean frame time of the `sequential` runs before and after, divided by `frame_ms`. `bound`: sum(t) / max(t),
+    where sum(t) is the time of all units in those runs (`all_alone_ms`) and their hand-overs, and max(t) the time of
+    the slowest unit. `in_run_over_alone`: time of the unit `slowest` in this run, without the time in which it had no
+    core, divided by `alone_ms`. `gain_of_bound`: `gain` divided by `bound`; `of_bound_low`, `of_bound_high`: the 95 %
+    interval of its median, with fewer than six rounds the least and largest. `hops_ms`: frame time of a sequential run
+    minus the times of its stages. `dropped`, `lost`: frames of all rounds. `accuracy`: the error of the avatar's
+    pictures and its source, or why there are no figures.
 
-    With `beside`, a second avatar of `beside_size`, two runs go on at once, each with a scheduler and units of its own
-    on the same cores, `pipelined`. Rows, one for each: `frame_ms`: mean time between frames while both ran;
-    `virtual_ms`: the same, computed from `isolated_ms`, its stages in sequential runs before and after; `ratio`:
-    measured over computed, with its interval; `strangers`: how many threads of others were ready where its stages
-    worked, in the mean: the ratio says nothing unless they are a few hundredths.
+    With `beside`, a second avatar of the size `beside_size`, two `pipelined` runs go on at once, each with its own
+    scheduler and units, on the same cores. Rows, one for each run: `frame_ms`: mean frame time while both ran;
+    `isolated_ms`: time of its stages for a frame, in sequential runs before and after; `virtual_ms`: frame time
+    computed from these times; `ratio`: measured divided by computed, with its interval; `strangers`: mean number of
+    other programs' ready threads where its stages worked. Above a few hundredths, the ratio says nothing.
 
     Raises BadInputError, MissingPartError, TrilaneError when a run fails.
     """
@@ -116,7 +117,7 @@ def measure(
 def _measure_two(
     which: Sequence[tuple[str, str]], edge: str, cores: int, frames: int, rounds: int, runtime: str, *, video: bool
 ) -> dict[str, Any]:
-    """Measure two avatars at once, each given as a name and a size."""
+    """Measure two avatars at once. `which`: (avatar, size) of both."""
     asked = [
         Asked(_folder(name), size, frames, runtime, usable_cores()[:cores], video=video, edge=edge)
         for name, size in which
@@ -131,7 +132,7 @@ def _folder(avatar: str) -> str:
 
 
 def _measure_rounds(checked: Checked, settings: list[Setting], rounds: int) -> list[dict[str, Any]]:
-    """Return a row for each setting. One more `sequential` run ends the last round."""
+    """Return a row for each setting. The first is `sequential`; one more sequential run ends the last round."""
     measured = [_run_round(checked, settings) for _ in range(rounds)]
     closing = _run(checked, settings[0])
     for runs, after in zip(measured, [*(runs[0] for runs in measured[1:]), closing], strict=True):
@@ -153,7 +154,7 @@ def _check(policies: Sequence[str], edges: Sequence[str], cores: Sequence[int]) 
 
 
 def _pairs(policies: Sequence[str], edges: Sequence[str]) -> list[tuple[str, str]]:
-    """Return policies and edges, `sequential` first, because the others are compared with it."""
+    """Return all pairs of policy and edge, `sequential` first, because every other pair is compared with it."""
     return [(SEQUENTIAL, "double"), *(pair for pair in product(policies, edges) if pair != (SEQUENTIAL, "double"))]
 
 
@@ -164,16 +165,16 @@ def _config(avatar: str, size: str, cores: int, frames: int, runtime: str, video
 
 
 def _run_round(checked: Checked, settings: list[Setting]) -> list[dict[str, Any]]:
-    """Run each setting once; the `sequential` run sets the pace of the paced ones."""
+    """Run each setting once. The `sequential` run, which is first, determines the pace for paced policies."""
     base = _run(checked, settings[0])
     slowest_ms = max(base[UNITS_MS].values())
     return [base, *(_run(checked, setting, slowest_ms) for setting in settings[1:])]
 
 
 def _compare(runs: list[dict[str, Any]], after: dict[str, Any]) -> None:
-    """Compare the `runs` of a round, `sequential` first, with that one and the one `after` them.
+    """Add comparisons to the `runs` of a round: with its first, `sequential` run and the sequential run `after`.
 
-    The `sequential` run is compared with itself.
+    The first run is compared with itself.
     """
     for place, row in enumerate(runs):
         beside = (runs[0], after if place else runs[0])
@@ -192,9 +193,9 @@ def _run(checked: Checked, plan: Setting, slowest_ms: float = 0.0) -> dict[str, 
 
 
 def finished_run(checked: Checked, what: str, least: int = 2, **options: Any) -> RunResult:
-    """Run `checked` with `options` of `run_avatar`, in a folder that is removed.
+    """Run `checked` in a temporary run folder, and return the result. `options`: further arguments of `run_avatar`.
 
-    Raises TrilaneError, which begins with `what`, when the run fails or presents fewer than `least` frames.
+    Raises TrilaneError if the run fails or presents fewer than `least` frames. `what`: beginning of its message.
     """
     with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
         placed = checked.changed(out_dir=Path(folder))
@@ -212,7 +213,7 @@ def finished_run(checked: Checked, what: str, least: int = 2, **options: Any) ->
 
 
 def _figures(result: RunResult) -> dict[str, Any]:
-    """Return the row of one run, before it is compared with others."""
+    """Return the figures of one run, without comparisons."""
     metrics = result.report
     frame_ms = metrics.frame_time_ms.mean
     assert frame_ms is not None  # two frames were presented
@@ -233,7 +234,7 @@ def _figures(result: RunResult) -> dict[str, Any]:
 
 
 def _units_ms(result: RunResult) -> dict[str, float]:
-    """Return milliseconds of each unit's jobs for a frame, without the time in which it had no core."""
+    """Return the time of each unit's jobs for a frame, ms, without the time in which the unit had no core."""
     times = dict.fromkeys(result.report.units, 0.0)
     for name, stage in result.report.stages.items():
         preempted = [job.preempted_ns for job in result.jobs if job.stage == name]
@@ -242,7 +243,10 @@ def _units_ms(result: RunResult) -> dict[str, float]:
 
 
 def idle_between_jobs(jobs: Sequence[JobRecord]) -> dict[str, float]:
-    """Return shares of the time between the first job's begin and the last one's end; `idle` sums up its causes."""
+    """Return a unit's idle shares by cause, and their sum `idle`, from its first job's begin to its last job's end.
+
+    `jobs`: all jobs of the unit.
+    """
     ordered = sorted(jobs, key=lambda job: job.begin_ns)
     span = ordered[-1].end_ns - ordered[0].begin_ns
     parts = {"starved": 0, "undispatched": 0, "overhead": 0}
@@ -257,14 +261,14 @@ def idle_between_jobs(jobs: Sequence[JobRecord]) -> dict[str, float]:
 
 
 def latencies_ns(recording: Recording, jobs: Sequence[JobRecord]) -> list[int]:
-    """Return the latency of each presented frame of a run that is in memory."""
+    """Return the latency of each presented frame of a run. `jobs`: all jobs of the run."""
     timeline = Timeline(recording.graph, recording.settings)
     facts = (fact for record in records_of(recording, jobs) for fact in timeline.add(record))
     return [fact.latency_ns for fact in facts if isinstance(fact, Presented) and fact.latency_ns is not None]
 
 
 def _latency_ms(runs: list[dict[str, Any]]) -> dict[str, float | None]:
-    """Return percentiles over the frames of all `runs`; None where there are too few."""
+    """Return the median and the 99th percentile of the latency over all `runs`; None for too few frames."""
     ordered = sorted(ns for run in runs for ns in run[LATENCIES])
     enough = {percent: len(ordered) >= samples_needed(percent / 100) for percent in (50, 99)}
     return {
@@ -274,7 +278,7 @@ def _latency_ms(runs: list[dict[str, Any]]) -> dict[str, float | None]:
 
 
 def _summary(setting: Setting, runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Summarise the runs of one setting: medians of numbers, the commonest of names, sums of frames."""
+    """Return a setting's row from its `runs`: medians of numbers, most frequent names, sums of frame counts."""
     names = ("slowest", "busiest")
     sums = ("dropped", "lost")
     row: dict[str, Any] = {**vars(setting)}
@@ -289,18 +293,18 @@ def _summary(setting: Setting, runs: list[dict[str, Any]]) -> dict[str, Any]:
 
 # Runs of an avatar, each in a process of its own, so that two can go on at once on the same cores.
 #
-# Rule: the process does what `trilane run` does, with its own scheduler and its own units; two of them share nothing
-# but the machine.
+# Rule: each process does what `trilane run` does, with its own scheduler and its own units. Two processes share only
+# the machine.
 
 START_S, RUN_S = 120.0, 600.0
 
 
 @dataclass(frozen=True)
 class Asked:
-    """A run of the default scene.
+    """A run of the default scene to be done.
 
-    `avatar`, `size`, `frames`, `runtime`: as in `trilane.stages.run_options.RunOptions`. `cores`: cores that its units
-    share by the rule for any run. `video`: whether a video is encoded. `edge`: rule of all edges.
+    `avatar`, `size`, `frames`, `runtime`: as in `trilane.stages.run_options.RunOptions`. `cores`: cores on which the
+    rule for any run places its units. `video`: whether a video is encoded. `edge`: rule of all edges.
     """
 
     avatar: str
@@ -315,7 +319,7 @@ class Asked:
 class Ran(NamedTuple):
     """The result of a run.
 
-    `jobs`: all jobs that ended. `seats`: each unit's cores, as text.
+    `jobs`: all jobs that ended. `seats`: unit -> its cores, as text such as "0,1".
     """
 
     jobs: tuple[JobRecord, ...]
@@ -323,7 +327,7 @@ class Ran(NamedTuple):
 
 
 class AvatarProcess:
-    """The parent's end of a process."""
+    """A process that runs an avatar, as the parent process sees it. `name`: name for error messages."""
 
     def __init__(self, pipe: Connection, name: str) -> None:
         self._pipe, self._name = pipe, name
@@ -333,7 +337,7 @@ class AvatarProcess:
         self._pipe.send(policy)
 
     def result(self) -> Ran:
-        """Return the result of the run that was begun. Raises TrilaneError when it failed."""
+        """Wait for the begun run, and return its result. Raises TrilaneError if the run failed."""
         jobs, seats = self.receive(RUN_S)
         return Ran(tuple(JobRecord(*job) for job in jobs), seats)
 
@@ -344,7 +348,10 @@ class AvatarProcess:
 
 @contextmanager
 def avatar_processes(asked: Sequence[Asked]) -> Iterator[list[AvatarProcess]]:
-    """Start a process for each, ready to run; they end with the block. Raises TrilaneError when one does not start."""
+    """Start a process for each run in `asked`, ready to run; all end with the block.
+
+    Raises TrilaneError if a process does not start.
+    """
     with asked_processes() as start:
         found = [AvatarProcess(start(serve, each), f"{each.avatar} at {each.size}") for each in asked]
         for one in found:
@@ -353,7 +360,7 @@ def avatar_processes(asked: Sequence[Asked]) -> Iterator[list[AvatarProcess]]:
 
 
 def serve(pipe: Connection, asked: Asked) -> None:
-    """Run the process: say that it is ready, then run under each policy that comes, until `pipe` closes."""
+    """Run the process: report that it is ready, then do a run for each policy that it receives, until `pipe` closes."""
     try:
         request = RunOptions(avatar=asked.avatar, size=asked.size, frames=asked.frames, runtime=asked.runtime)
         checked = configure(request, Path.cwd()).changed(units=host_units(asked.cores), record=asked.video)
@@ -374,15 +381,15 @@ def serve(pipe: Connection, asked: Asked) -> None:
         pipe.send(f"{type(error).__name__}: {error}")
 
 
-# Two avatars at once on this machine, beside what the virtual clock predicts for them: are the frame times the same?
+# Two avatars at once on this machine: do the measured frame times equal those that the virtual clock computes?
 #
-# Rule: the runs are measured, and before and after them the time of each stage while no other unit works. From these
-# times alone, the frame times of two such pipelines are computed, on cores that they divide in equal shares.
+# Rule: both runs are measured at once. Before and after them, sequential runs measure each stage while no other unit
+# works. From these times alone, the frame times of both pipelines are computed, on cores that they share equally.
 #
-# The scheduler's own time on its core, `SCHEDULER_NS` a job as in the model of placement, counts with the first stage,
-# which runs there. `strangers` says how quiet the machine was: the time that sequential stages wait for their cores,
-# over the time that they work. The virtual clock does not know other programs: the ratio says nothing when `strangers`
-# is more than a few hundredths.
+# The scheduler's own time, `SCHEDULER_NS` a job as in the model of placement, is added to the first stage, which runs
+# on the same core. `strangers` says how busy the machine was: the time for which sequential stages had no core, divided
+# by the time for which they worked. The virtual clock does not know other programs: if `strangers` is above a few
+# hundredths, the ratio says nothing.
 
 FIRST, LAST = BEFORE_INFER[0][0], AFTER_INFER[-1][0]
 SECONDS = 20.0  # virtual seconds of the simulated runs
@@ -390,10 +397,10 @@ ENDLESS = 1 << 40
 
 
 class Isolated(NamedTuple):
-    """The times of one pipeline alone.
+    """The times of one pipeline's stages in sequential runs.
 
-    `stage_ns`: mean time of each stage, ns. `worked_ns`, `waited_ns`: time that all stages worked, and waited for a
-    core, ns.
+    `stage_ns`: mean time of each stage. `worked_ns`, `waited_ns`: total time for which stages worked, and for which
+    they had no core.
     """
 
     stage_ns: Mapping[str, float]
@@ -406,12 +413,10 @@ def measure_beside(
     rounds: int,
     processes: Callable[[Sequence[Asked]], AbstractContextManager[list[AvatarProcess]]] = avatar_processes,
 ) -> list[dict[str, Any]]:
-    """Return a row for each of the two pipelines `asked`, medians over the `rounds`.
+    """Return a row for each of the two pipelines `asked`, medians over the `rounds`. Raises TrilaneError.
 
-    `frame_ms`: mean time between presented frames while both ran. `virtual_ms`: the same, computed. `ratio`: measured
-    over computed. `ratio_low`, `ratio_high`: 95 % interval of its median. `isolated_ms`: time of a frame's stages.
-    `strangers`: mean number of other programs' threads that were ready where its stages worked. `processes`: makes the
-    processes that run. Raises TrilaneError when a run fails.
+    Keys: as for `beside` in `measure`, and `ratio_low`, `ratio_high`, the 95 % interval of `ratio`'s median.
+    `processes`: function that starts the processes.
     """
     found: list[list[dict[str, float]]] = []
     with processes(asked) as pair:
@@ -433,7 +438,7 @@ def _ran(process: AvatarProcess, policy: str) -> Ran:
 
 
 def isolated_of(jobs: Sequence[JobRecord]) -> Isolated:
-    """Return the times of the stages in `jobs` of sequential runs, without their waits for cores."""
+    """Return the times of the stages in sequential runs. `jobs`: all jobs of these runs."""
     times: dict[str, list[int]] = {}
     for job in jobs:
         times.setdefault(job.stage, []).append(job.end_ns - job.begin_ns - job.preempted_ns)
@@ -458,9 +463,9 @@ def _round(both: Sequence[Ran], isolated: Sequence[Isolated], asked: Sequence[As
 
 
 def overlapping_ms(runs: Sequence[Sequence[JobRecord]]) -> list[float]:
-    """Return the mean time between presented frames of each run, while all ran, in ms.
+    """Return the mean frame time of each run, ms, over the time in which all runs presented frames.
 
-    Raises TrilaneError when they hardly overlapped.
+    `runs`: jobs of each run. Raises TrilaneError if the runs hardly overlapped.
     """
     ends = [sorted(job.end_ns for job in jobs if job.stage == LAST) for jobs in runs]
     first, last = max(each[0] for each in ends), min(each[-1] for each in ends)
@@ -473,7 +478,10 @@ def overlapping_ms(runs: Sequence[Sequence[JobRecord]]) -> list[float]:
 def computed_ms(
     isolated: Sequence[Isolated], seats: Sequence[Mapping[str, str]], asked: Sequence[Asked]
 ) -> list[float]:
-    """Return the mean virtual frame time of each pipeline in ms, when all run at once and divide the cores."""
+    """Return the mean frame time of each pipeline, ms, computed in virtual time: all run at once and share cores.
+
+    `seats`: each unit's cores, as text, by pipeline.
+    """
     stop = (round(SECONDS * 1e9), Stop())
     members = [
         Member(

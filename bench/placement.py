@@ -1,7 +1,7 @@
 """Is the placement that a run chooses the best one, what does it gain over the rule, and does the model predict it?
 
-Rule: a run's own choice is made first; after that, everything is tried again. All placements run in turns, a few frames
-each. The placements that could be the best run in further rounds, which alone decide. Whole runs compare the chosen
+Rule: first a placement is chosen as in a run. After that, all placements are tried in turns, a few frames each. Only
+the placements that could be the best run in further rounds, and these rounds decide. Whole runs compare the chosen
 placement with the rule's. Other numbers of cores are computed in virtual time, and the results say so.
 """
 
@@ -53,22 +53,23 @@ def measure(
 ) -> dict[str, Any]:
     """A row for each size, number of cores and placement.
 
-    Rows: `predicted_ms`; `tried_ms`: median of the `rounds` in which all are tried, in turns of 16 frames, 10 of which
-    count; `frame_ms`: median of the `further` rounds, null for placements that are not in them; `is_chosen`, `is_rule`.
-    The further rounds have the chosen placement, the rule's, and the `finalists` fastest of the others.
+    Rows: `predicted_ms`; `tried_ms`: median of `rounds` rounds with all placements, in turns of 16 frames, of which the
+    last 10 count; `frame_ms`: median of the `further` rounds, null for placements that are not in them; `is_chosen`,
+    `is_rule`. The further rounds have the chosen placement, the rule's, and the `finalists` fastest of the others.
 
-    `sizes`: a row for each size and number of cores. `how`: what chose: the run's own trial, or the prediction.
-    `chosen_over_best`: frame time of the chosen placement over that of the best other one in the further rounds, the
-    median of the ratios within a round, with its 95 % interval `low` and `high` (with fewer than six rounds the least
-    and largest); 1 and below: the chosen one is the best. `rule_over_chosen`: how many times faster than with the rule,
-    `rule_low`, `rule_high`: its interval. `rank_correlation`: Spearman's, of predicted and tried times of all.
-    `predicted_over_tried`, `predicted_least`, `predicted_largest`: median, least and largest ratio of all. `others`:
-    share of the cores that other programs had in the further rounds: with more than a tenth the row says little.
-    `run_ms`, `rule_run_ms`, `machine_efficiency`, `efficiency`, `rule_machine_efficiency`: medians of `runs` whole
-    runs of `frames` frames each, in turns. `took_s`: a run's rehearsal and trial. `times`: what was measured first.
+    `sizes`: a row for each size and number of cores. `how`: what chose the placement: the run's own trial, or the
+    prediction. `chosen_over_best`: frame time of the chosen placement divided by that of the best other placement in
+    the further rounds, as the median of the rounds' ratios. `low`, `high`: its 95 % interval; with fewer than six
+    rounds, the least and the largest. Up to 1, the chosen placement is the best. `rule_over_chosen`: frame time of the
+    rule's placement divided by that of the chosen one. `rule_low`, `rule_high`: its interval. `rank_correlation`:
+    Spearman's, of the predicted and tried times of all placements. `predicted_over_tried`, `predicted_least`,
+    `predicted_largest`: median, least and largest ratio of these times. `others`: share of the cores that other
+    programs had in the further rounds; above a tenth, the row says little. `run_ms`, `rule_run_ms`,
+    `machine_efficiency`, `efficiency`, `rule_machine_efficiency`: medians of `runs` whole runs of `frames` frames each,
+    in turns. `took_s`: time of a run's rehearsal and trial. `times`: the rehearsal's measured times.
 
-    `virtual`: other numbers of cores, by the profile `host` in virtual time: `frame_ms` is computed by the scheduler,
-    for every placement that virtual time knows.
+    `virtual`: other numbers of cores, by the profile `host` in virtual time. The scheduler computes `frame_ms` for
+    every placement that virtual time knows.
 
     Raises BadInputError, MissingPartError, TrilaneError when a run fails.
     """
@@ -105,7 +106,7 @@ def _check(counts: Sequence[int], frames: int, rounds: int, finalists: int, furt
 
 
 class _Trial:
-    """Tries all placements of one scene on some cores."""
+    """Chooses a placement for a scene on `cores` as a run does, then tries all placements."""
 
     def __init__(self, checked: Checked, cores: Sequence[CpuCore], starter: UnitStarter) -> None:
         self._checked, self._starter = checked, starter
@@ -127,7 +128,7 @@ class _Trial:
         self._runs: dict[str, list[RunMetrics]] = {of: [] for of in self._places}
 
     def run(self, rounds: int, finalists: int, further: int, runs: int) -> None:
-        """Do `rounds` of all placements, `further` rounds of those that could be the best, and whole runs."""
+        """Do `rounds` rounds with all placements, `further` rounds with the best ones, and `runs` whole runs."""
         self._rounds = self._try(range(len(self._found)), rounds)
         tried_ms = self._tried_ms()
         always = list(dict.fromkeys(self._places.values()))
@@ -155,7 +156,7 @@ class _Trial:
         ]
 
     def summary(self) -> dict[str, Any]:
-        """Compare the chosen placement with the best other one and the rule's, and the model with the trial."""
+        """Return the row of `sizes` in `measure`: the chosen placement against others, predictions against trials."""
         place = self._places["chosen"]
         mine = self._further[place]
         best = min(self._further, key=lambda other: (median(self._further[other]), other != place))
@@ -188,15 +189,15 @@ class _Trial:
         }
 
     def times(self) -> list[dict[str, Any]]:
-        """Return the measured needs of the units."""
+        """Return rows with the rehearsal's measured times."""
         return times_rows(self._times)
 
     def _tried_ms(self) -> list[float]:
-        """Return the time of each placement in the rounds of all, ms."""
+        """Return the median frame time of each placement in the rounds with all placements, ms."""
         return [median(each.frame_ns[place] for each in self._rounds) / NS_PER_MS for place in range(len(self._found))]
 
     def _place(self, one: Ranked) -> int:
-        """Return the index of a placement among those that were found."""
+        """Return the index of a placement in the list of all placements."""
         return [each.placement for each in self._found].index(one.placement)
 
     def _try(self, places: Sequence[int], rounds: int) -> Sequence[Round]:
@@ -214,7 +215,7 @@ def _interval(prefix: str, values: Sequence[float]) -> dict[str, float]:
 
 
 def _virtual(checked: Checked, avatar: str, count: int) -> Mapping[str, Any]:
-    """Return what virtual time says about the placements on `count` equal cores without siblings."""
+    """Return computed frame times of the placements on `count` equal cores, each alone on its physical core."""
     shape = min(checked.config.buckets, key=lambda shape: (abs(shape[0] - shape[1]), shape))
     work = painting(networks_of(checked.assets), shape, {"avatar": avatar})
     profile, plan = load_profile(HOST), Plan(work, "dsp", Variant(POLICY, EDGE))
@@ -242,7 +243,7 @@ def _virtual(checked: Checked, avatar: str, count: int) -> Mapping[str, Any]:
 
 
 def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float | None:
-    """Return Pearson's correlation of the ranks, from -1 to 1; None where all values of a list are equal.
+    """Return Spearman's rank correlation of two lists, from -1 to 1; None if all values of a list are equal.
 
     Spearman, American Journal of Psychology 15 (1904), 72-101. Raises ValueError for lists of different lengths.
     """

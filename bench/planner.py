@@ -1,10 +1,9 @@
 """What does planning save against a fixed square of 512 x 512, and what does it cost in image error?
 
-Rule: both plans run interleaved, on the same moments of the same scenes. Each has the cores that are best for it, as
-`trilane run` places it. The compared pictures are made by the runs' own stages from the very configurations that were
-timed. Their reference, the plan `full`, is a second implementation (`bench/lib/full_picture.py`). People see single bad
-frames, but means hide them. Therefore every frame of both runs is also compared with the truth, which is quicker to
-draw.
+Rule: both plans run interleaved, on the same moments of the same scenes. Each plan is placed as by `trilane run`. The
+runs' own stages make the compared pictures, in the timed configurations. The reference, the plan `full`, is a second
+implementation (`bench/lib/full_picture.py`). People see single bad frames, but means hide them. Therefore every frame
+of both plans is also compared with the truth, which is quicker to draw than `full`.
 """
 
 from __future__ import annotations
@@ -39,26 +38,30 @@ POLICY = "pipelined"
 LEAST_FRAMES = 20
 #: Factor on differences from `full` in the sheets.
 SHOWN = 8
-#: Tensor of the reference application, which fills it in every frame.
+#: Tensor size of the reference application.
 FIXED = "512x512"
 
 
 def fixed(checked: Checked) -> Checked:
-    """Return the reference application's plan: one square tensor for everything, and every skin weight (12 at most)."""
+    """Return `checked` with the reference application's plan: a fixed square tensor, and up to 12 skin weights."""
     scene = checked.config.scene.model_copy(update={"size": FIXED, "plan": "fixed"})
     return checked.changed(scene=scene, shapes=())
 
 
 def planned(checked: Checked) -> Checked:
-    """Return the scene's own plan; the shapes of a planned tensor are in the configuration."""
+    """Return `checked` as it is: with the scene's own plan."""
     return checked
 
 
+#: Name of a plan -> function that applies it to a configuration.
 PLANS = {"fixed": fixed, "planned": planned}
 
 
 def in_frames(checked: Checked, frames: int) -> Checked:
-    """Spread the whole scene over `frames` frames, at longer steps; a scene with no more frames stays unchanged."""
+    """Return `checked` with only `frames` frames at a lower rate, so that they span the whole scene.
+
+    A scene with at most `frames` frames stays unchanged.
+    """
     scene = checked.config.scene
     if frames >= scene.frames:
         return checked
@@ -75,17 +78,17 @@ def measure(
     video: bool = True,
     out: str = "",
 ) -> dict[str, Any]:
-    """For each scene: how many times as fast the planned run is as the fixed one, and both image errors.
+    """For each scene: how many times as fast the planned run is as the fixed run, and the image errors of both.
 
-    Keys: `scenes`, one entry each: `name`; `speedup` (median over the rounds of the fixed frame time over the planned
-    one), `speedup_low`, `speedup_high` (its 95 % interval; with fewer than six rounds the least and largest),
-    `fixed_ms`, `planned_ms`; `placements`: by plan, on which cores its units were and why; `psnr_fixed_db`,
-    `psnr_planned_db`, `ssim_*`, `flip_*` of the frames against those of
-    `full`, the same with `box_` in the avatars' rectangles, None with nobody in view; PSNR is that of the mean square
-    over all frames; `truth`: the same against the clothed body that a bundled avatar was trained on, `full`
-    too; `network`: what paints `full`; `tensors`: the planned ones; `by_frame`: what `by_frame` says of all frames,
-    None where there is no truth. `median_speedup`, `least_speedup`, `largest_loss_db` (fixed minus planned) and
-    `worst_loss_db`, the same of the worst frames, None without any truth; `sources`; `driver`; `config`.
+    Keys: `scenes`, with an entry for each scene: `name`; `fixed_ms`, `planned_ms`: median frame times; `speedup`: the
+    ratio of both, as the median over the rounds; `speedup_low`, `speedup_high`: its 95 % interval, with fewer than six
+    rounds the least and largest; `placements`: by plan, the cores of the units and why; `psnr_fixed_db`,
+    `psnr_planned_db`, `ssim_*`, `flip_*`: errors against the plan `full`, where PSNR follows from the mean square over
+    all frames; the same keys with `box_`: errors in the avatars' rectangles, None with nobody in view; `truth`: the
+    same errors, also of `full`, against the clothed body that a bundled avatar was trained on; `network`: source of the
+    network of `full`; `tensors`: sizes of planned tensors; `by_frame`: errors of single frames, None without a truth.
+    Over all scenes: `median_speedup`, `least_speedup`; `largest_loss_db`: PSNR of fixed minus planned; `worst_loss_db`:
+    the same for the worst frames, None without a truth; `sources`; `driver`; `config`.
 
     Raises BadInputError, MissingPartError, TrilaneError when a run fails.
     """
@@ -93,7 +96,7 @@ def measure(
     require_metrics()
     if out:
         with write_folder(Path(out)):
-            pass  # finds out before the work whether it can be written
+            pass  # fails before the work if the folder cannot be written
     found = [_Scene(name, frames, runtime, video=video) for name in scene]
     rows = []
     with UnitStarter(PRELOAD) as starter:
@@ -123,9 +126,9 @@ def _check(frames: int, pictures: int) -> None:
 
 @dataclass(frozen=True)
 class _Moment:
-    """One frame by every plan, (h,w,3) uint8 each.
+    """One frame by every plan, pictures (h,w,3) uint8.
 
-    `true`: true picture; None where there is no truth.
+    `full`: picture by the plan `full`. `plans`: pictures by name in `PLANS`. `true`: true picture; None if unknown.
     """
 
     number: int
@@ -135,13 +138,13 @@ class _Moment:
 
 
 class _Scene:
-    """One scene by both plans.
+    """Runs and compares one scene by both plans.
 
-    `name`: name of the scene. `driver`: OpenGL driver, once the scene was compared.
+    `name`: name of the scene. `driver`: facts about the OpenGL driver; empty before `compare`.
     """
 
     def __init__(self, name: str, frames: int, runtime: str, *, video: bool) -> None:
-        """Prepare both plans. Raises BadInputError, MissingPartError."""
+        """Configure both plans. Raises BadInputError, MissingPartError."""
         asked = RunOptions(scene=name, runtime=runtime, hud=False)
         checked = in_frames(configure(asked, Path.cwd()).changed(record=video), frames)
         self.name = checked.config.scene.name
@@ -150,9 +153,10 @@ class _Scene:
         self._plans = {plan: make(checked) for plan, make in PLANS.items()}
 
     def time(self, rounds: int, starter: UnitStarter) -> dict[str, Any]:
-        """Measure frame times of both plans in turns, and their ratio. Raises TrilaneError when a run fails.
+        """Measure frame times of both plans in turns, and return their keys of `measure`.
 
-        `starter`: starter of all units. Scenes too short to be rehearsed are placed by the rule for any run.
+        `starter`: starter of all units. A scene that is too short for a rehearsal is placed by the rule for any run.
+        Raises TrilaneError if a run fails.
         """
         on_cores = {plan: placed(one, POLICY, starter, str(self.driver)) for plan, one in self._plans.items()}
         times: dict[str, list[float]] = {plan: [] for plan in self._plans}
@@ -166,7 +170,7 @@ class _Scene:
         return {"speedup": median(ratios), "speedup_low": low, "speedup_high": high, **middle, "placements": said}
 
     def compare(self, pictures: int) -> tuple[dict[str, Any], list[tuple[int, U8]]]:
-        """Return image errors over `pictures` frames, evenly spread, and a sheet of each with its number."""
+        """Return the errors' keys of `measure`, over `pictures` frames, evenly spread, and (number, sheet) of each."""
         cast, total = Cast(self._checked), self._checked.config.scene.frames
         full = FullPictures(cast)
         first = AvatarFrames(self._checked)
@@ -205,12 +209,13 @@ def by_frame(
     true: Callable[[int, U8], U8],
     cast: Cast,
 ) -> dict[str, Any] | None:
-    """Return each plan's error in the avatars' boxes against the truth, over `frames`, one after the other.
+    """Return each plan's error in the avatars' boxes against the truth, over single frames.
 
-    `true`: makes the true picture of a frame over the background that `behind` makes.
-    The result has, by plan, the values of `psnr_of_frames` for the frames in which somebody is seen, and `worst_frame`,
-    its number. For `planned` it also has `changes`, how often the tensor's shape differs from the frame before, and
-    `worst_change_db`, the least PSNR of these frames, None without any. It is None with nobody in view.
+    `frames`: numbers, ascending. `chains`: makes the frames, by plan. `behind`: makes the backgrounds. `true`: function
+    of a frame's number and background that makes the true picture.
+    The result has, by plan, the values of `psnr_of_frames` over the frames with a visible avatar, and the number
+    `worst_frame`. For `planned` it also has `changes`: in how many frames the tensor's shape differs from the frame
+    before; and `worst_change_db`: the least PSNR of these frames, or None. With nobody in view, the result is None.
     """
     errors: dict[str, dict[int, float]] = {plan: {} for plan in chains}
     tensors: dict[int, str] = {}
@@ -249,10 +254,10 @@ def _frame_ms(checked: Checked, what: str, starter: UnitStarter) -> float:
 
 
 def sheet(moment: _Moment) -> U8:
-    """Return the pictures of a moment in two rows.
+    """Return a sheet (h,w,3) with the pictures of a moment in two rows.
 
-    Above stand full, fixed and planned. Below stand the truth (grey without) and the differences from full, around
-    grey.
+    The upper row has full, fixed and planned. The lower row has the truth, or grey without a truth, and the differences
+    of fixed and planned from full, around grey.
     """
     above = [moment.full, *moment.plans.values()]
     below = [np.full_like(moment.full, 128) if moment.true is None else moment.true]

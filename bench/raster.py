@@ -1,7 +1,7 @@
 """How much faster is one packed pass than a pass for every four channels and a permute?
 
-Rule: all variants draw the same body in the same process, interleaved, in poses that take turns, and must give the same
-bytes. The split passes share mesh, texture and triangles with the packed one.
+Rule: all variants draw the same body in the same poses, in the same process, interleaved, and must give the same bytes.
+The split passes share mesh, texture and triangles with the packed pass.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ from trilane.training.sample_renderer import UvBytes
 MAX_SIDE = 4096
 #: Variants whose bytes are compared.
 COMPARED = ("packed", "packed, other way", "split")
-UNEQUAL = 1e-3  # largest share of bytes that may differ by one step: other targets interpolate UVs at other places
+UNEQUAL = 1e-3  # largest share of bytes that may differ, by one step: variants interpolate UVs at other places
 
 
 def measure(size: int = 512, channels: int = 16, repeats: int = 40, threads: int = 1) -> dict[str, Any]:
     """Milliseconds of one raster, readback to host memory included; medians over `repeats`.
 
-    Keys: `raster_ms` (the raster stage as a run on this driver does it: where it is software, the CPU unit skins),
-    `packed_ms`, `split_ms`, `ratios.split_over_packed`, `rows` (one per variant: median, minimum, p90), `covered`
-    (share of the pixels), `driver`, `config`.
+    Keys: `raster_ms` (as in a run on this driver: with a software driver, the CPU unit skins), `packed_ms`, `split_ms`,
+    `ratios.split_over_packed`, `rows` (one per variant: median, minimum, p90), `covered` (share of the pixels that the
+    body covers), `driver`, `config`.
 
-    Raises BadInputError, MissingPartError; TrilaneError when bytes differ.
+    Raises BadInputError, MissingPartError; TrilaneError if the variants' bytes differ.
     """
     if not 1 <= size <= MAX_SIDE:
         raise BadInputError("--size", str(size), f"1 to {MAX_SIDE}")
@@ -67,7 +67,10 @@ def measure(size: int = 512, channels: int = 16, repeats: int = 40, threads: int
 def _variants(
     ctx: Any, fixture: Fixture, tensors: dict[str, Any], shape: tuple[int, int], deferred: bool
 ) -> dict[str, Callable[[int], object]]:
-    """Return every variant; each of `COMPARED` writes to its own one of `tensors`."""
+    """Return all variants by name, as functions of the input's number.
+
+    Variants in `COMPARED` write to their own array (SLOTS, bytes) of `tensors`. `deferred`: as a run on this driver.
+    """
     draws = (
         packed_variant(ctx, fixture, shape, deferred),
         packed_variant(ctx, fixture, shape, not deferred),
@@ -84,12 +87,12 @@ def _variants(
     return variants
 
 
-#: Draws an input, by its number, to its slot of an array (SLOTS, bytes).
+#: Function of an array (SLOTS, bytes) and an input's number. It draws the input into the array's next slot.
 Draw = Callable[[Any, int], None]
 
 
 def packed_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int], deferred: bool) -> Draw:
-    """Return a function that draws the body by the packed pass and reads it into a tensor.
+    """Return a function that draws the body by the packed pass and reads the result into a tensor.
 
     `ctx`: OpenGL context.
     `fixture`: body to draw.
@@ -110,9 +113,9 @@ def packed_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int], deferred:
 def skinned_variant(
     ctx: Any, fixture: Fixture, shape: tuple[int, int], deferred: bool
 ) -> tuple[Callable[[int], None], Draw]:
-    """Return a function that skins the body as the CPU unit does, and one that draws it by the packed pass.
+    """Return a function that skins the body as the CPU unit does, and a function that draws the skinned body.
 
-    The parameters are those of `packed_variant`.
+    The second function uses the packed pass. Parameters: see `packed_variant`.
     """
     packed = PackedPass(ctx, fixture.texture.shape[2], ENCODING, deferred)
     avatar = PackedAvatar(packed, PosedMesh(ctx, fixture.arrays), fixture.texture)
@@ -135,7 +138,7 @@ def skinned_variant(
 
 
 def split_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int]) -> Draw:
-    """Return a function that draws the body by the split passes, reads them and permutes."""
+    """Return a function that draws the body by the split passes, reads their targets and interleaves the channels."""
     split = SplitPass(ctx, SkinnedMesh(ctx, fixture.arrays), fixture.texture, ENCODING, shape)
 
     def draw_and_read(tensors: Any, number: int) -> None:
@@ -146,7 +149,7 @@ def split_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int]) -> Draw:
 
 
 def uv_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int]) -> Draw:
-    """Return a function that draws the UV coordinates of the body as two bytes a pixel."""
+    """Return a function that draws the UV coordinates of the body, two bytes a pixel, and reads them."""
     image = UvBytes(ctx, SkinnedMesh(ctx, fixture.arrays))
 
     def draw_and_read(images: Any, number: int) -> None:
@@ -163,11 +166,11 @@ def _check_equal(tensors: dict[str, Any]) -> None:
 
 
 class SplitPass:
-    """Draws one avatar into tensors, RGBA8 by RGBA8.
+    """Draws one avatar in several passes, each into an RGBA8 target with four channels of the tensor.
 
     `ctx`: OpenGL context.
     `mesh`: mesh of the avatar.
-    `texture`: (H,W,C) floats, C a multiple of 4.
+    `texture`: neural texture (H,W,C), real numbers, C a multiple of 4.
     `quantisation`: scale and zero point of the tensor.
     `shape`: (height, width) of the tensor in pixels.
     """
@@ -193,7 +196,7 @@ class SplitPass:
         self._planes = np.empty((len(self._targets), *shape, 4), np.uint8)
 
     def draw(self, view: Floats, placement: Placement) -> None:
-        """Draw every pass. The avatar fills the tensor; `placement.rect` is not read."""
+        """Draw every pass. The avatar gets the whole tensor: `placement.rect` is ignored."""
         self._texture.use(0)
         self._mesh.prepare(self._ctx)
         for layer, target in enumerate(self._targets):
@@ -203,7 +206,7 @@ class SplitPass:
             self._draw.draw(placement.pose, view, placement.clip_projection)
 
     def read_into(self, tensor: U8) -> None:
-        """Read every pass and interleave them into `tensor`, (h * w * C,) uint8."""
+        """Read the targets of all passes, and interleave their channels into `tensor`, (h * w * C,) uint8."""
         image = tensor.reshape(*self._shape, 4 * len(self._targets))
         for layer, target in enumerate(self._targets):
             target.read_into(self._planes[layer], components=4)

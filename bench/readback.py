@@ -1,7 +1,7 @@
 """Which variant of moving pixels between GPU and slot is the fastest on this driver?
 
-Rule: all variants move the same bytes and run interleaved, once without a draw and once after one, during which a copy
-may go on. The body's poses and the pictures take turns, and so do the slots.
+Rule: all variants move the same bytes and run interleaved. They are timed twice: with an idle GPU, and directly after a
+draw. Poses, pictures and slots change from run to run.
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ def measure(
 ) -> dict[str, Any]:
     """One row for each size, number of channels and variant: `kind` (readback, upload), `way`, `lag`, `move`, `turn`.
 
-    `lag`: how many frames later the bytes arrive. `move`: time of the copy alone, while the GPU has nothing else to do
-    (uploads: with a copy to another framebuffer). `turn`: time of the copy and of the tensor's draw before it.
-    `fastest`: for each kind the variant with the smallest sum of medians, of `turn` on a hardware driver and of `move`
-    on a software one, where nothing runs beside the caller.
+    `way`: name of the variant. `lag`: how many frames later the bytes arrive. `move`: time of the copy alone, with an
+    idle GPU; for uploads, with a copy to another framebuffer. `turn`, only for readbacks: time of the tensor's draw and
+    the copy. `fastest`: for each kind, the variant with the smallest sum of medians: of `turn` for readbacks on a
+    hardware driver, otherwise of `move`.
 
     Raises MissingPartError.
     """
@@ -136,9 +136,9 @@ def _fastest(rows: list[dict[str, Any]], kind: str, figure: str) -> str:
     return min(sums, key=lambda variant: sums[variant])
 
 
-# Variants of moving pixels between the GPU and a slot, by name.
+# Variants of moving pixels between the GPU and a slot.
 #
-# Rule: every variant gives the same bytes; they differ in when the caller waits.
+# Rule: every variant gives the same bytes. The variants differ in when the caller waits.
 
 Box = tuple[int, int, int, int]
 RING = 3
@@ -153,20 +153,20 @@ class Readback(Protocol):
     lag: int
 
     def submit(self, target: Any, box: Box, words: int, tensor: U8) -> None:
-        """Start to read.
+        """Start a read.
 
         `target`: framebuffer.
         `box`: (x, y, width, height) in pixels.
         `words`: number of components of a pixel.
-        `tensor`: bytes to fill, `lag` submits later.
+        `tensor`: array that gets the bytes, `lag` submits later.
         """
 
     def drain(self) -> None:
-        """Fill every tensor that was submitted."""
+        """Finish all reads: every submitted tensor has its bytes afterwards."""
 
 
 class DirectReadback:
-    """The driver copies to the slot, and the caller waits."""
+    """A readback in which the driver copies to the slot, and the caller waits."""
 
     lag = 0
 
@@ -174,7 +174,7 @@ class DirectReadback:
         """Do nothing: no memory is needed."""
 
     def submit(self, target: Any, box: Box, words: int, tensor: U8) -> None:
-        """Read at once."""
+        """Read at once, and wait."""
         target.read_into(tensor, box, components=words, dtype="u4", alignment=1)
 
     def drain(self) -> None:
@@ -182,7 +182,7 @@ class DirectReadback:
 
 
 class PboReadback:
-    """The driver copies to one pixel buffer, the caller from there to the slot."""
+    """A readback through a pixel buffer: the driver copies to the buffer, the caller from the buffer to the slot."""
 
     lag = 0
     orphan = False
@@ -191,7 +191,7 @@ class PboReadback:
         self._buffer = ctx.buffer(reserve=most_bytes)
 
     def submit(self, target: Any, box: Box, words: int, tensor: U8) -> None:
-        """Read to the buffer, then copy."""
+        """Read to the buffer, then copy to `tensor`."""
         if self.orphan:
             self._buffer.orphan()
         target.read_into(self._buffer, box, components=words, dtype="u4", alignment=1)
@@ -202,13 +202,13 @@ class PboReadback:
 
 
 class OrphanPboReadback(PboReadback):
-    """Reads as `PboReadback`, with fresh memory for each frame, so that the driver need not wait for the old."""
+    """A `PboReadback` with new memory for each frame, so that the driver need not wait for the old memory."""
 
     orphan = True
 
 
 class RingReadback:
-    """A ring of pixel buffers, each with a fence; the slot is filled when its buffer is needed again."""
+    """A readback through a ring of pixel buffers with fences. A slot is filled when its buffer is needed again."""
 
     lag = RING - 1
 
@@ -217,7 +217,7 @@ class RingReadback:
         self._waiting: deque[tuple[Any, int, U8]] = deque()
 
     def submit(self, target: Any, box: Box, words: int, tensor: U8) -> None:
-        """Start this read; finish the oldest when no buffer is free."""
+        """Start this read; finish the oldest read if no buffer is free afterwards."""
         buffer = self._free.popleft()
         target.read_into(buffer, box, components=words, dtype="u4", alignment=1)
         self._waiting.append((buffer, opengl.fence(), tensor))
@@ -225,7 +225,7 @@ class RingReadback:
             self._finish()
 
     def drain(self) -> None:
-        """Wait for all buffers."""
+        """Finish all reads, the oldest first."""
         while self._waiting:
             self._finish()
 
@@ -248,41 +248,41 @@ class Upload(Protocol):
     """Writes a slot's bytes to a texture."""
 
     def write(self, texture: Any, image: U8) -> None:
-        """Write `image`; the caller may change it afterwards."""
+        """Write `image` to `texture`. The caller may change `image` afterwards."""
 
 
 class SubUpload:
-    """The driver copies from the slot."""
+    """An upload in which the driver copies from the slot."""
 
     def __init__(self, ctx: Any, most_bytes: int) -> None:
         """Do nothing: no memory is needed."""
 
     def write(self, texture: Any, image: U8) -> None:
-        """Copy at once."""
+        """Let the driver copy from `image` at once."""
         texture.write(image, alignment=1)
 
 
 class OrphanUpload:
-    """Uploads through one pixel buffer, with fresh memory for each frame."""
+    """An upload through one pixel buffer, with new memory for each frame."""
 
     def __init__(self, ctx: Any, most_bytes: int) -> None:
         self._buffer = ctx.buffer(reserve=most_bytes)
 
     def write(self, texture: Any, image: U8) -> None:
-        """Copy to fresh memory, from which the driver copies on."""
+        """Copy to new memory of the buffer; the driver copies from there."""
         self._buffer.orphan()
         self._buffer.write(image)
         texture.write(self._buffer, alignment=1)
 
 
 class RingUpload:
-    """Uploads through a ring of pixel buffers; one is written again only after its fence."""
+    """An upload through a ring of pixel buffers. A buffer is written again only after its fence."""
 
     def __init__(self, ctx: Any, most_bytes: int) -> None:
         self._ring: deque[tuple[Any, int | None]] = deque((ctx.buffer(reserve=most_bytes), None) for _ in range(RING))
 
     def write(self, texture: Any, image: U8) -> None:
-        """Copy to the oldest buffer, from which the driver copies on."""
+        """Copy to the oldest buffer; the driver copies from there."""
         buffer, sync = self._ring.popleft()
         if sync is not None:
             opengl.wait_fence(sync)

@@ -1,8 +1,8 @@
 """What are the highest rates of this machine's cores, in INT8, in FP32, and from memory?
 
-Rule: there are two peaks for INT8, and each figure names its own. The first is the best rate that any layer of the
-installed runtimes reached here, on layers that suit them. The second is what the instruction set allows: the documented
-multiply-accumulates of a cycle, times the clock measured under that load, times the number of cores.
+Rule: there are two peaks for INT8, and each figure names its own. The first is the best rate that the installed
+runtimes reach here, on layers that suit them. The second is the peak of the instruction set: the documented
+multiply-accumulates a cycle, times the clock measured under that load, times the number of cores.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ COPY_BYTES = 128 << 20
 
 
 def measure(threads: int = 0) -> dict[str, Any]:
-    """Best rates with `threads` threads; 0: one for each core that this process may use.
+    """Best rates with `threads` threads; 0 means one for each core that this process may use.
 
-    Keys: `int8_gmac_s` and `fp32_gmac_s`: rate of the best layer of the runtimes, in 1e9 multiply-accumulates a second;
-    `int8_instruction_gmac_s`: peak of the instruction set, null where it is not known; `layer_of_instruction`:
-    `int8_gmac_s` over this peak; `memory_gb_s`: 1e9 bytes a second, read and written by one thread; `instructions`:
-    derivation of the instruction set's peak, or why it is not known; `rows`: the rate of each INT8 layer that was
-    tried.
+    Keys: `int8_gmac_s`: rate of the best INT8 layer of the runtimes, in 1e9 multiply-accumulates a second;
+    `fp32_gmac_s`: rate of an FP32 matrix product; `int8_instruction_gmac_s`: peak of the instruction set, null if it is
+    unknown; `layer_of_instruction`: `int8_gmac_s` divided by this peak; `memory_gb_s`: 1e9 bytes a second, read and
+    written by one thread; `instructions`: derivation of the instruction set's peak, or why it is unknown; `rows`: rate
+    of each INT8 layer that was tried.
     """
     threads = threads or len(machine.here.cores())
     rows = _int8_rows(threads)
@@ -67,12 +67,12 @@ def measure(threads: int = 0) -> dict[str, Any]:
 
 
 def instruction_peak(flags: Sequence[str], threads: int) -> dict[str, Any]:
-    """Return the INT8 peak of the widest instruction set that `flags` name, on as many cores as `threads` can use.
+    """Return the INT8 peak of the widest instruction set among the CPU `flags`, on at most `threads` cores.
 
-    `set`, `sequence`, `source`: entries of `INSTRUCTION_SETS`. `macs_a_cycle`: documented value for one core.
-    `issued_macs_a_cycle`: value that a loop of registers alone reached. `clock_ghz`: clock under that load, with its
-    95 % interval. `cores`: number of cores. `gmac_s`: macs_a_cycle x clock x cores. `absent`: reason why there is no
-    peak; all other keys are then missing.
+    `set`, `sequence`, `source`: as in `INSTRUCTION_SETS`. `macs_a_cycle`: documented value for one core.
+    `issued_macs_a_cycle`: value measured with a loop without memory accesses. `clock_ghz`: clock under that load, with
+    its 95 % interval. `cores`: number of cores. `gmac_s`: macs_a_cycle x clock x cores. If there is no peak, the only
+    key is `absent`, the reason.
     """
     widest = instruction_set_of(flags)
     if widest is None:
@@ -128,7 +128,7 @@ def _best_ms(variants: dict[str, ProcessVariant]) -> dict[str, float]:
 
 
 def _memory_gb_s() -> float:
-    """Return the memory rate of one thread in 1e9 bytes a second, read and written by a copy larger than the caches."""
+    """Return the memory rate of one thread, 1e9 bytes a second: bytes read plus written by a copy beyond the caches."""
     source, target = np.ones(COPY_BYTES // 8), np.empty(COPY_BYTES // 8)
     best = float("inf")
     for _ in range(ROUNDS):
@@ -146,7 +146,7 @@ def _product() -> onnx.ModelProto:
 
 
 def _layers(side: int, channels: int, kernel: int) -> onnx.ModelProto:
-    """Return `LAYERS` quantised convolutions in a row, NHWC bytes in and out."""
+    """Return a network of `LAYERS` quantised convolutions in sequence, with NHWC bytes as input and output."""
     rng = np.random.default_rng(0)
     shape = (channels, channels, kernel, kernel)
     constants = {
@@ -180,24 +180,25 @@ def _model(nodes: list[Any], ends: list[Any], tensors: list[Any]) -> onnx.ModelP
 
 # The INT8 peak of a core by its instruction set: multiply-accumulates of an instruction, times instructions a cycle.
 #
-# Rule: the number of multiply-accumulates in an instruction is its definition; the number of instructions a cycle is
-# documented. Where cores with the same set differ, the measurement says which of the documented rates this core has.
+# Rule: the number of multiply-accumulates in an instruction follows from its definition; the number of instructions a
+# cycle is documented. If cores with the same set differ, the measurement shows which documented rate this core has.
 #
-# The cores are measured by two loops that run by turns in short bursts on every core at once; the median of the bursts
-# counts. One loop issues nothing but the set's instructions. In the other, each of them is followed by dependent
-# `imul`. An `imul` takes three cycles on every x86-64 core since Intel's Nehalem and AMD's Zen (uops.info
-# IMUL_R64_R64). These form the longer path, so the loop takes three cycles for each, at the clock that the core holds
-# under this very load. No processor counter is needed, because virtual machines have none. The loops are machine code,
-# because a compiler may be missing; the bytes are GNU as's for the lines beside them.
+# Two loops measure the cores. They run in turn, in short bursts, on all cores at once; the median of the bursts counts.
+# The first loop only issues the set's instructions. The second loop has dependent `imul` after each of them. An `imul`
+# takes three cycles on every x86-64 core since Intel's Nehalem and AMD's Zen (uops.info IMUL_R64_R64). The chain of
+# `imul` takes longer than the other instructions. Therefore the time of the second loop shows the clock under this
+# load. No performance counter is needed, because virtual machines have none. The loops are machine code, because a
+# compiler may be missing. The bytes are the output of GNU as for the instructions in the comments.
 
 
 @dataclass(frozen=True)
 class InstructionSet:
-    """One row of the table.
+    """An instruction set with INT8 multiply-accumulates.
 
     `flags`: flags of /proc/cpuinfo that every core with the set has.
-    `macs`: INT8 multiply-accumulates of one `sequence`, an instruction or the few that stand for one.
-    `rates`: sequences a cycle that cores with the set are documented to reach.
+    `sequence`: the instruction that multiplies and accumulates, or a few instructions in its place.
+    `macs`: INT8 multiply-accumulates of one `sequence`.
+    `rates`: documented numbers of sequences a cycle, which differ from core to core.
     `source`: source of `macs` and `rates`.
     """
 
@@ -209,16 +210,16 @@ class InstructionSet:
     source: str
 
     def rate_nearest(self, measured: float) -> Fraction:
-        """Return the documented rate of a core on which `measured` sequences a cycle were issued."""
+        """Return the documented rate that is nearest to `measured` sequences a cycle."""
         return min(self.rates, key=lambda rate: abs(float(rate) - measured))
 
     def macs_a_cycle(self, measured: float) -> float:
-        """Return the multiply-accumulates a cycle of a core on which `measured` sequences a cycle were issued."""
+        """Return the documented multiply-accumulates a cycle of a core with `measured` sequences a cycle."""
         return float(self.macs * self.rate_nearest(measured))
 
 
 ONE, TWO, FOUR = Fraction(1), Fraction(2), Fraction(4)
-#: From the widest to the narrowest: a core's own set is the first whose flags it has.
+#: From the widest to the narrowest. The first set whose flags a core has counts.
 INSTRUCTION_SETS = (
     InstructionSet(
         "AMX-INT8",
@@ -272,7 +273,7 @@ INSTRUCTION_SETS = (
 
 
 def instruction_set_of(flags: Iterable[str]) -> InstructionSet | None:
-    """Return the widest set that a core with these `flags` has, or None for one that is not in the table."""
+    """Return the widest set in `INSTRUCTION_SETS` that a core with these `flags` has; None if it has none of them."""
     found = {*flags}
     return next((each for each in INSTRUCTION_SETS if found.issuperset(each.flags)), None)
 
@@ -282,18 +283,20 @@ DEC, JNZ, RET = bytes.fromhex("48ffcf"), bytes.fromhex("0f85"), b"\xc3"  # dec %
 VZEROUPPER = "c5f877"
 BURST_CYCLES, BURSTS = 1_000_000, 60
 SYS_ARCH_PRCTL, ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA = 158, 0x1023, 18
-#: Palette 1; eight tiles of 16 rows of 64 bytes.
+#: Tile configuration of AMX: palette 1, eight tiles of 16 rows of 64 bytes.
 TILE_CONFIG = bytes([1, *[0] * 15, *[64, 0] * 8, *[0] * 16, *[16] * 8, *[0] * 8])
 
 
 @dataclass(frozen=True)
 class Kernel:
-    """The machine code of a set's loop.
+    """The machine code of an instruction set's loop.
 
-    `body`: instructions in hexadecimal, `sequences` of them without an input from one another.
-    `imuls`: number of `imul` after each instruction in the loop that measures the clock: enough that they take longer
-    than it.
-    `cycles`: least number of cycles of the body, for the length of a burst.
+    `body`: code of independent sequences, in hexadecimal, instructions separated by spaces.
+    `sequences`: number of sequences in the body.
+    `imuls`: number of `imul` after each instruction in the loop that measures the clock. They take longer than the
+    instruction.
+    `cycles`: least number of cycles that the body takes; it determines the turns of a burst.
+    `before`, `after`: code before and after the loop.
     """
 
     body: str
@@ -304,6 +307,7 @@ class Kernel:
     after: str = VZEROUPPER
 
 
+#: Name of an instruction set -> its loop, for x86-64.
 KERNELS = {
     "AMX-INT8": Kernel(
         "c4e2415ec6 c4e2415ece c4e2415ed6 c4e2415ede",  # tdpbusd %tmm7,%tmm6,%tmm0 to %tmm3
@@ -347,9 +351,9 @@ KERNELS = {
 
 @dataclass(frozen=True)
 class Issued:
-    """The measured rates of the cores.
+    """Measured rates, as means over the cores.
 
-    `rate`: sequences a cycle of the mean core. `clock_ghz`: clock of the mean core, with the interval of its median.
+    `rate`: sequences a cycle. `clock_ghz`: clock, with the 95 % interval of its median.
     """
 
     rate: float
@@ -359,12 +363,15 @@ class Issued:
 
 
 def rate_loop(kernel: Kernel) -> bytes:
-    """Return a function that issues the body; it takes the number of turns (%rdi) and the tile configuration (%rsi)."""
+    """Return machine code of a function that loops over the body.
+
+    Its arguments are the number of turns (%rdi) and the tile configuration (%rsi).
+    """
     return _loop(kernel, bytes.fromhex(kernel.body))
 
 
 def clock_loop(kernel: Kernel) -> bytes:
-    """Return the same function with `imul` after each instruction."""
+    """Return the function of `rate_loop` with `imul` after each instruction."""
     return _loop(kernel, b"".join(bytes.fromhex(each) + IMUL * kernel.imuls for each in kernel.body.split()))
 
 
@@ -375,10 +382,10 @@ def _loop(kernel: Kernel, body: bytes) -> bytes:
 
 
 def measure_issued(name: str, cores: Sequence[int]) -> Issued:
-    """Measure the rate of each of `cores` while all of them work.
+    """Measure all `cores` while all of them work.
 
-    `name`: key of `KERNELS` for a set that this CPU has. Raises OSError when the kernel refuses machine code in memory
-    or the tiles of AMX.
+    `name`: key of `KERNELS` for a set that this CPU has. Raises OSError for another architecture, and if Linux refuses
+    executable memory or the tiles of AMX.
     """
     if machine.here.architecture() != "x86_64":
         raise OSError("there are no loops for this architecture")
@@ -395,16 +402,16 @@ def measure_issued(name: str, cores: Sequence[int]) -> Issued:
 
 
 def _ask_for_tiles() -> None:
-    """Ask Linux for the registers of AMX, which a process has only on request."""
+    """Request the tile registers of AMX from Linux. Raises OSError."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.syscall(SYS_ARCH_PRCTL, ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA):
         raise OSError(ctypes.get_errno(), "the tiles of AMX are refused")
 
 
 def _on_core(core: int, kernel: Kernel, together: threading.Barrier) -> tuple[float, list[float]]:
-    """Return sequences a cycle, and the clock in GHz in each burst, on one core.
+    """Return, for one core, its sequences a cycle, and the clock in GHz in each burst.
 
-    The thread ends afterwards, and with it its binding to the core.
+    This binds the calling thread to the core. Therefore the thread must end afterwards.
     """
     os.sched_setaffinity(0, {core})
     turns = BURST_CYCLES // kernel.cycles
@@ -419,7 +426,7 @@ def _on_core(core: int, kernel: Kernel, together: threading.Barrier) -> tuple[fl
 
 
 class _Code:
-    """Machine code in memory. Raises OSError when the kernel refuses it."""
+    """Machine code in executable memory. Raises OSError if Linux refuses such memory."""
 
     def __init__(self, code: bytes) -> None:
         self._memory = mmap.mmap(-1, len(code), prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC)
@@ -435,7 +442,7 @@ class _Code:
         self._memory.close()
 
     def ns(self, turns: int) -> int:
-        """Return the CPU time of so many turns; other threads of this process run meanwhile."""
+        """Return the CPU time of this thread for `turns` turns of the loop, ns."""
         begin = time.thread_time_ns()
         self._call(turns, TILE_CONFIG)
         return time.thread_time_ns() - begin

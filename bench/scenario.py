@@ -1,7 +1,7 @@
 """Does the pipeline answer as a service should: one query at a time, several, at random moments, all at once?
 
-Rule: the whole pipeline answers, from pose to presented frame. A result is valid or says why not, and MLCommons LoadGen
-can ask for the same load and evaluate it.
+Rule: the whole pipeline answers, from pose to presented frame. A result is valid, or says why it is not. MLCommons
+LoadGen can create the same load and evaluate the run.
 """
 
 from __future__ import annotations
@@ -47,12 +47,13 @@ def measure(
     runtime: str = "auto",
     seed: int = 1,
 ) -> dict[str, Any]:
-    """One row for each scenario and each of `judge`: `trilane` or `loadgen`, MLCommons' own.
+    """One row for each scenario and each `judge`, which evaluates the run: `trilane`, or `loadgen` of MLCommons.
 
-    Scenarios: single-stream, multi-stream (`samples` frames a query), server (`rate` queries a second at random
-    moments, each to be answered within `limit_ms`), offline. A row's `verdict` is VALID when it lasted `seconds`, has
-    as many queries as its percentile needs, and for a server when few enough were late; `because` says why not.
-    `percentile_ms`: latency that the share `percentile` of all queries does not exceed.
+    Scenarios: single-stream (the next query after each answer), multi-stream (the same with `samples` frames a query),
+    server (`rate` queries a second at random moments, each to be answered within `limit_ms`), offline (all queries at
+    once). The `verdict` of a row is VALID if the run lasted `seconds`, had as many queries as its percentile needs and,
+    for a server, had few enough late answers; `because` says why it is not. `percentile_ms`: latency that the share
+    `percentile` of all queries does not exceed.
 
     Raises BadInputError, MissingPartError, TrilaneError when a run fails.
     """
@@ -80,10 +81,10 @@ def measure(
 def run_scenario(
     pipeline: Pipeline, assets: Assets, load: Load, evaluated_by: str, policy: str
 ) -> tuple[dict[str, Any], str]:
-    """Do one run under `load`; return its row, and LoadGen's summary where LoadGen evaluates it.
+    """Do one run under `load`; return its row, and LoadGen's summary, empty if LoadGen does not evaluate the run.
 
     `pipeline`, `assets`: pipeline to run, and the arrays that its stages may read.
-    `load`: pattern and its limits.
+    `load`: load pattern and its limits.
     `evaluated_by`: one of `JUDGES`.
     `policy`: policy of the scheduler.
     Raises TrilaneError when the run fails.
@@ -111,10 +112,10 @@ def run_scenario(
 
 @dataclass
 class _Player(threading.Thread):
-    """Asks for frames on a thread of its own.
+    """A thread that asks for frames.
 
-    `requests`: queue of the run; asking begins when it is open.
-    `work`: function that asks, and waits for the answers.
+    `requests`: queue of the run; the thread waits until the queue is open.
+    `work`: function that asks for frames and waits for the answers.
     `errors`: errors that `work` raised.
     """
 
@@ -170,14 +171,14 @@ def _check(scenarios: tuple[str, ...], judges: tuple[str, ...], numbers: dict[st
 
 # The four load patterns of MLPerf inference, and the conditions of a valid result.
 #
-# Rule: names, patterns and the number of queries that a percentile needs are LoadGen's, so that results can be compared
-# with LoadGen's; the warm-up is not counted.
+# Rule: names, patterns and the number of queries for a percentile are as in LoadGen, so that results can be compared.
+# The warm-up is not counted.
 #
 # Reddi et al., MLPerf Inference Benchmark, ISCA 2020, sections III and V.
 
 CONFIDENCE = 0.99
 WARM_UP = 8
-#: Percentile of the queries' latency that decides in each scenario. Offline is decided by its rate.
+#: Scenario -> percentile of the queries' latency that is judged. For offline, the rate is judged.
 PERCENTILES = {"single-stream": 0.90, "multi-stream": 0.99, "server": 0.99, "offline": 0.90}
 STALLED_S = 60.0
 KEEPS_ALL = "single, double and fifo edges drop none, under the policies sequential and pipelined"
@@ -189,10 +190,10 @@ class Load:
 
     `scenario`: key of `PATTERNS`.
     `seconds`: least duration.
-    `rate`: queries a second of the server scenario.
-    `limit_ms`: limit of the server scenario on the percentile of its latency.
-    `samples`: number of frames in a query of multi-stream.
-    `seed`: seed of the moments at which a server's queries arrive.
+    `rate`: queries a second, for server.
+    `limit_ms`: limit on the percentile of the latency, for server.
+    `samples`: number of frames in a query, for multi-stream.
+    `seed`: seed of the random moments of queries, for server.
     """
 
     scenario: str
@@ -209,14 +210,14 @@ class Load:
 
 @dataclass
 class Queries:
-    """Times at which each query was asked of a `FrameRequestQueue` and answered; two threads share it.
+    """The times at which queries were asked of a `FrameRequestQueue` and answered.
 
-    The threads are the one that asks and the run's.
-    `size`: number of frames in a query, which is answered with the last of them.
-    `asked_s`, `answered_s`: monotonic seconds of the queries that count.
-    `over`: whether nothing more counts: the run has ended, or a frame was dropped or lost.
+    Two threads share this object: the thread that asks and the thread of the run.
+    `size`: number of frames in a query. The last frame answers the query.
+    `asked_s`, `answered_s`: monotonic seconds of the queries that count, in order.
+    `over`: whether no more answers count: the run has ended, or a frame was dropped or lost.
     `why`: sentence about the dropped or lost frame.
-    `changed`: condition that is notified with every answer and when it is over.
+    `changed`: condition that is notified of every answer, and of `over`.
     """
 
     size: int = 1
@@ -228,12 +229,12 @@ class Queries:
     _frames: int = 0
 
     def ask(self, requests: FrameRequestQueue, count: int = 1) -> None:
-        """Ask `count` queries now."""
+        """Ask `count` queries now, and note the time."""
         self.asked_s += [time.monotonic()] * count
         requests.request(count * self.size)
 
     def answered(self, _frame: int) -> None:
-        """Note a presented frame; the `FrameRequestQueue` calls this."""
+        """Note a presented frame, which may complete a query. The `FrameRequestQueue` calls this."""
         with self.changed:
             self._frames += 1
             if self._frames % self.size == 0:
@@ -241,7 +242,7 @@ class Queries:
                 self.changed.notify_all()
 
     def unanswered(self, causes: Mapping[str, int]) -> None:
-        """Note that a frame was dropped or lost, so its query has no answer; the `FrameRequestQueue` calls this."""
+        """Note dropped or lost frames, by cause: their queries get no answer. The `FrameRequestQueue` calls this."""
         frames = ", ".join(f"{cause} {count}" for cause, count in causes.items())
         self.why = f"frames of queries were dropped or lost ({frames}), and every query must be answered: {KEEPS_ALL}"
         self.ended()
@@ -266,7 +267,7 @@ class Queries:
                 raise TrilaneError(self.why or "the run ended before every query was answered")
 
     def warm_up(self, requests: FrameRequestQueue) -> None:
-        """Ask a few queries that are not counted."""
+        """Ask a few queries that do not count, and wait for their answers."""
         self.ask(requests, WARM_UP)
         self.wait()
         self.restart()
@@ -278,16 +279,15 @@ class Queries:
 
     @property
     def latencies_ms(self) -> list[float]:
-        """Latencies of the answered queries, in the order in which they were asked."""
+        """The latencies of the answered queries, ms, in the order in which these were asked."""
         return [(end - begin) * 1e3 for begin, end in zip(self.asked_s, self.answered_s, strict=False)]
 
 
 def play(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
-    """Ask as `load` says until the time has passed and there are enough queries, then wait for the answers.
+    """Ask queries in the pattern of `load`, for its time and until there are enough, then wait for the answers.
 
-    `load`: pattern and its limits.
     `requests`: queue of the run.
-    `queries`: times, which are filled in.
+    `queries`: gets the times of the queries.
     """
     queries.warm_up(requests)
     PATTERNS[load.scenario](load, requests, queries)
@@ -314,7 +314,7 @@ def _poisson(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
 
 
 def _all_at_once(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
-    """Ask as many queries at once as will take the time, by the rate that a first few show."""
+    """Ask all queries at once. A few queries before them show the rate, and so how many fill the time of `load`."""
     few = queries_needed(load.percentile)
     queries.ask(requests, few)
     queries.wait()
@@ -332,9 +332,9 @@ PATTERNS: dict[str, Callable[[Load, FrameRequestQueue, Queries], None]] = {
 
 
 def tail(queries: int, late: int, share: float) -> float:
-    """Return the tail of the binomial distribution: the chance of at most `late` late ones among `queries`.
+    """Return the probability that at most `late` of `queries` queries are late (binomial distribution).
 
-    `share`: chance of each query to be late.
+    `share`: probability of each query to be late.
     """
     logs = [
         math.lgamma(queries + 1)
@@ -348,9 +348,9 @@ def tail(queries: int, late: int, share: float) -> float:
 
 
 def queries_needed(percentile: float, late: int = 1) -> int:
-    """Return the least number of queries that show, at `CONFIDENCE`, that `percentile` of all are within a limit.
+    """Return how many queries are needed to show, at `CONFIDENCE`, that the share `percentile` keeps a limit.
 
-    `late` of them may be beyond it: 64 are needed for 0.90, 662 for 0.99, with one late query.
+    `late`: number of these queries that may be late. With one late query, 64 are needed for 0.90, and 662 for 0.99.
     """
     low, high = late, late + 1
     while tail(high, late, 1 - percentile) > 1 - CONFIDENCE:
@@ -362,9 +362,9 @@ def queries_needed(percentile: float, late: int = 1) -> int:
 
 
 def bound_ms(latencies_ms: list[float], percentile: float) -> float | None:
-    """Return the latency that `percentile` of all queries stay within, at `CONFIDENCE`; None for too few queries.
+    """Return the latency that the share `percentile` of queries keeps, at `CONFIDENCE`; None for too few queries.
 
-    The result is the k-th largest latency. k is the number of queries that may be late, as in LoadGen.
+    As in LoadGen, it is the k-th largest latency, if k queries may be late.
     """
     if len(latencies_ms) < queries_needed(percentile):
         return None
@@ -375,7 +375,7 @@ def bound_ms(latencies_ms: list[float], percentile: float) -> float | None:
 
 
 def verdict(load: Load, latencies_ms: list[float], lasted_s: float) -> list[str]:
-    """Say in sentences why the result is invalid; empty when it is valid.
+    """Return sentences that say why the result is invalid; none if it is valid.
 
     `load`: load of the run.
     `latencies_ms`: latencies of all queries.
@@ -397,13 +397,13 @@ def verdict(load: Load, latencies_ms: list[float], lasted_s: float) -> list[str]
     return reasons
 
 
-# A run evaluated by MLCommons LoadGen: it asks, it measures, and its own summary says whether the run is valid.
+# A run that MLCommons LoadGen evaluates: LoadGen asks, measures, and says in its summary whether the run is valid.
 #
-# Rule: LoadGen decides when a query comes and what counts; here its queries become frames, and the answers go back.
+# Rule: LoadGen decides when queries come and what counts. This code turns queries into frames, and frames into answers.
 
 NAMES = {"single-stream": "SingleStream", "multi-stream": "MultiStream", "server": "Server", "offline": "Offline"}
 VERDICT = re.compile(r"^Result is : (\w+)", re.MULTILINE)
-SAMPLES = 64  # size of the library that LoadGen draws from; whichever it draws, the motion's next frame is presented
+SAMPLES = 64  # size of the library that LoadGen draws samples from; for any sample, the motion's next frame is shown
 SUMMARY = "mlperf_log_summary.txt"
 
 
@@ -419,9 +419,9 @@ def load_generator() -> Any:
 class LoadGenPlayer:
     """Lets LoadGen ask a run for frames.
 
-    `load`: pattern and its limits, which LoadGen gets.
-    `queries`: times of the same frames, which also show an early end of the run.
-    `valid`, `summary`: whether LoadGen calls the run valid, and its text as LoadGen wrote it; `play` fills them in.
+    `load`: load pattern and its limits, which are passed to LoadGen.
+    `queries`: gets the times of the same frames, and an early end of the run.
+    `valid`, `summary`: whether LoadGen calls the run valid, and LoadGen's summary as text. `play` sets both.
     """
 
     load: Load
@@ -433,14 +433,14 @@ class LoadGenPlayer:
     _completed: int = 0
 
     def answered(self, frame: int) -> None:
-        """Pass a presented frame on to LoadGen, as a sample after the warm-up; the `FrameRequestQueue` calls this."""
+        """Note a presented frame; after the warm-up, pass it on to LoadGen. The `FrameRequestQueue` calls this."""
         self.queries.answered(frame)
         if self._begun and not self.queries.over:
             self._completed = frame - WARM_UP + 1
             self._complete(frame - WARM_UP)
 
     def unanswered(self, causes: Mapping[str, int]) -> None:
-        """Note a dropped or lost frame, which voids the rest of the run; the `FrameRequestQueue` calls this."""
+        """Note dropped or lost frames, by cause. They end the run. The `FrameRequestQueue` calls this."""
         self.queries.unanswered(causes)
         self.ended()
 
@@ -448,14 +448,14 @@ class LoadGenPlayer:
         """Note that the run is over; the `FrameRequestQueue` calls this."""
         self.queries.ended()
         if self._begun:
-            with self.queries.changed:  # no sample is completed twice, whichever thread comes first
+            with self.queries.changed:  # two threads may come here, but no sample may be completed twice
                 numbers = range(self._completed, len(self._ids))
                 self._completed = len(self._ids)
             for number in numbers:
                 self._complete(number)
 
     def play(self, requests: FrameRequestQueue) -> None:
-        """Warm up, then let LoadGen ask until it has enough answers. Raises TrilaneError when the run ends first."""
+        """Warm up, then let LoadGen ask until it has enough answers. Raises TrilaneError if the run ends first."""
         lg = load_generator()
         self.queries.warm_up(requests)
         self._begun = True

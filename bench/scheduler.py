@@ -1,7 +1,7 @@
-"""How fast is the scheduler in virtual time, beside SimPy on the same model, and is it the same every time?
+"""How fast is the scheduler in virtual time, beside SimPy on the same model, and do equal inputs give equal runs?
 
-Rule: all models present every frame at the same nanosecond or the bench fails. Their runs are interleaved, with the
-same service times, and with Python's garbage collector off.
+Rule: all models must present every frame at the same nanosecond; otherwise the bench fails. Their runs are interleaved,
+with the same service times, and with Python's garbage collector off.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from trilane.scheduler.virtual import Service, VirtualDriver, simulate
 from trilane.transport.slots import edge_rule
 
 MS = 1_000_000
-#: Mean service time in ms; each job takes from half of it to one and a half.
+#: Mean service time by stage, ms. Each job takes half to one and a half times the mean.
 SERVICE_MS = {"pose": 0.3, "raster": 4.0, "infer": 14.0, "composite": 2.0, "present": 3.0}
 FPS = 60
 PERIOD_NS = round(1e9 / FPS)
@@ -36,7 +36,7 @@ REPEATS, SEED_FRAMES = 10, 300
 TRILANE, NO_REPORT, RECORDED = "trilane", "trilane, no report", "trilane, recorded"
 SIMPY, LEAN = "simpy", "simpy lean"
 
-#: A run of the model; it returns when each frame was presented, in ns.
+#: Function that runs a model and returns the time of presentation of each frame, ns.
 Run = Callable[[], list[int]]
 
 
@@ -45,23 +45,23 @@ def measure(minutes: float = 15.0, rounds: int = 7, seeds: int = 10, events: str
 
     `minutes`: length of a run of the avatar's pipeline, at 60 frames a second, with policy `pipelined` and edges
     `double`.
-    `rounds`: number of runs of each way, interleaved.
+    `rounds`: number of runs of each variant, interleaved.
     `seeds`: number of seeds for which equal runs are compared.
     `events`: folder of a run, or events.jsonl, to replay.
 
-    The ways are the variants. `trilane` makes its report; its other two ways have `no report`, or are `recorded` for
-    replay. `simpy` is the model in SimPy's own parts, processes and resources. `simpy lean` has one timeout a job, and
-    callbacks. Both ways of SimPy keep no accounts and know no faults, policies or drops.
+    Variants: `trilane` makes its report; `trilane, no report` does not; `trilane, recorded` also keeps a recording.
+    `simpy` is the model with SimPy's own parts, processes and resources. `simpy lean` has callbacks and one timeout a
+    job. Both models in SimPy keep no accounts and know no faults, policies or drops.
 
-    Rows: `way`, `frames`, median CPU `seconds` and the 95 % interval of that median (`seconds_low`, `seconds_high`;
-    with fewer than six rounds the least and largest), `events_per_s` (an event is a frame's release or a job's end;
-    their number is the same in all ways), `processed` (events by the way's own count; SimPy takes several for a job).
-    `over_trilane`: seconds of each way, divided by those of `trilane` in the same round: median and interval. Below 1,
-    the way is faster than Trilane. `over_simpy`, `over_simpy_lean`: how many times as fast Trilane is as each way, from
-    the same rounds.
-    `agree`: number of frames that all ways present at the same nanosecond. `same_traces`: number of seeds for which 10
-    repeats of a run, in which a unit dies, give one trace. `different_traces`: number of different traces over the
-    seeds. `replay`: number of `steps` of the replayed `events`, and number of steps with a different answer.
+    Rows: `way` (the variant), `frames`, median CPU `seconds` and the 95 % interval of that median (`seconds_low`,
+    `seconds_high`; with fewer than six rounds the least and largest), `events_per_s` (an event is a frame's release or
+    a job's end; all variants have the same number), `processed` (events by the variant's own count; SimPy needs several
+    for a job). `over_trilane`: seconds of each variant divided by the seconds of `trilane` in the same round, as median
+    and interval; below 1, the variant is faster. `over_simpy`, `over_simpy_lean`: the medians for `simpy` and `simpy
+    lean`. `agree`: number of frames that all variants present at the same nanosecond. `same_traces`: number of seeds
+    for which 10 repeats of a run give the same trace; in that run a unit dies. `different_traces`: number of different
+    traces over the seeds. `replay`: number of `steps` of the replayed `events`, and number of steps with a different
+    answer.
 
     Raises BadInputError when `events` is not a recording, TrilaneError when SimPy disagrees.
     """
@@ -71,17 +71,17 @@ def measure(minutes: float = 15.0, rounds: int = 7, seeds: int = 10, events: str
     replayed = _replayed(events) if events else {}
     frames = max(2, round(minutes * 60 * FPS))
     graph, service = application_graph(), _service(0, frames)
-    ways = _trilane_ways(graph, service, frames)
-    simpy_ways, absent = _simpy_ways(graph, service, frames)
-    seconds = _cpu_seconds({**ways, **simpy_ways}, rounds)
+    variants = _trilane_variants(graph, service, frames)
+    simpy_variants, absent = _simpy_variants(graph, service, frames)
+    seconds = _cpu_seconds({**variants, **simpy_variants}, rounds)
     events_each = frames * (len(graph.stages) + 1)
-    processed = {**dict.fromkeys(ways, events_each), **_processed(graph, service, frames, [*simpy_ways])}
-    rows = [_row(way, frames, events_each, runs, processed[way]) for way, runs in seconds.items()]
+    processed = {**dict.fromkeys(variants, events_each), **_processed(graph, service, frames, [*simpy_variants])}
+    rows = [_row(variant, frames, events_each, runs, processed[variant]) for variant, runs in seconds.items()]
     config = {"minutes": minutes, "fps": FPS, "rounds": rounds, "seeds": seeds, "repeats": REPEATS}
     return {
         "rows": rows,
         **compared(seconds),
-        "agree": frames if simpy_ways else None,
+        "agree": frames if simpy_variants else None,
         **_determinism(seeds),
         "config": config,
         **absent,
@@ -92,16 +92,16 @@ def measure(minutes: float = 15.0, rounds: int = 7, seeds: int = 10, events: str
 def compared(seconds: dict[str, list[float]]) -> dict[str, Any]:
     """Return the ratios `over_trilane`, `over_simpy` and `over_simpy_lean` of `measure`.
 
-    `seconds`: CPU seconds of each round, by way. Each ratio compares two ways in the same round.
+    `seconds`: CPU seconds of each round, by variant.
     """
     ours = seconds[TRILANE]
     ratios = {
-        way: [other / own for other, own in zip(runs, ours, strict=True)]
-        for way, runs in seconds.items()
-        if way != TRILANE
+        variant: [other / own for other, own in zip(runs, ours, strict=True)]
+        for variant, runs in seconds.items()
+        if variant != TRILANE
     }
     return {
-        "over_trilane": {way: _with_interval(values) for way, values in ratios.items()},
+        "over_trilane": {variant: _with_interval(values) for variant, values in ratios.items()},
         "over_simpy": median(ratios[SIMPY]) if SIMPY in ratios else None,
         "over_simpy_lean": median(ratios[LEAN]) if LEAN in ratios else None,
     }
@@ -112,28 +112,28 @@ def _with_interval(values: list[float]) -> dict[str, float]:
     return {"median": median(values), "low": low, "high": high}
 
 
-def _cpu_seconds(ways: dict[str, Run], rounds: int) -> dict[str, list[float]]:
-    """Return the CPU time of every round of each way.
+def _cpu_seconds(variants: dict[str, Run], rounds: int) -> dict[str, list[float]]:
+    """Return the CPU seconds of each round, by variant.
 
-    Raises TrilaneError when they present frames at different times.
+    Raises TrilaneError if variants present frames at different times.
     """
-    seconds: dict[str, list[float]] = {way: [] for way in ways}
+    seconds: dict[str, list[float]] = {variant: [] for variant in variants}
     for number in range(rounds):
-        names = list(ways)
-        # Each round begins with another way, so that none is always the first.
+        names = list(variants)
+        # Each round begins with another variant, so that none is always the first.
         first = number % len(names)
         ends: dict[str, list[int]] = {}
-        for way in names[first:] + names[:first]:
-            taken, ends[way] = _timed(ways[way])
-            seconds[way].append(taken)
-        different = [way for way in ends if ends[way] != ends[TRILANE]]
+        for variant in names[first:] + names[:first]:
+            taken, ends[variant] = _timed(variants[variant])
+            seconds[variant].append(taken)
+        different = [variant for variant in ends if ends[variant] != ends[TRILANE]]
         if different:
             raise TrilaneError(f"{', '.join(different)} and trilane present frames at different times")
     return seconds
 
 
 def _timed(run: Run) -> tuple[float, list[int]]:
-    """Return the CPU seconds of a run without garbage collection, and its answer."""
+    """Return the CPU seconds of a run without garbage collection, and the result of `run`."""
     collects = gc.isenabled()
     gc.collect()
     gc.disable()
@@ -155,13 +155,13 @@ def _determinism(seeds: int) -> dict[str, int]:
 
 
 def _service(seed: int, frames: int) -> Service:
-    """Return service times from a table made beforehand, so that all runs pay only for a look-up."""
+    """Return service times of `frames` frames, from a table made beforehand, so that runs only pay for a look-up."""
     rng = np.random.default_rng(seed)
     table = {name: (ms * MS * rng.uniform(0.5, 1.5, frames)).astype(int).tolist() for name, ms in SERVICE_MS.items()}
     return lambda stage, _unit, frame, _begin_ns: table[stage][frame]
 
 
-def _trilane_ways(graph: Graph, service: Service, frames: int) -> dict[str, Run]:
+def _trilane_variants(graph: Graph, service: Service, frames: int) -> dict[str, Run]:
     def run(*, report: bool = True, keep: bool = False) -> list[int]:
         driver = VirtualDriver(graph, Settings(frames, "pipelined", period_ns=PERIOD_NS), service, keep=keep)
         driver.run()
@@ -172,13 +172,13 @@ def _trilane_ways(graph: Graph, service: Service, frames: int) -> dict[str, Run]
     return {TRILANE: run, NO_REPORT: lambda: run(report=False), RECORDED: lambda: run(keep=True)}
 
 
-def _simpy_ways(graph: Graph, service: Service, frames: int) -> tuple[dict[str, Run], dict[str, dict[str, str]]]:
-    """Return SimPy's runs, or why they are absent."""
+def _simpy_variants(graph: Graph, service: Service, frames: int) -> tuple[dict[str, Run], dict[str, dict[str, str]]]:
+    """Return the runs in SimPy by variant; without SimPy, no runs, and `absent` with the reason."""
     try:
         models = _models()
     except ModuleNotFoundError:
         return {}, {"absent": {SIMPY: f"not installed: {install_line('peers')}"}}
-    return {way: partial(_run_model, model, graph, service, frames) for way, model in models.items()}, {}
+    return {variant: partial(_run_model, model, graph, service, frames) for variant, model in models.items()}, {}
 
 
 def _run_model(model: Any, graph: Graph, service: Service, frames: int) -> list[int]:
@@ -187,15 +187,15 @@ def _run_model(model: Any, graph: Graph, service: Service, frames: int) -> list[
 
 
 def _models() -> dict[str, Any]:
-    """Return the model of each way. Raises ModuleNotFoundError without SimPy."""
+    """Return the models in SimPy by variant. Raises ModuleNotFoundError without SimPy."""
     import simpy
 
     return {SIMPY: partial(SimpyPipeline, simpy), LEAN: partial(LeanPipeline, simpy)}
 
 
-def _processed(graph: Graph, service: Service, frames: int, ways: list[str]) -> dict[str, int]:
-    """Return how many events SimPy processes in each of `ways`."""
-    return {way: _count_events(_models()[way](graph, service, frames, PERIOD_NS).env) for way in ways}
+def _processed(graph: Graph, service: Service, frames: int, variants: list[str]) -> dict[str, int]:
+    """Return how many events SimPy processes in each of `variants`."""
+    return {variant: _count_events(_models()[variant](graph, service, frames, PERIOD_NS).env) for variant in variants}
 
 
 def _count_events(env: Any) -> int:
@@ -206,15 +206,15 @@ def _count_events(env: Any) -> int:
     return count
 
 
-def _row(way: str, frames: int, events: int, seconds: list[float], processed: int) -> dict[str, Any]:
+def _row(variant: str, frames: int, events: int, seconds: list[float], processed: int) -> dict[str, Any]:
     low, high = median_interval(seconds)
     times = {"seconds": median(seconds), "seconds_low": low, "seconds_high": high}
     rates = {"events_per_s": events / times["seconds"], "processed": processed}
-    return {"way": way, "frames": frames, "events": events, **times, **rates}
+    return {"way": variant, "frames": frames, "events": events, **times, **rates}
 
 
 def _traces(seed: int) -> list[str]:
-    """Return digests of every step of equal runs under the `deadline` policy, in which the DSP dies once."""
+    """Return a digest of all steps for each of `REPEATS` equal runs under the `deadline` policy. The DSP dies once."""
     settings = Settings(SEED_FRAMES, "deadline", period_ns=PERIOD_NS, deadline_ns=3 * PERIOD_NS)
     digests = []
     for _ in range(REPEATS):
@@ -236,14 +236,14 @@ def _replayed(events: str) -> dict[str, Any]:
 
 # The avatar's pipeline in SimPy, for comparison: the same chain, slots, held jobs and order as the `pipelined` policy.
 #
-# Rule: the models contain only what decides when a frame is presented: no ledger, no faults, no other policies.
+# Rule: the models only compute when each frame is presented: no ledger, no faults, no other policies.
 # `SimpyPipeline` is written as SimPy's users write; `LeanPipeline` is as lean as SimPy allows.
 
 
 class SimpyPipeline:
-    """A model whose frames are released every `period_ns`.
+    """The pipeline as SimPy's processes and resources. Every `period_ns`, a frame is released.
 
-    After `run`, `presented_ns` are the ends of the last stage in order.
+    `presented_ns`: ends of the last stage, in order, after `run`.
     """
 
     def __init__(self, simpy: Any, graph: Graph, service: Service, frames: int, period_ns: int) -> None:
@@ -283,11 +283,12 @@ class SimpyPipeline:
 
 
 class LeanPipeline:
-    """The same model with one timeout for each job and callbacks instead of processes; nothing is checked.
+    """The same model with one timeout for each job, and callbacks instead of processes; nothing is checked.
 
-    SimPy keeps the clock and the order of events; slots, held jobs and queues are plain numbers. The instants are the
-    same to the nanosecond unless events tie, as with service times in whole milliseconds. It only suits chains whose
-    frames stay in order: edges drop nothing, and a unit takes its oldest frame, which is at the last of its stages.
+    SimPy only keeps the clock and the order of events; slots, held jobs and queues are plain numbers and lists. Times
+    equal those of `SimpyPipeline` to the nanosecond, unless two events have the same time. The model only suits chains
+    whose frames stay in order: edges drop nothing. A unit takes its oldest frame, which waits at the last stage of the
+    unit with a waiting frame.
     """
 
     def __init__(self, simpy: Any, graph: Graph, service: Service, frames: int, period_ns: int) -> None:
@@ -323,7 +324,7 @@ class LeanPipeline:
         self._fill(self._chain[0][1])
 
     def _fill(self, unit: str) -> None:
-        """Hand jobs to the unit until it holds enough or nothing can run."""
+        """Hand jobs to `unit` until it holds `HELD_JOBS` jobs or none can run."""
         while self._held[unit] < HELD_JOBS:
             for position in self._positions[unit]:
                 if self._waiting[position] and (position == self._last or self._free[position]):

@@ -1,6 +1,6 @@
-"""How much does an avatar change when others share its tensor, by the width of the background between them?
+"""How much does an avatar's picture change if other avatars share its tensor, by the margin between them?
 
-Rule: the same avatars are drawn in the same cells, together and each on its own; only the neighbours differ.
+Rule: each avatar is drawn in the same cell, with its neighbours and without them. Nothing else differs.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ BOUND_DB = 0.5
 OUTPUT = (480, 640)
 MOST_AVATARS = 8
 MOST_MARGIN = 128
-#: Metres between neighbours, and metres that every second one stands back.
+#: Distance between neighbours, and how far every second avatar stands back, metres.
 STEP_M, BACK_M = 0.8, 0.7
 SECONDS = 10.0
 
@@ -44,7 +44,7 @@ class _View:
 
     `joints`: skinning matrices (55,3,4) of each avatar.
     `view`, `projection`: matrices (4,4) of the camera.
-    `layout`: layout of the tensor.
+    `layout`: shape of the tensor, with the crop rectangle and the cell of each avatar.
     """
 
     joints: tuple[NDArray[np.float32], ...]
@@ -58,10 +58,10 @@ def measure(
 ) -> dict[str, Any]:
     """The default avatar, `avatars` times in one tensor, in `views` moments of a scene, compared with ground truth.
 
-    Keys: `rows`, one per margin in tensor pixels: `loss_db_median`, `loss_db_worst` (PSNR of an avatar on its own in
-    its cell minus PSNR with its neighbours), `psnr_db_alone` (on its own, median), `bytes_mean`, `bytes_max`
-    (difference of the two pictures inside the cell), `cell_height` (median, tensor pixels); `sources`; `bound_db`;
-    `margin_px` (of the pipeline); `config`.
+    Keys: `rows`, one per margin in tensor pixels: `loss_db_median`, `loss_db_worst` (PSNR without neighbours minus PSNR
+    with them), `psnr_db_alone` (median without neighbours), `bytes_mean`, `bytes_max` (difference of the two pictures
+    inside the cell), `cell_height` (median, tensor pixels); `sources`; `bound_db`; `margin_px`, the margin of a run;
+    `config`.
 
     Raises BadInputError, MissingPartError.
     """
@@ -103,7 +103,7 @@ class _CrowdFixture:
         self._bound: dict[Shape, tuple[U8, U8, Binding]] = {}
 
     def compare(self, view: _View) -> list[tuple[float, float, float, float, float]]:
-        """Return for each avatar: PSNR together, PSNR alone, mean and greatest byte difference, its cell's height."""
+        """Return, for each avatar: PSNR with and without neighbours, mean and largest byte difference, cell height."""
         everyone = self._picture(view, range(len(view.joints)))
         rows = []
         for k, (crop, (top, left, height, width)) in enumerate(view.layout.crops):
@@ -119,7 +119,7 @@ class _CrowdFixture:
         return rows
 
     def _picture(self, view: _View, shown: Sequence[int]) -> U8:
-        """Return the network's picture (h,w,4) with only the avatars `shown`."""
+        """Return the network's picture (h,w,4) uint8 of a tensor with only the avatars `shown`, given by number."""
         shape = view.layout.shape
         tensor, image, binding = self._binding(shape)
         target = self.packed.begin(shape)
@@ -142,7 +142,7 @@ class _CrowdFixture:
 
 
 def _views(fixture: _CrowdFixture, avatars: int, views: int, size: str, margin: int) -> Iterator[_View]:
-    """Yield moments in which every avatar is seen, spread over the default motion."""
+    """Yield moments, spread over the default motion. Moments in which an avatar is out of view are left out."""
     specs = tuple(
         AvatarSpec(position=((k - (avatars - 1) / 2) * STEP_M, 0.0, -BACK_M * (k % 2))) for k in range(avatars)
     )

@@ -1,6 +1,6 @@
-"""Runs, predictions and sweeps beside each other: what differs, why, and what each speed costs in image error.
+"""Comparison of runs, predictions and sweeps: what differs, why, and the image error that each speed costs.
 
-It may use apps/ and every lower folder, but not apps/cli/.
+This folder may import from apps/ and every lower folder, but not from apps/cli/.
 """
 
 from __future__ import annotations

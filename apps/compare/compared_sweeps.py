@@ -1,7 +1,7 @@
-"""Two sweeps beside each other: trials of one configuration in pairs, and what holds for all pairs together.
+"""Comparison of two sweeps: trials of one configuration in pairs, and the change over all pairs.
 
-Rule: a configuration is paired with itself and nothing else. A trial that did not end well, or that the other sweep
-lacks, is counted and named. A trial is compared by its run folder if there is one, else by the result in its line.
+Rule: a pair has the same configuration on both sides. A trial that is not done, or that the other sweep lacks, is
+counted and named. A trial is compared by its run folder or, without one, by the result in its line.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ METHOD: Final = (
     f"of the trials that are said to differ does so by chance has a probability of at most {100 * ALPHA:.0f} % (Holm); "
     "over all: the geometric mean of the ratios"
 )
-#: A pair: the name of its first trial in the base, both sides, and its options.
+#: A pair: name of its first trial in the base, base, other side, options.
 _Found = tuple[str, Side, Side, Mapping[str, Any]]
 
 
@@ -44,9 +44,9 @@ _Found = tuple[str, Side, Side, Mapping[str, Any]]
 class TrialPair:
     """One configuration in both sweeps.
 
-    `name`: name of its first trial in the base. `runs`: number of runs a side. `frame_time`: mean frame time of both.
-    `differs`: whether the test of all pairs together calls it different. `sides`: figures of both sides, for the gates.
-    `bounds`: bounds of its runs.
+    `name`: name of its first trial in the base. `runs`: number of runs on each side. `frame_time`: difference of the
+    mean frame times. `differs`: whether the frame times differ, by a test of all pairs together. `sides`: figures of
+    both sides, for the gates. `bounds`: bounds of its runs.
     """
 
     name: str
@@ -59,7 +59,7 @@ class TrialPair:
 
     @property
     def outcome(self) -> Finding:
-        """What holds for the frame time."""
+        """The finding about the frame time."""
         return self.frame_time.outcome(differs=self.differs)
 
 
@@ -67,8 +67,8 @@ class TrialPair:
 class SweepComparison:
     """The comparison of the sweep `other` with the sweep `base`.
 
-    `over_all`: mean frame time of all pairs. `left_out`: configurations without a partner, by reason. `changes`:
-    changes that every pair has. `notes`: what makes the comparison less sure.
+    `over_all`: difference of the mean frame times over all pairs. `left_out`: names of configurations without a
+    partner, by reason. `changes`: changes that every pair has. `notes`: facts that make the comparison less sure.
     """
 
     base: str
@@ -81,7 +81,7 @@ class SweepComparison:
 
     @property
     def verdict(self) -> str:
-        """What differs, as a sentence."""
+        """The verdict on the frame times, as a sentence."""
         differing = [pair for pair in self.pairs if pair.differs]
         of = f"{len(self.pairs)} trial{'s' * (len(self.pairs) > 1)}"
         whole = f"over all {change_of(self.over_all, MS)} ({interval_of(self.over_all, MS)})"
@@ -96,7 +96,7 @@ class SweepComparison:
 
     @property
     def bound(self) -> str:
-        """How many runs of each sweep each unit bounded, as a sentence; empty where no run names a bound."""
+        """The number of runs that each unit bounded, by sweep, as a sentence; empty if no run names a bound."""
         base = [bound for pair in self.pairs for bound in pair.bounds.base]
         other = [bound for pair in self.pairs for bound in pair.bounds.other]
         if not any((*base, *other)):
@@ -136,7 +136,7 @@ def is_sweep(name: str) -> bool:
 
 
 def compare_sweeps(base: str, other: str) -> SweepComparison:
-    """Compare the folders of two sweeps. Raises BadInputError where there is no pair, or no runs in them."""
+    """Compare the sweeps in two folders. Raises BadInputError if they have no common trial, or do no runs."""
     first, second = (_configurations(Path(name)) for name in (base, other))
     found: list[_Found] = []
     left: dict[str, list[str]] = {"not_done": [], "base_alone": [], "other_alone": []}
@@ -191,7 +191,7 @@ def _compared(
 
 
 def _pair(name: str, base: Side, other: Side) -> GatedPair:
-    """Return the figures of a trial. Raises BadInputError for one without frame times."""
+    """Return two sides with their figures. Raises BadInputError if these have no frame time."""
     rows = rows_of(base, other)
     if MEAN not in rows:
         raise BadInputError(base.name, "trials without a frame time", "a sweep of `run` or `predict`")
@@ -199,7 +199,7 @@ def _pair(name: str, base: Side, other: Side) -> GatedPair:
 
 
 def _configurations(folder: Path) -> dict[str, dict[int, Mapping[str, Any]]]:
-    """Return the trials by configuration and repeat, in the order in which they ended."""
+    """Return the trials' records by configuration, then by number of the repeat, in the order in which they ended."""
     found: dict[str, dict[int, Mapping[str, Any]]] = {}
     for record in read_trials(folder).values():
         words, options = record.get("command"), record.get("options")
@@ -215,7 +215,7 @@ def _is_done(record: Mapping[str, Any] | None) -> bool:
 
 
 def _trial(sweep: str, record: Mapping[str, Any]) -> ComparedRun:
-    """Read a trial, with every frame if its run folder is there. Raises BadInputError for one that is no run."""
+    """Read a trial, with every frame if its run folder exists. Raises BadInputError if the trial is no run."""
     name, folder = str(record["id"]), record.get("folder")
     place = Path(sweep, str(folder)) if isinstance(folder, str) and Path(folder).name == folder else None
     if place is not None and (place / "report.json").is_file():
@@ -236,7 +236,7 @@ def _told(row: Difference) -> dict[str, Any]:
 
 
 def _notes(documents: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield remarks on the machine while the trials ran."""
+    """Yield remarks on other programs beside the trials, and on too few frames. `documents`: reports of all runs."""
     shares = [share for document in documents if (share := document.get("other_programs") or 0.0) > BUSY_MACHINE]
     if shares:
         runs = f"{len(shares)} of {len(documents)} runs"

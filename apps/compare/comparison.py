@@ -1,7 +1,7 @@
-"""A base and the sides compared with it, as data and in words. Rule: table, JSON and page show this and nothing else.
+"""A comparison of sides with a base, as data and in words. Rule: table, JSON and page show only its content.
 
-The verdict is a sentence. It names the frame time, then what explains it, the most telling first: stages that take
-longer or shorter, units that wait more or less, and settings with a known effect. It names what no rule explains too.
+The verdict is a sentence. It names the change of the frame time, then what explains the change, the most telling first:
+stages that take longer or shorter, units that wait more or less, and settings with a known effect.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ SEVERAL: Final = (
 )
 NO_DIFFERENCE: Final = str(Finding.SAME)
 TOO_FEW: Final = f"{Finding.UNKNOWN}: too short"
-#: The least change of a share of idle time for its cause to be named.
+#: The least change of a share of idle time that the verdict names.
 TELLING_SHARE: Final = 0.05
 MOST_NAMED: Final = 4
 NOT_EXPLAINED: Final = "no stage, unit or setting alone explains it; the cores may have another speed"
 WITHOUT_FRACTION: Final = 999.5
-#: A setting and its value -> what is said of it.
+#: A setting and its new value -> how the verdict explains a difference by it.
 REASONS: Final = {
     ("policy", "sequential"): "one frame at a time under sequential",
     ("policy", "pipelined"): "several frames at a time under pipelined",
@@ -73,10 +73,10 @@ IN_THOUSANDS: Final = 10_000
 
 
 class Bounds(NamedTuple):
-    """The `bound` of each run of either side, as in report.json; None where it is unknown.
+    """The `bound` of each run on both sides, as in report.json; None if it is unknown.
 
-    `outcome` says whether the bounding unit changed. A run whose bound has rivals is no sure evidence of that. A report
-    without rivals is sure evidence where the unit has more than half of the path.
+    `outcome`: whether the bounding unit changed. It is certain only if no bound has rivals. A report without the key
+    `rivals` is certain if the unit has more than half of the path.
     """
 
     base: tuple[Mapping[str, Any] | None, ...]
@@ -95,12 +95,12 @@ class Bounds(NamedTuple):
         return Finding.DIFFERS if len(base) == len(other) == 1 and is_sure else Finding.UNKNOWN
 
     def as_json(self) -> dict[str, Any]:
-        """Return `bound` of an entry of `comparisons`, or of `trials` of two sweeps."""
+        """Return the value of `bound` in an entry of `comparisons` or, for two sweeps, of `trials`."""
         return {**self._asdict(), "outcome": str(self.outcome)}
 
 
 def bounds_of(base: Side, other: Side) -> Bounds:
-    """Return what bounded the runs of both sides, by their reports."""
+    """Return the bounds in the reports of both sides."""
     return Bounds(*(tuple(told.document.get("bound") for told in side.runs) for side in (base, other)))
 
 
@@ -127,11 +127,11 @@ class Comparison:
 
     @property
     def unsure(self) -> tuple[str, ...]:
-        """Why a run is not to be trusted, a sentence for each such run."""
+        """A sentence for each run that cannot be trusted."""
         return tuple(spoilt((*self.base.runs, *self.other.runs)))
 
     def as_json(self) -> dict[str, Any]:
-        """Return one entry of `comparisons`."""
+        """Return the comparison as an entry of `comparisons` in the document of `trilane compare --json`."""
         return {
             "run": self.other.name,
             "verdict": self.verdict,
@@ -145,7 +145,7 @@ class Comparison:
 
     @property
     def whole(self) -> Finding:
-        """What holds for the comparison as a whole, as the verdict says it."""
+        """The finding about the comparison as a whole, as in the verdict."""
         if self.differing:
             return Finding.DIFFERS
         return Finding.SAME if self.verdict == NO_DIFFERENCE else Finding.UNKNOWN
@@ -162,9 +162,9 @@ def compare(base: Side, others: Sequence[Side]) -> list[Comparison]:
 
 
 def document(comparisons: Sequence[Comparison]) -> dict[str, Any]:
-    """Return what `trilane compare --json` prints.
+    """Return the document of `trilane compare --json`.
 
-    With several other sides, `verdict` names each of them, and each of `changes` names its side.
+    If several sides are compared, `verdict` names each side. Each of `changes` names its side as `run`.
     """
     several = len(comparisons) > 1
     return {
@@ -192,7 +192,7 @@ def _compared(base: Side, other: Side) -> Comparison:
 
 
 def _differing(rows: Rows, figures: Sequence[Figure]) -> tuple[Figure, ...]:
-    """Return the `figures` that differ. All are tested together; a figure without scatter does not weaken the test."""
+    """Return the `figures` that differ. All are tested together, except figures without scatter, which need no test."""
     tested = {figure: rows[figure].probability or 0.0 for figure in figures if rows[figure].probability is not None}
     uncertain = [figure for figure in tested if rows[figure].deviation]
     fallen = dict(zip(uncertain, rejected([tested[figure] for figure in uncertain]), strict=True))
@@ -200,7 +200,7 @@ def _differing(rows: Rows, figures: Sequence[Figure]) -> tuple[Figure, ...]:
 
 
 def _stages(report: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Return the names of each unit's stages."""
+    """Return the names of the stages, by unit. `report`: report as JSON."""
     found: dict[str, list[str]] = {}
     for name, row in report["stages"].items():
         found.setdefault(row["unit"], []).append(name)
@@ -216,14 +216,14 @@ def _notes(base: Side, other: Side) -> list[str]:
 
 
 def spoilt(runs: Sequence[ComparedRun]) -> Iterator[str]:
-    """Yield why a run is not to be trusted. A prediction or an imported time is taken as it is."""
+    """Yield a sentence for each run that cannot be trusted. Predictions and imported times are not judged."""
     for told in runs:
         if told.kind in (RunKind.RUN, RunKind.REPORT) and not (trust := trust_of(told.document)).trusted:
             yield f"{told.name} is {trust.said}"
 
 
 def _about(told: ComparedRun) -> Iterator[str]:
-    """Yield remarks on the data of a run."""
+    """Yield remarks on what is known of a run: kind of data, number of frames, end of the journal."""
     if told.kind is RunKind.REPORT:
         yield "a report without a journal, so only summaries are compared, each as uncertain as the mean frame time"
     if told.kind is RunKind.TIMES:
@@ -266,7 +266,7 @@ def verdict(
     changes: Sequence[Change],
     stages: Mapping[str, Sequence[str]],
 ) -> str:
-    """Return `no difference`, or a sentence, which begins with `cannot tell` where nothing is sure.
+    """Return the verdict: `no difference`, or a sentence, which begins with `cannot tell` if nothing is certain.
 
     `named`: figures of `rows` that the verdict rests on. `differing`: figures that differ, tested together. `changes`:
     changes of configuration and machine. `stages`: names of each unit's stages.
@@ -289,9 +289,9 @@ def verdict(
 def _not_told(
     rows: Rows, named: Sequence[Figure], changes: Sequence[Change], stages: Mapping[str, Sequence[str]]
 ) -> str:
-    """Return the verdict where no figure surely differs: there is no difference that matters, or it cannot be told.
+    """Return the verdict if no figure surely differs: `no difference` or `cannot tell`.
 
-    Counted instructions alone stand for the program if every stage has them and no setting changed.
+    It rests on counted instructions alone if every stage has them and no setting changed, otherwise on times.
     """
     counted = [figure for figure in named if figure.measure == INSTRUCTIONS]
     is_counted = len(counted) == sum(map(len, stages.values())) and not changes
@@ -313,7 +313,7 @@ def _not_told(
 
 
 def _programs(found: Rows) -> Iterator[str]:
-    """Yield stages that execute more or fewer instructions, and those whose instructions take longer or shorter."""
+    """Yield stages that execute more or fewer instructions, then stages whose instructions take longer or shorter."""
     for figure, row in found.items():
         if figure.measure == INSTRUCTIONS:
             sign = 1 if row.change > 0 else -1
@@ -325,7 +325,10 @@ def _programs(found: Rows) -> Iterator[str]:
 
 
 def _heads(found: Rows) -> Iterator[str]:
-    """Yield the frame time, its first percentile that differs if the mean does not, or else the latency."""
+    """Yield the change of the mean frame time or, if only a percentile differs, of the first such percentile.
+
+    If the frame time does not differ, yield the same of the latency.
+    """
     for measure in (FRAME_TIME, LATENCY):
         mine = {figure: row for figure, row in found.items() if figure.measure == measure}
         of_mean = [figure for figure in mine if figure.statistic == "mean"] or [*mine][:1]
@@ -337,7 +340,10 @@ def _heads(found: Rows) -> Iterator[str]:
 
 
 def _works(found: Rows, rows: Rows, changes: Sequence[Change]) -> Iterator[str]:
-    """Yield stages without counted instructions, those whose work changed by the most milliseconds first."""
+    """Yield stages that take longer or shorter, the largest change in ms first.
+
+    Stages with counted instructions are left out: `_programs` names them.
+    """
     by_stage: dict[str, tuple[Figure, Difference]] = {}
     counted = {figure.of for figure in found if figure.measure in (INSTRUCTIONS, INSTRUCTION_TIME)}
     measure = WORK if any(figure.measure == WORK for figure in rows) else SERVICE
@@ -355,9 +361,9 @@ def _works(found: Rows, rows: Rows, changes: Sequence[Change]) -> Iterator[str]:
 
 
 def _waits(found: Rows, rows: Rows, stages: Mapping[str, Sequence[str]]) -> Iterator[str]:
-    """Yield units that wait more where frames take longer, or less where shorter.
+    """Yield units that wait more if frames take longer, or wait less if frames take less time.
 
-    Longer waits come first, and among them the units that were the busiest.
+    Longer waits come first, then units that were busier.
     """
     frame_time = next((row.change for figure, row in found.items() if figure.measure == FRAME_TIME), 0.0)
     telling = [
@@ -400,7 +406,7 @@ def signed(row: Difference, unit: str) -> str:
 
 
 def _between(row: Difference, sign: int) -> str:
-    """Return the interval; nothing where both ends have the same written digits."""
+    """Return the interval in words; "" if it is unknown, or if both ends are written with the same digits."""
     if row.low is None or row.high is None:
         return ""
     scale = 100 if row.is_ratio else 1
@@ -409,14 +415,14 @@ def _between(row: Difference, sign: int) -> str:
 
 
 def _amount(value: float, row: Difference, unit: str, sign: str = "") -> str:
-    """Return a change in its unit; a change of a share is in points of percent."""
+    """Return a change with its unit: a ratio in percent, a share in percentage points."""
     if row.is_ratio or unit == SHARE:
         return f"{_number(100 * value, sign)} {'%' if row.is_ratio else 'points'}"
     return f"{_number(value, sign)} {unit}".rstrip()
 
 
 def _number(value: float, sign: str = "") -> str:
-    """Return three digits, without powers of ten."""
+    """Return a number with three digits, and without an exponent for large numbers."""
     return f"{value:{sign}.3g}" if abs(value) < WITHOUT_FRACTION else f"{value:{sign}.0f}"
 
 
@@ -428,7 +434,7 @@ def name_of(figure: Figure) -> str:
 
 
 def value_of(value: float, unit: str) -> str:
-    """Return a value in its unit; a share is in percent."""
+    """Return a value with its unit; a share is in percent."""
     if unit == BYTES:
         return f"{value:,.0f} {unit}"
     if unit == "" and abs(value) >= IN_THOUSANDS:
@@ -437,7 +443,7 @@ def value_of(value: float, unit: str) -> str:
 
 
 def change_of(row: Difference, unit: str) -> str:
-    """Return the change: a ratio in percent, a share in points, anything else in its unit."""
+    """Return the change with its unit: a ratio in percent, a share in percentage points, other changes in `unit`."""
     return _scaled(row.change, row, unit)
 
 
@@ -456,7 +462,7 @@ def _scaled(value: float, row: Difference, unit: str, *, with_unit: bool = True)
 
 
 def bounds_text(bounds: Bounds) -> str:
-    """Return what bounded the other side and the base; empty where neither is known, as in predictions."""
+    """Return the bounds of the other side and the base in words; "" if none is known, as in predictions."""
     if not any((*bounds.base, *bounds.other)):
         return ""
     changed = " changed" if bounds.outcome is Finding.DIFFERS else ""
@@ -465,7 +471,7 @@ def bounds_text(bounds: Bounds) -> str:
 
 
 def bound_of_runs(bounds: Sequence[Mapping[str, Any] | None]) -> str:
-    """Return the bound of one run in words; of several runs, how many each unit bounded."""
+    """Return the bound of one run in words or, for several runs, the number of runs that each unit bounded."""
     if len(bounds) == 1:
         return bound_text(bounds[0]) if bounds[0] else "not known"
     names = Counter(bound["unit"]["name"] if bound else "not known" for bound in bounds)
@@ -473,5 +479,5 @@ def bound_of_runs(bounds: Sequence[Mapping[str, Any] | None]) -> str:
 
 
 def setting(value: Any) -> str:
-    """Return the value of a setting; a dash where the key is missing."""
+    """Return the value of a setting as text; a dash if the key is missing."""
     return DASH if value is None else str(value)

@@ -1,11 +1,11 @@
-"""How much a statistic differs between runs, and how sure that is. Rule: lack of knowledge widens the interval.
+"""The difference of a statistic between runs, with its uncertainty. Rule: lack of knowledge widens the interval.
 
 Two things make runs of one kind differ by chance. Frames scatter and drift within a run; a jackknife over stretches of
 frames measures that (Künsch, Annals of Statistics 17 (1989)). The state of the machine also differs from run to run:
 several runs on each side show it, and the deviations in `rows.py` count as further runs. A conjugate normal prior joins
 both, so Student's t applies (Gelman et al., Bayesian Data Analysis, section 3.2; Smyth, Statistical Applications in
-Genetics and Molecular Biology 3 (2004)). A change with a known cause is not chance, so a change of up to that size
-counts as nothing.
+Genetics and Molecular Biology 3 (2004)). If a known cause explains a change of some size, a change up to that size does
+not count as a difference.
 """
 
 from __future__ import annotations
@@ -29,16 +29,18 @@ STRETCHES: Final = 16
 #: Runs show the same frames if at least this share of each run's frames is in the other runs too.
 ALIKE: Final = 0.8
 NEGLIGIBLE: Final = 1e-9
-#: The least change that matters: as a share of the base, or, for shares of the time, as a share of the time.
+#: The least change that matters: a share of the base or, for shares of the time, a difference of shares.
 MATTERS: Final = 0.05
+#: Function of values and weights that returns a statistic.
 Reduce = Callable[[F64, F64], float]
+#: Largest probability of any false rejection among figures that are tested together.
 ALPHA = 0.01
 
 
 class Finding(StrEnum):
     """The finding about a figure.
 
-    SAME: its change is certainly below `MATTERS`. UNKNOWN: its change may be more, or zero.
+    DIFFERS: it has changed. SAME: its change is certainly below `MATTERS`. UNKNOWN: neither is certain.
     """
 
     DIFFERS = "differs"
@@ -50,8 +52,8 @@ class Finding(StrEnum):
 class Series:
     """One figure of every frame of a run, in order.
 
-    `frames`: numbers of the frames, (n,). `values`: the figure of each, (n,) float64. `weights`: for a share its whole,
-    (n,), in the unit of `values`; else ones.
+    `frames` (n,): numbers of the frames. `values` (n,): figure of each frame; for a share, its numerator. `weights`
+    (n,): for a share, its denominator in the same unit; otherwise 1.
     """
 
     frames: I64
@@ -59,16 +61,16 @@ class Series:
     weights: F64
 
     def at(self, places: Ints | slice) -> Series:
-        """Return the frames at `places`."""
+        """Return the part of the series at `places`, indices of frames."""
         return Series(self.frames[places], self.values[places], self.weights[places])
 
 
 class Chance(NamedTuple):
-    """How much a figure differs between runs of one kind beyond what their frames show; nothing in virtual time.
+    """How much a figure differs between runs of one kind beyond the scatter of their frames; nothing in virtual time.
 
-    `relative`, `absolute`: standard deviations of one run's figure, as a share of it and in its unit. `freedom`: number
-    of runs that would give equal knowledge. `explained`: part of a change that has another cause. It is a logarithm of
-    the ratio, or in the figure's unit where the change is no ratio.
+    `relative`, `absolute`: two parts of the standard deviation of one run's figure: as a share of the figure, and in
+    its unit. `freedom`: number of runs that would give equal knowledge. `explained`: largest change that a known cause
+    explains, as a logarithm for a ratio, otherwise in the figure's unit.
     """
 
     relative: float = 0.0
@@ -78,15 +80,16 @@ class Chance(NamedTuple):
 
 
 class Difference(NamedTuple):
-    """How far a statistic has changed.
+    """How far a statistic has changed from the base to the other side.
 
-    `base`, `other`: value of each side, over all frames of its run; the arithmetic mean of several runs. `change`:
-    change from base to other, with its 95 % interval from `low` to `high`, as a share of the base where `is_ratio`,
-    else in the statistic's unit. The change only covers frames that all runs have. Of several runs on a side, their
-    geometric mean counts. Therefore the change need not be the ratio of the values. `probability`: chance of a change
-    as large as this between runs of one kind. `low`, `high` and `probability` are None where nobody can tell.
-    `deviation`: standard deviation of the change, or of its logarithm where `is_ratio`. `freedom`: degrees of freedom
-    of the deviation. `explained`: as in `Chance`.
+    `base`, `other`: value of each side, over all frames; for several runs, their arithmetic mean.
+    `change`: change with its 95 % interval from `low` to `high`: a share of the base if `is_ratio`, otherwise in the
+    statistic's unit. It only covers frames that all runs have. For a ratio, the geometric mean of several runs counts.
+    Therefore it may differ from the ratio of `other` and `base`.
+    `probability`: chance that runs of one kind differ by at least `change`.
+    `deviation`: standard deviation of the change, or of its logarithm if `is_ratio`. `freedom`: degrees of freedom of
+    the deviation. `explained`: as in `Chance`.
+    If the uncertainty is unknown, `low`, `high`, `probability` and `deviation` are None.
     """
 
     base: float
@@ -102,14 +105,14 @@ class Difference(NamedTuple):
 
     @property
     def effect(self) -> float:
-        """The change on the scale of the deviations: the logarithm of the ratio where `is_ratio`, else the change."""
+        """The change on the scale of `deviation`: the logarithm of the ratio if `is_ratio`, otherwise the change."""
         return log1p(self.change) if self.is_ratio else self.change
 
     def outcome(self, *, differs: bool, margin: float = MATTERS) -> Finding:
         """Return the finding about this difference.
 
-        `differs`: whether the test of all figures together calls it different. `margin`: the least change that matters,
-        in the unit of `change`.
+        `differs`: whether the figure differs, by a test of all figures together. `margin`: the least change that
+        matters, in the unit of `change`.
         """
         if differs:
             return Finding.DIFFERS
@@ -123,17 +126,17 @@ def _mean(values: F64, weights: F64) -> float:
 
 
 def _typical(values: F64, _: F64) -> float:
-    """Return the mean of the middle half."""
+    """Return the mean of the middle half of `values`."""
     count = len(values)
     return float(np.sort(values)[count // 4 : count - count // 4].mean())
 
 
 def _quantile(share: float) -> Reduce:
-    """Return a quantile that is linear between ranks, as in the report."""
+    """Return a function that computes a quantile, linear between ranks, as in the report."""
     return lambda values, _: float(np.quantile(values, share))
 
 
-#: Statistic -> how it is computed. `typical` is the mean of the middle half of the values.
+#: Statistic -> function that computes it.
 STATISTICS: Final[dict[str, Reduce]] = {
     "mean": _mean,
     "share": _mean,
@@ -147,10 +150,11 @@ STATISTICS: Final[dict[str, Reduce]] = {
 def difference(
     base: Sequence[Series], other: Sequence[Series], statistic: str, *, is_ratio: bool, chance: Chance
 ) -> Difference:
-    """Return the change of `statistic` from the runs `base` to the runs `other`, over each one's last `MOST_FRAMES`.
+    """Return the change of `statistic` from the runs `base` to the runs `other`, over each run's last `MOST_FRAMES`.
 
-    `is_ratio`: whether the change is a share of the base; a value of zero makes it a plain difference. Frames that all
-    runs have are compared frame with frame, so the different work in the scene's frames does not count as scatter.
+    If the runs have the same frames, each frame is compared with itself: the different work in the frames of a scene
+    does not count as scatter. `is_ratio`: whether the change is a share of the base. If a value is 0, the change is a
+    plain difference in any case. `chance`: chance of the figure between runs of one kind.
     """
     reduce = STATISTICS[statistic]
     sides = [[each.at(slice(-MOST_FRAMES, None)) for each in side] for side in (base, other)]
@@ -177,8 +181,8 @@ def settled(
 ) -> Difference:
     """Return the difference of two sides.
 
-    `values`: figures of each side's runs. `effects`: the same figures on the scale of the deviations. `within`:
-    variance of the change due to scatter within runs.
+    `values`: figure of each run, by side. `effects`: the same figures on the scale of `Difference.deviation`: for a
+    ratio, logarithms. `within`: variance of the change due to scatter within runs.
     """
     first, second = (float(side.mean()) for side in effects)
     scale = 1.0 if is_ratio else max(abs(first), abs(second))
@@ -191,12 +195,11 @@ def settled(
 
 
 def combined(pairs: Sequence[Difference]) -> Difference:
-    """Return one difference for several pairs; the pairs may scatter more than their own intervals say.
+    """Return one difference for all `pairs`, at least one.
 
-    `base` and `other` are the arithmetic means of the values. The change is the mean of the effects: for ratios the
-    geometric mean. Its deviation assumes independent pairs. If the pairs scatter more than that (Birge's ratio above
-    1), their scatter gives the deviation. If only some pairs are ratios, the change has no deviation.
-    `pairs`: at least one.
+    `base` and `other` are arithmetic means. The change is the mean of the effects: for ratios, the geometric mean. Its
+    deviation follows from the pairs' deviations, as if they were independent. If the pairs scatter more (Birge's ratio
+    above 1), their scatter gives the deviation. If only some pairs are ratios, the deviation is unknown.
     """
     base, other = (sum(getattr(pair, side) for pair in pairs) / len(pairs) for side in ("base", "other"))
     is_ratio = all(pair.is_ratio for pair in pairs)
@@ -215,15 +218,18 @@ def combined(pairs: Sequence[Difference]) -> Difference:
 
 
 def unsure(base: float, other: float, *, is_ratio: bool) -> Difference:
-    """Return a difference whose uncertainty is unknown."""
+    """Return the difference of `other` from `base` with unknown uncertainty.
+
+    `is_ratio`: whether the change is a share of the base; not if a value is 0 or less.
+    """
     is_ratio = is_ratio and min(base, other) > 0
     return _told((base, other), log(other / base) if is_ratio else other - base, None, is_ratio=is_ratio)
 
 
 def judged(base: float, other: float, deviation: float, *, is_ratio: bool) -> Difference:
-    """Return the difference of `other` from `base`, whose standard deviation is `deviation`.
+    """Return the difference of `other` from `base` with the standard deviation `deviation`.
 
-    With `is_ratio` both are above 0, and the difference and `deviation` are those of their logarithms.
+    If `is_ratio`, both values must be above 0, and `deviation` belongs to the logarithm of their ratio.
     """
     return _told((base, other), log(other / base) if is_ratio else other - base, deviation, is_ratio=is_ratio)
 
@@ -237,7 +243,7 @@ def _told(
     *,
     is_ratio: bool,
 ) -> Difference:
-    """Return the difference with this `effect` and deviation; None means that the deviation is unknown."""
+    """Return the difference of two `values` with this effect (`Difference.effect`) and deviation, None if unknown."""
     base, other = values
     if deviation is None:
         return Difference(base, other, _change(effect, is_ratio), None, None, None, is_ratio)
@@ -255,7 +261,8 @@ def _change(effect: float, is_ratio: bool) -> float:
 def _least_frames(statistic: str) -> int:
     """Return the number of frames that a statistic needs.
 
-    For a percentile, each stretch has on average one frame beyond it; otherwise the jackknife sees no scatter.
+    For a percentile, each stretch needs on average one frame beyond it: without such frames, the jackknife sees no
+    scatter.
     """
     share = int(statistic[1:]) / 100 if statistic in ("p50", "p90", "p99") else 0.5
     return max(LEAST_FRAMES, ceil(STRETCHES / (1 - share)))
@@ -270,7 +277,7 @@ def _value(series: Series, reduce: Reduce) -> float:
 
 
 def _common(runs: Sequence[Series]) -> I64 | None:
-    """Return the frames that all `runs` have; None where they are less than the share `ALIKE` of a run's frames."""
+    """Return the frames that all `runs` have; None if they are less than the share `ALIKE` of a run's frames."""
     common = runs[0].frames
     for each in runs[1:]:
         common = np.intersect1d(common, each.frames)
@@ -278,7 +285,10 @@ def _common(runs: Sequence[Series]) -> I64 | None:
 
 
 def _left_out(series: Series, reduce: Reduce, is_ratio: bool) -> F64:
-    """Return the statistic of all frames, then that without each stretch, (1 + `STRETCHES`,); ratios as logarithms."""
+    """Return the statistic of all frames, then of all frames but each stretch in turn, (1 + `STRETCHES`,).
+
+    If `is_ratio`, return logarithms.
+    """
     edges = np.linspace(0, len(series.values), STRETCHES + 1).astype(int)
     places = np.arange(len(series.values))
     kept = [places, *(np.delete(places, slice(low, high)) for low, high in pairwise(edges))]
@@ -287,12 +297,12 @@ def _left_out(series: Series, reduce: Reduce, is_ratio: bool) -> F64:
 
 
 def _jackknife(values: F64) -> float:
-    """Return the variance of a statistic, from its `values` without each stretch."""
+    """Return the variance of a statistic by the jackknife. `values`: the statistic without each stretch in turn."""
     return float((len(values) - 1) / len(values) * ((values - values.mean()) ** 2).sum())
 
 
 def rejected(probabilities: Sequence[float], alpha: float = ALPHA) -> list[bool]:
-    """Return which of the hypotheses "no difference" are rejected.
+    """Return, for each hypothesis "no difference", whether it is rejected.
 
     `probabilities`: probability of the observation under each hypothesis. The chance of any false rejection is at most
     `alpha`, even if the hypotheses depend on each other: Holm, "A simple sequentially rejective multiple test

@@ -1,4 +1,4 @@
-"""Which of many entries are worth a look: the frontier of frame time against error, and its knee.
+"""The entries that are worth a look: the frontier of frame time against error, and its knee.
 
 Rule: pure. Only a sure difference counts: intervals decide for times, `SAME_DB` decides for pictures.
 """
@@ -10,15 +10,16 @@ from collections.abc import Hashable, Sequence
 from itertools import accumulate
 from typing import Final, NamedTuple, Protocol
 
-#: PSNRs that differ by no more are equal: runtimes that round differently move it that far (docs/networks.md).
+#: PSNRs that differ by at most this count as equal: rounding in runtimes changes a PSNR that much (docs/networks.md).
 SAME_DB: Final = 0.1
+#: A frontier with fewer points has no knee.
 LEAST_OF_A_KNEE: Final = 3
 
 
 class Scored(Protocol):
-    """An entry that can be on a frontier. Less `frame_ms` and more `psnr_db` are better, within one `group`.
+    """An entry that can be on a frontier. Less `frame_ms` and more `psnr_db` are better.
 
-    `low_ms`, `high_ms`: interval of `frame_ms`; None where there is none.
+    `low_ms`, `high_ms`: interval of `frame_ms`; None if unknown. `group`: only entries of one group are compared.
     """
 
     @property
@@ -34,7 +35,7 @@ class Scored(Protocol):
 
 
 class _Point(NamedTuple):
-    """An entry with a speed and an error. `number`: its place among the entries."""
+    """An entry with a frame time and a PSNR. `number`: place of the entry in the list of all entries."""
 
     frame_ms: float
     low_ms: float
@@ -46,9 +47,9 @@ class _Point(NamedTuple):
 def frontier(entries: Sequence[Scored]) -> list[bool]:
     """Return for each entry whether it is on the frontier: no other entry of its group beats it.
 
-    An entry beats another in two ways: its picture is better by more than `SAME_DB` and it is no slower; or its
-    picture is equal or better and it is surely quicker, which means that the intervals do not meet. An entry without a
-    speed or an error is not on the frontier.
+    An entry beats another in two ways. Either its picture is better by more than `SAME_DB`, and its mean frame time is
+    not larger. Or its picture is equal or better, and it is surely quicker: its interval ends below the other's begin.
+    An entry without a frame time or a PSNR is not on the frontier.
     """
     on = [False] * len(entries)
     for points in _groups(entries).values():
@@ -65,10 +66,11 @@ def frontier(entries: Sequence[Scored]) -> list[bool]:
 
 
 def knees(entries: Sequence[Scored]) -> dict[Hashable, int]:
-    """Return the knee of each group that has one: the number of the entry after which more time buys little picture.
+    """Return the knee of each group that has one, as the number of an entry. After the knee, time buys little quality.
 
-    The knee is the point of the best pictures at each frame time that is farthest above the straight line from the
-    quickest to the best one, both axes scaled to 0..1 (Satopaa et al., "Finding a Kneedle in a Haystack", 2011).
+    Take the points that have a better picture than all quicker points, with both axes scaled to 0..1. The knee is the
+    point farthest above the straight line from the first to the last (Satopaa et al., "Finding a Kneedle in a
+    Haystack", 2011).
     """
     found = {}
     for group, points in _groups(entries).items():

@@ -1,11 +1,12 @@
-"""A comparison as a gate: each limit is kept, broken, or it cannot be told, with the runs that would tell.
+"""A comparison as a gate: the outcome of each limit is kept, broken, or cannot tell.
 
-Rule: whoever wants to pass bears the proof. A limit is broken if a figure surely became worse, and its interval reaches
-beyond the limit. A limit is kept if the whole interval lies within it, on a quiet machine. Otherwise nobody can tell.
+Rule: a pass needs proof. A limit is broken if a figure surely became worse, and its interval reaches beyond the limit.
+A limit is kept if the whole interval lies within it, on a quiet machine. Otherwise the gate cannot tell, and names the
+number of runs that would decide.
 
 Time is weighed three ways: frame time with other programs' share taken out, each stage's time and CPU time of a job,
-and its counted instructions. Instructions repeat to 0.1 %. Therefore they alone may keep the limit `slower`, if every
-stage has counts and no setting changed. The frame time must not contradict them.
+and its counted instructions. Instructions repeat to 0.1 %. Therefore the limit `slower` needs no other figure if every
+stage has counts, no setting changed, and the frame time does not contradict the counts.
 """
 
 from __future__ import annotations
@@ -36,13 +37,13 @@ from trilane.apps.compare.sides import Change, ComparedRun, Side
 from trilane.errors import BadInputError, did_you_mean
 from trilane.student import student_quantile, student_tails
 
-#: Runs of each side up to which it is computed how many would tell.
+#: Largest number of runs on each side for which is computed whether they would decide.
 MOST_RUNS: Final = 200
 PERCENT, DECIBELS = "%", "dB"
-#: Share by which a stage's CPU time and its time on the core may differ where one thread does its jobs.
+#: A stage's CPU time and its time on the core count as equal if they differ by at most this share.
 SAME_TIME: Final = 0.05
 CHECKED: Final = "check"
-#: Measures without the share of other programs.
+#: Measures that are judged with other programs' share taken out.
 WALL: Final = (FRAME_TIME, LATENCY)
 MOST_SAID: Final = 4
 
@@ -56,10 +57,10 @@ class LimitOutcome(StrEnum):
 
 
 class GateMetric(NamedTuple):
-    """A figure that may have a limit.
+    """A metric that may have a limit.
 
-    `says`: what breaks the limit. `of`: measures and their statistics. `unit`: unit of the limit. `is_timed`: whether
-    other programs change it. `sign`: -1 if less is worse.
+    `says`: a broken limit in words. `of`: its figures, as (measure, statistic). `unit`: unit of the limit. `is_timed`:
+    whether other programs change its figures. `sign`: 1 if more is worse, -1 if less is worse.
     """
 
     says: str
@@ -69,7 +70,7 @@ class GateMetric(NamedTuple):
     sign: int = 1
 
 
-#: Name in --fail-if: its metric. A share of the frames has a limit in points of percent.
+#: Name in --fail-if -> metric. The limit of a share of the frames is in percentage points.
 METRICS: Final = {
     "slower": GateMetric(
         "frames or the jobs of any stage take longer",
@@ -92,7 +93,7 @@ METRICS: Final = {
     "psnr": GateMetric("the frames of --check are worse in the mean", ((CHECKED, "psnr_db"),), DECIBELS, False, -1),
     "worst-psnr": GateMetric("the worst frame of --check is worse", ((CHECKED, "worst_psnr_db"),), DECIBELS, False, -1),
 }
-#: Why there may be no figure.
+#: Measure -> why a comparison may lack it.
 ABSENT: Final = {
     CHECKED: "not every run was made with --check",
     INSTRUCTIONS: "not every run has counted instructions (`trilane doctor` says whether this machine counts them)",
@@ -100,7 +101,7 @@ ABSENT: Final = {
 
 
 class Gate(NamedTuple):
-    """A limit of a metric. `limit`: a share, or dB. `text`: as it was asked for."""
+    """A limit of a metric. `limit`: a share, or dB. `text`: the limit in words, such as `slower=5%`."""
 
     name: str
     limit: float
@@ -112,7 +113,7 @@ class Gate(NamedTuple):
 
 
 def read_gate(text: str, option: str = "--fail-if") -> Gate:
-    """Read `slower=5%` or `psnr=0.5dB`. Raises BadInputError naming the metrics, or the unit that the metric has."""
+    """Read a limit such as `slower=5%` or `psnr=0.5dB`. Raises BadInputError, which names the metrics or the unit."""
     name, _, value = (part.strip() for part in text.partition("="))
     if name not in METRICS:
         expected = f"METRIC=LIMIT with one of {', '.join(METRICS)}"
@@ -126,7 +127,7 @@ def read_gate(text: str, option: str = "--fail-if") -> Gate:
 
 @dataclass(frozen=True)
 class GatedPair:
-    """Two sides that are judged. `rows`: their figures. `changes`: settings and facts of the machine that changed."""
+    """Two sides to judge. `rows`: their figures. `changes`: settings and facts of the machine that changed."""
 
     name: str
     base: Side
@@ -138,10 +139,10 @@ class GatedPair:
 class Weighed(NamedTuple):
     """One figure against its limit.
 
-    `least`, `most`: change for the worse, less all or nothing of what known causes can explain. For a ratio, both are
-    logarithms. `limit`: on the same scale. `probability`: chance that runs of one kind are worse by `least`. `outcome`:
-    outcome of this figure alone. `runs`: number of runs of each side that would decide, inf for more than `MOST_RUNS`,
-    None where no number decides.
+    `least`, `most`: smallest and largest change for the worse, given the changes that known causes can explain. For a
+    ratio, both are logarithms. `limit`: limit on the same scale. `probability`: chance that runs of one kind are worse
+    by `least`. `outcome`: outcome of this figure alone. `runs`: number of runs on each side that would decide; inf for
+    more than `MOST_RUNS`, None if no number decides.
     """
 
     figure: Figure
@@ -155,7 +156,7 @@ class Weighed(NamedTuple):
 
     @property
     def is_near(self) -> bool:
-        """Whether the estimate is at most one deviation above the limit."""
+        """Whether `least` is at most one deviation above the limit."""
         return self.row.deviation is not None and self.least - self.row.deviation <= self.limit
 
     @property
@@ -175,7 +176,7 @@ class JudgedLimit(NamedTuple):
     """The judgement of one limit for one pair.
 
     `name`: name of the other side. `reason`: a sentence. `runs`: as in `Weighed`, for all figures of the limit
-    together; also None where more runs are of no help or no need.
+    together; None also if the outcome needs no more runs.
     """
 
     gate: Gate
@@ -191,7 +192,7 @@ class JudgedLimit(NamedTuple):
         return f"{self.gate.text}: {self.outcome}: {self.reason}"
 
     def as_json(self) -> dict[str, Any]:
-        """Return one entry of `gates`."""
+        """Return the judgement as an entry of `gates` in the output of `trilane compare --json`."""
         return {
             "run": self.name,
             "limit": self.gate.text,
@@ -207,7 +208,7 @@ class JudgedLimit(NamedTuple):
 
 
 def whole(judged: Sequence[JudgedLimit]) -> LimitOutcome:
-    """Return the outcome of all limits: one that is broken decides, then one that cannot be told."""
+    """Return the outcome of all limits: broken if one is broken, else unknown if one is unknown, else kept."""
     found = [each.outcome for each in judged]
     return next(
         (outcome for outcome in (LimitOutcome.BROKEN, LimitOutcome.UNKNOWN) if outcome in found), LimitOutcome.KEPT
@@ -215,7 +216,7 @@ def whole(judged: Sequence[JudgedLimit]) -> LimitOutcome:
 
 
 def judge(gates: Sequence[Gate], pairs: Sequence[GatedPair]) -> list[JudgedLimit]:
-    """Judge every limit for every pair. All figures are tested together, so that they raise few false alarms."""
+    """Judge every limit for every pair. All figures are tested together, so that false alarms are rare."""
     asked = [(gate, pair, list(_weighed(gate, pair))) for pair in pairs for gate in gates]
     every = [each for _, _, figures in asked for each in figures if each.row.deviation]
     fallen = rejected([each.probability for each in every])
@@ -245,10 +246,11 @@ def _weighed(gate: Gate, pair: GatedPair) -> Iterator[Weighed]:
 
 
 def _is_said(figure: Figure, row: Difference, work: Difference | None, metric: GateMetric, is_quiet: bool) -> bool:
-    """Return whether the stage's `work` says the same: service time that grew as much, CPU time that is as long.
+    """Return whether `work`, the stage's typical time on its core, already says what `figure` says.
 
-    The typical job says nothing of few that take much longer; then the mean is weighed too. Beside other programs few
-    jobs take much longer by themselves, and nothing is kept there anyway.
+    Service time says no more if it did not grow more than `work`, CPU time if it is as long as `work`. If few jobs take
+    much longer, the typical time does not show it, but the mean service time does. On a machine that is not quiet,
+    other programs make few jobs longer. Service time is not weighed there, and no limit is kept anyway.
     """
     if work is None or (WORK, "typical") not in metric.of:
         return False
@@ -259,14 +261,17 @@ def _is_said(figure: Figure, row: Difference, work: Difference | None, metric: G
 
 
 def _chance_of(least: float, row: Difference) -> float:
-    """Return the probability that runs of one kind are worse by `least`: one tail."""
+    """Return the one-sided probability that runs of one kind are worse by at least `least`."""
     if least <= 0 or row.deviation is None:
         return 1.0
     return student_tails(least / row.deviation, row.freedom) / 2 if row.deviation else 0.0
 
 
 def _settled(each: Weighed, is_sure: bool, tests: int, pair: GatedPair) -> Weighed:
-    """Return a figure with its outcome. `is_sure`: whether it is surely worse. `tests`: number of figures tested."""
+    """Return `each` with its outcome or, if that is unknown, with the number of runs that would decide.
+
+    `is_sure`: whether the figure is surely worse. `tests`: number of figures that are tested together.
+    """
     row = each.row
     if row.deviation is None:
         return each
@@ -278,9 +283,9 @@ def _settled(each: Weighed, is_sure: bool, tests: int, pair: GatedPair) -> Weigh
 
 
 def runs_needed(each: Weighed, sizes: tuple[int, int], tests: int) -> float | None:
-    """Return how many runs of each side would decide, if further runs have the same means and the same scatter.
+    """Return how many runs on each side would decide (`Weighed.runs`), if further runs have the same mean and scatter.
 
-    `sizes`: runs of both sides now. `tests`: number of figures that are tested together.
+    `sizes`: present numbers of runs on both sides. `tests`: number of figures that are tested together.
     """
     if each.row.deviation is None or (each.most >= each.limit and each.least <= 0):
         return None
@@ -320,7 +325,7 @@ def _judged(gate: Gate, pair: GatedPair, figures: tuple[Weighed, ...]) -> Judged
 
 
 def _missing(pair: GatedPair) -> list[str]:
-    """Return the stages that some run lacks: nobody knows what became of them."""
+    """Return the stages that some run has and another lacks. Their change is unknown."""
     stages = [{*run.document.get("stages", {})} for run in _runs(pair)]
     return sorted(set().union(*stages) - set[str]().union(*stages[:1]).intersection(*stages))
 
@@ -330,10 +335,10 @@ def _runs(pair: GatedPair) -> tuple[ComparedRun, ...]:
 
 
 def _decisive(gate: Gate, pair: GatedPair, figures: Sequence[Weighed]) -> list[Weighed]:
-    """Return the figures that must keep the limit.
+    """Return the figures that must keep the limit: all or, for `slower`, only the counted instructions.
 
-    For `slower` these are the counted instructions, if every stage has them, nothing changed, and the frame time does
-    not contradict them.
+    Instructions are enough if every stage has them and no setting changed. A frame time that contradicts them, because
+    it is not near the limit, must keep the limit too.
     """
     counted = [each for each in figures if each.figure.measure == INSTRUCTIONS]
     frames = [each for each in figures if each.figure.measure == FRAME_TIME]
@@ -362,5 +367,5 @@ def _list(figures: Sequence[Weighed]) -> str:
 
 
 def as_json(judged: Sequence[JudgedLimit]) -> Mapping[str, Any]:
-    """Return the keys that a gate adds to the output of `trilane compare --json`."""
+    """Return the keys that gates add to the output of `trilane compare --json`."""
     return {"outcome": str(whole(judged)), "gates": [each.as_json() for each in judged]}

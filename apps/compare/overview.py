@@ -28,15 +28,16 @@ from trilane.scene.schema import Scene
 from trilane.units import COMPUTED, HOST_CLOCK, MEASURED, NO_FIGURES
 from trilane.writing import write_atomically
 
-#: What an error belongs to, and what an interval of the frame time holds.
+#: Origins of an image error.
 OF_RUN, OF_AVATAR = "errors of the runs themselves", "errors of the avatars' validations"
+#: Kinds of an interval of the frame time.
 BY_SCATTER, BY_MODEL = "95 %, scatter of the run's frames", "80 %, of the model"
-#: Keys of a scene that say how it is drawn, not what; another bundle may be another network of the same person.
+#: Keys of a scene that do not change its content. Another bundle may be another network of the same person.
 HOW_DRAWN = (
     *("size", "plan", "texture_filter", "error_budget_px", "error_budget_db", "most_side", "memory_mb"),
     *("avatars[0].bundle", "avatars[0].name"),
 )
-#: Keys of a scene whose values stand without the key. Every avatar has the keys of the first.
+#: Keys of a scene whose values are shown without the key. The keys of the first avatar hold for every avatar.
 WITHOUT_KEY = ("name", "background", "output.width", "output.height", "camera.source", "avatars[0].motion")
 #: Keys of a document's `config` that are no settings, or that the row has under other names.
 NOT_SETTINGS = (
@@ -64,9 +65,9 @@ SOURCES = ("speed_source", "interval", "error_source", "shows", "clock", "machin
 
 
 def read_entries(places: Sequence[Path]) -> list[Entry]:
-    """Read the entries of all `places`, in their order; entries of the same name get their folder's name in front.
+    """Read the entries of all `places`, in order. If entries have the same name, each gets its folder's name in front.
 
-    In a folder of runs and sweeps, one that cannot be read becomes an entry with a `failure`.
+    In a folder of runs and sweeps, a run that cannot be read becomes an entry with a `failure`.
     Raises BadInputError for a place that cannot be read or has no entries.
     """
     entries: list[Entry] = []
@@ -122,9 +123,10 @@ def _document(path: Path) -> Mapping[str, Any]:
 
 
 def _names(trials: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Name trials of one sweep by the options in which they differ, such as `256, openvino`; by their ids if in none.
+    """Return names for the trials of one sweep: the options in which they differ, such as `256, openvino`.
 
-    A number stands without its option if only one option has numbers. Repeats have their number, other namesakes ids.
+    If only one option has numbers, its name is left out. If several trials would have the same name, each gets the
+    number of its repeat, or else its id. A trial without any such option is named by its id.
     """
     options = [dict(_settings(_dict(trial.get("options")))) for trial in trials]
     keys = [key for key in dict.fromkeys(chain(*options)) if len({each.get(key) for each in options}) > 1]
@@ -179,7 +181,7 @@ def _dict(value: Any) -> dict[str, Any]:
 
 
 def _video(folder: Path, name: Any) -> Path | None:
-    """Return the video of a trial's run folder, which has to lie inside the sweep's folder."""
+    """Return the video in a trial's run folder; None if that folder is not inside the sweep's folder."""
     if not isinstance(name, str):
         return None
     place = (folder / name).resolve()
@@ -190,17 +192,19 @@ def _video(folder: Path, name: Any) -> Path | None:
 class Entry:
     """One run, prediction or trial as a row.
 
-    `name`: name of its folder, or options in which its trial differs from others. `trial`: id of its trial. `clock`:
-    host or virtual. `machine`: the machine in one line. `settings`:
-    settings by dotted key. `command`: words of the command; empty where none is known. `frame_ms`, `low_ms`, `high_ms`:
-    mean frame time and its interval, None where there is none. `psnr_db`: error, a mean over the frames.
-    `worst_psnr_db`, `p1_psnr_db`: worst frame and 1st percentile of a run's own frames. `error_source`: origin of the
-    error, or why there is none. `facts`: facts of the machine. `video`: video of a run. `failure`: why there are no
-    figures. `verdict`: PASS or FAIL at its rate, empty where none is known. `bound`: the unit and the stages that the
-    verdict names. `trust`: "sure", or UNSURE. `other_programs`: share of its cores' time that other programs had, None
-    where nobody knows. `interval`: what the interval holds. `error_of`: `OF_RUN` and its
-    reference, `OF_AVATAR`, or empty. `shows`: what the pictures show. `within`: name of the folder that holds the run,
-    or of its sweep.
+    `name`: name of its folder, or the options in which its trial differs from others. `trial`: id of its trial.
+    `within`: name of the folder around the run folder, or of its sweep's folder.
+    `clock`: host or virtual. `machine`: the machine in one line. `facts`: facts of the machine.
+    `settings`: values by dotted key. `command`: words of the command, empty if unknown.
+    `frame_ms`, `low_ms`, `high_ms`: mean frame time and its interval, None if unknown. `interval`: `BY_SCATTER`,
+    `BY_MODEL`, or empty.
+    `psnr_db`: mean PSNR over frames. `worst_psnr_db`, `p1_psnr_db`: worst frame and 1st percentile of a run's own
+    frames. `error_source`: origin of the PSNR, or why there is none. `error_of`: `OF_RUN` with its reference,
+    `OF_AVATAR`, or empty.
+    `failure`: why there are no figures. `verdict`: PASS or FAIL at its rate, empty if unknown. `bound`: the unit and
+    the stages that the verdict names. `trust`: "sure", "UNSURE", or empty.
+    `other_programs`: share of the time of its cores that other programs had, None if unknown.
+    `video`: video of a run. `shows`: content of the pictures in words.
     """
 
     name: str
@@ -232,21 +236,21 @@ class Entry:
 
     @property
     def speed_source(self) -> str:
-        """Origin of the speed; empty without a speed."""
+        """The origin of the speed, measured or computed; empty without a speed."""
         return "" if self.frame_ms is None else MEASURED if self.clock == HOST_CLOCK else COMPUTED
 
     @property
     def group(self) -> tuple[str, str, str, str]:
-        """The group of entries that are compared with each other: their times and errors mean the same."""
+        """The group of the entry. Only entries of one group are compared: their times and errors mean the same."""
         return self.clock, self.machine, self.shows, self.error_of
 
 
 def entry_of(
     name: str, document: Mapping[str, Any], video: Path | None = None, options: Mapping[str, Any] | None = None
 ) -> Entry:
-    """Return the row of a report.json, of a prediction, or of a failed trial, which has only a `failure`.
+    """Return the entry of a report, of a prediction, or of a failed trial, which has only a `failure`.
 
-    `options`: options of a trial, which are settings beside those of its document.
+    `document`: content of the report or prediction. `options`: options of a trial, which are added to the settings.
     """
     times, made = _mapping(document, "frame_time_ms"), _mapping(document, "made")
     machine, config = _mapping(document, "machine"), _mapping(document, "config")
@@ -280,7 +284,7 @@ def entry_of(
 
 
 def _verdict(verdict: Mapping[str, Any]) -> dict[str, str]:
-    """Return the words of a report's or a prediction's `verdict`; empty where a document has none."""
+    """Return `verdict`, `bound` and `trust` of an entry from a document's `verdict`; empty if `verdict` is empty."""
     if not verdict:
         return {}
     bound = _mapping(verdict, "bound")
@@ -291,17 +295,16 @@ def _verdict(verdict: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _interval(times: Mapping[str, Any]) -> tuple[float | None, float | None]:
-    """Return the interval of the mean from a run's own frames, else that of a model."""
+    """Return the ends of the interval of the mean frame time: from a run's own frames, or else from a model."""
     names = ("mean_low", "mean_high") if "mean_low" in times else ("low", "high")
     low, high = (_time(times.get(name)) for name in names)
     return (None, None) if low is None or high is None else (low, high)
 
 
 def _shows(scene: Mapping[str, Any]) -> str:
-    """Return the content of the frames of `scene` in words.
+    """Return the content of the pictures of `scene` in words. Two scenes with the same words show the same pictures.
 
-    The size of the tensor and the network do not change these words. Unusual content is named by its key, so two scenes
-    with the same words show the same pictures.
+    The size of the tensor and the network do not change these words. Unusual content is named with its key.
     """
     output, camera = _mapping(scene, "output"), _mapping(scene, "camera")
     bodies = [body for body in _sequence(scene.get("avatars")) if isinstance(body, Mapping)]
@@ -311,7 +314,7 @@ def _shows(scene: Mapping[str, Any]) -> str:
 
 
 def _unusual(scene: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the keys of `scene` with values that differ from the defaults, such as `frames 60`."""
+    """Yield key and value of the settings of `scene` that differ from the defaults, such as `frames 60`."""
     usual = dict(_settings(Scene().model_dump(mode="json")))
     for key, value in _settings(scene):
         plain = re.sub(r"^avatars\[\d+\]", "avatars[0]", key)
@@ -320,7 +323,10 @@ def _unusual(scene: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _error(document: Mapping[str, Any]) -> tuple[float | None, str, str]:
-    """Return a PSNR, its origin and what it belongs to: the run itself if it was compared, else its worst avatar."""
+    """Return `psnr_db`, `error_source` and `error_of` of an entry.
+
+    The PSNR is the run's own if the run was checked, otherwise that of its worst avatar.
+    """
     check = _mapping(document, "check")
     if (own := _number(check.get("psnr_db"))) is not None:
         against = f"against {str(check.get('against')).partition(':')[0]}"
@@ -337,7 +343,7 @@ def _error(document: Mapping[str, Any]) -> tuple[float | None, str, str]:
 
 
 def _settings(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the leaves of `config` by dotted key."""
+    """Yield (dotted key, value as text) for each leaf of `config`, without `NOT_SETTINGS`."""
     for key, value in config.items():
         if not prefix and key in NOT_SETTINGS:
             continue
@@ -368,12 +374,12 @@ def _sequence(value: Any) -> list[Any]:
 
 
 def _text(value: Any) -> str:
-    """Return `value` as text that any file can hold. A lone surrogate, as from a file name without UTF-8, is a `?`."""
+    """Return `value` as text that UTF-8 can hold: a lone surrogate, as in a file name without UTF-8, becomes `?`."""
     return str(value).encode("utf-8", "replace").decode("utf-8")
 
 
 def _number(value: Any) -> float | None:
-    """Return a number; None for NaN, infinities, integers beyond a float, which JSON may hold, and anything else."""
+    """Return `value` as a finite float; None if it is no number, NaN, infinite, or an integer beyond a float."""
     if not isinstance(value, int | float) or isinstance(value, bool):
         return None
     try:
@@ -384,19 +390,19 @@ def _number(value: Any) -> float | None:
 
 
 def _time(value: Any) -> float | None:
-    """Return a number above 0, else None."""
+    """Return `value` as a float if it is a number above 0, otherwise None."""
     number = _number(value)
     return number if number is not None and number > 0 else None
 
 
 def varied(entries: list[Entry]) -> list[str]:
-    """Return the settings in which entries differ, in the order of their first appearance."""
+    """Return the keys of settings in which entries differ, in the order of their first appearance."""
     keys = dict.fromkeys(key for entry in entries for key in entry.settings)
     return [key for key in keys if len({entry.settings[key] for entry in entries if key in entry.settings}) > 1]
 
 
 def told_choices(entries: Sequence[Entry]) -> Iterator[str]:
-    """Yield a sentence for each group of two or more known entries: its knee, or its quickest and its best picture."""
+    """Yield a sentence about each group with two or more known entries: its knee, or its quickest and best entries."""
     at = knees(entries)
     known: dict[Hashable, dict[int, tuple[float, float, str]]] = {}
     for number, entry in enumerate(entries):
@@ -444,7 +450,7 @@ def table_rows(entries: Sequence[Entry]) -> list[dict[str, Any]]:
 
 
 def write_csv(target: Path, entries: Sequence[Entry]) -> None:
-    """Write the table as CSV. Raises BadInputError where nothing can be written."""
+    """Write the table as CSV. Raises BadInputError if `target` cannot be written."""
     with write_atomically(target) as draft, draft.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, columns(entries))
         writer.writeheader()
@@ -454,7 +460,7 @@ def write_csv(target: Path, entries: Sequence[Entry]) -> None:
 def write_parquet(target: Path, entries: Sequence[Entry]) -> None:
     """Write the table as Parquet.
 
-    Raises MissingPartError without pyarrow, BadInputError where nothing can be written.
+    Raises MissingPartError without pyarrow, BadInputError if `target` cannot be written.
     """
     try:
         import pyarrow

@@ -1,7 +1,7 @@
 """The overview as one self-contained HTML file: a drawing, the table, and stills of the videos.
 
 Rule: all text is escaped. The only script is a file of this folder, and the page's policy names its digest. An
-unreadable video gives no still. The drawing shows the table's numbers, and never distinguishes things by colour alone.
+unreadable video gives no still. The drawing shows the table's numbers. No two things differ by colour alone.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ UNITS = {"frame_ms": "frame, ms", "low_ms": "from, ms", "high_ms": "to, ms", "la
 UNITS |= {"psnr_db": "PSNR, dB", "worst_psnr_db": "worst frame, dB", "p1_psnr_db": "1st percentile, dB"}
 UNITS |= {"frames_per_s": "frames/s", "on_frontier": "frontier", "other_programs": "other programs"}
 NO_ERROR = "No entry has both a speed and a known error. `trilane run --check N` measures the error of a run."
-LONG = 40  # letters of a cell, of which the rest is shown when a person points at it
+LONG = 40  # letters; the style cuts a longer cell, which is shown in full when a person points at it
 SHARES = ("other_programs",)
-LETTER, BESIDE = 7, 12  # width of a letter of a name, and its distance from its dot
+LETTER, BESIDE = 7, 12  # width of a name's letter, and distance of a name from its dot, pixels
 MEANING = (
     "Frame time is the mean between presented frames, from and to its interval: of a run 95 %, by the scatter of its "
     "own frames; of a prediction 80 %, by the model. PSNR says how near the picture is to the truth; larger is better. "
@@ -48,7 +48,7 @@ STILL_WIDTH = 640
 
 
 def page(title: str, entries: Sequence[Entry]) -> str:
-    """Return a whole HTML document of at least one entry."""
+    """Return an HTML document. `entries`: one or more."""
     script = (files("trilane.apps.compare") / "overview_page.js").read_text(encoding="utf-8")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
@@ -129,7 +129,7 @@ def _cell(name: str, value: Any) -> str:
 
 
 def _stills(entries: Sequence[Entry]) -> Iterator[str]:
-    """Yield the pictures, and two of them over each other."""
+    """Yield the section of stills: two selectable stills over each other, then all stills."""
     filmed = [entry for entry in entries if entry.video is not None]
     pictures = [(entry, still(entry.video)) for entry in filmed[:MOST_STILLS] if entry.video is not None]
     found = [(entry, base64.b64encode(data).decode()) for entry, data in pictures if data is not None]
@@ -179,10 +179,10 @@ def _facts(machine: Any) -> str:
 
 
 class Dot(NamedTuple):
-    """A dot at `x` and `y`.
+    """A dot at the frame time `x` and the PSNR `y`.
 
-    `low`, `high`: interval of `x`. `on`: whether it is on the frontier. `group`: number of its marker.
-    `is_knee`: whether it is the knee of its group.
+    `low`, `high`: interval of `x`. `on`: whether the dot is on the frontier. `group`: number of its group, which has a
+    marker. `is_knee`: whether the dot is the knee of its group.
     """
 
     label: str
@@ -195,7 +195,7 @@ class Dot(NamedTuple):
     is_knee: bool = False
 
 
-#: Name -> marker. Groups beyond the last marker begin again at the first.
+#: Name -> SVG of a marker. The group after the last marker gets the first marker again.
 MARKERS = {
     "circle": '<circle class="g0" cx="{x}" cy="{y}" r="5"/>',
     "square": '<rect class="g1" x="{x0}" y="{y0}" width="9" height="9"/>',
@@ -213,7 +213,7 @@ def marker_name(group: int) -> str:
 
 
 def scatter(dots: Sequence[Dot], x_title: str, y_title: str) -> str:
-    """Return an SVG drawing of the dots, with intervals as lines and frontiers as steps; empty without dots."""
+    """Return an SVG drawing of the dots, with intervals as lines and frontiers as steps; "" without dots."""
     if not dots:
         return ""
     xs = [value for dot in dots for value in (dot.x, dot.low, dot.high) if value is not None]
@@ -236,7 +236,10 @@ def scatter(dots: Sequence[Dot], x_title: str, y_title: str) -> str:
 
 
 class _Axis:
-    """An axis from values to pixels, with a margin of a twentieth and ticks at round numbers."""
+    """An axis that maps values to pixels, with a margin of a twentieth on both sides and ticks at round numbers.
+
+    `low`, `high`: range of the values. `first`, `last`: pixels of the axis's ends.
+    """
 
     def __init__(self, low: float, high: float, first: float, last: float) -> None:
         margin = (high - low) / 20 or max(abs(high) / 20, 0.5)
@@ -270,7 +273,7 @@ def _grid(across: _Axis, up: _Axis) -> Iterator[str]:
 
 
 def _steps(dots: Sequence[Dot], across: _Axis, up: _Axis) -> Iterator[str]:
-    """Yield the frontier of each group as steps: the best error at each frame time."""
+    """Yield the frontier of each group as steps: the best PSNR up to each frame time."""
     for group in sorted({dot.group for dot in dots}):
         points = sorted((dot.x, dot.y) for dot in dots if dot.on and dot.group == group)
         bests = accumulate((y for _, y in points), max)
@@ -295,7 +298,7 @@ def _dot(dot: Dot, across: _Axis, up: _Axis) -> str:
 
 
 def _names(dots: Sequence[Dot], across: _Axis, up: _Axis) -> Iterator[str]:
-    """Yield the names of knees, then those of the frontier, each where it meets no other name."""
+    """Yield the names of knees, then of other dots on the frontier. A name that would overlap another is left out."""
     taken: list[tuple[float, float, float]] = []  # left, right, base line
     named = sorted((dot for dot in dots if dot.on or dot.is_knee), key=lambda dot: not dot.is_knee)
     for dot in named:
@@ -311,7 +314,7 @@ def _names(dots: Sequence[Dot], across: _Axis, up: _Axis) -> Iterator[str]:
 
 
 def still(video: Path) -> bytes | None:
-    """Return the frame nearest before the middle of `video` as JPEG, at most `STILL_WIDTH` wide; None if unreadable."""
+    """Return a frame from about the middle of `video` as JPEG, at most `STILL_WIDTH` wide; None if unreadable."""
     try:
         with av.open(str(video)) as container:
             stream = container.streams.video[0]

@@ -1,4 +1,4 @@
-"""The comparison as one HTML file. Rule: it loads nothing, runs no script, and all text is escaped.
+"""The comparison as one HTML file. Rule: the file loads nothing, runs no script, and all its text is escaped.
 
 Each change is also drawn: a dot with its 95 % interval, on one scale for figures of the same kind.
 """
@@ -49,7 +49,7 @@ WIDTH, HEIGHT, MARGIN = 160, 18, 6
 
 
 def page(comparisons: Sequence[Comparison]) -> str:
-    """Return a whole HTML document. `comparisons`: comparisons with one base, at least one."""
+    """Return an HTML document. `comparisons`: one or more, with the same base."""
     base = escape(comparisons[0].base.name)
     body = "\n".join(part for comparison in comparisons for part in _section(comparison))
     return (
@@ -120,7 +120,10 @@ def _scale_of(row: Difference, unit: str) -> tuple[bool, str]:
 
 
 def _scales(comparison: Comparison) -> dict[tuple[bool, str], float]:
-    """Return the scale of each kind of change: every change fits in, and the intervals of figures that differ."""
+    """Return, by kind of change (`_scale_of`), the largest change to draw.
+
+    Every change fits in, and so do the intervals of figures that differ. Other intervals may be cut.
+    """
     scales: dict[tuple[bool, str], float] = {}
     for figure, row in comparison.rows.items():
         reach = max(map(abs, (row.change, row.low or 0.0, row.high or 0.0))) if figure in comparison.differing else 0.0
@@ -130,7 +133,10 @@ def _scales(comparison: Comparison) -> dict[tuple[bool, str], float]:
 
 
 def _drawing(row: Difference, scale: float) -> str:
-    """Return a drawing: a dot at the change, its interval as a line, and a line at no change."""
+    """Return a table cell with a drawing: a dot at the change, a line for its interval, and a line at no change.
+
+    `scale`: change at the right edge.
+    """
 
     def place(value: float) -> float:
         share = min(max(value / scale, -1.0), 1.0) if scale else 0.0

@@ -3,8 +3,8 @@
 In runs with a journal, every figure comes from the frames. A report alone or a prediction only has summaries. Each
 summary gets the uncertainty of the mean frame time, because no other one is known.
 
-`Noise` says how much more a figure differs between runs of one kind than their frames show. The source of each number
-stands beside the number.
+`Noise` says how much more a figure differs between runs of one kind than their frames show. "Runs of one kind" are runs
+of the same configuration.
 """
 
 from __future__ import annotations
@@ -57,24 +57,24 @@ UNITS: Final = {
 }
 #: Statistics of a summary whose uncertainty is about that of a mean.
 LIKE_THE_MEAN: Final = ("mean", "p50")
-#: Standard deviations of one run's figure, of its logarithm or of a share of the time, and how many runs these numbers
-#: are worth (docs/decisions/comparing-runs.md has the measurements): of a stage's typical time on its core, of other
-#: times on the clock, of shares, and of counted instructions.
+#: Standard deviations between runs of one kind, as measured in docs/decisions/comparing-runs.md. For the logarithm of a
+#: stage's typical time on its core, of other times on the clock, and of counted instructions; for a share itself.
 WORK_DEVIATION, WALL_DEVIATION, SHARE_DEVIATION, COUNT_DEVIATION = 0.042, 0.03, 0.015, 0.001
+#: Number of runs whose scatter gives equal knowledge.
 FREEDOM = 5
 #: Standard deviation of the logarithm of a held stage's time, assumed: a sleep may end a little late.
 HELD_DEVIATION = 0.002
-#: How much a larger share of the cores for other programs explains, per share of the cores: of a stage's time on its
-#: core, and of a share of the time.
+#: Change that other programs explain, per share of the cores that they had more on one side: in the logarithm of a
+#: stage's time on its core, and in a share of the time.
 WORK_BESIDE_OTHERS, SHARE_BESIDE_OTHERS = 0.3, 0.5
-#: The least share of the cores that is left to a run.
+#: The least share of the cores that is taken as left to a run.
 LEAST_LEFT = 0.01
-#: How many times as much a percentile differs as the mean, because rare events make it.
+#: Deviation of a percentile as a multiple of the mean's: rare events decide it.
 TAILS: Final = {"p90": 1.5, "p99": 4.0}
-WAIT_FLOOR_MS: Final = 0.05  # deviation of any wait: a message takes so long more or less
-#: Share of the cores for other programs above which a person is told.
+WAIT_FLOOR_MS: Final = 0.05  # deviation of any wait: the time of a message varies by so much
+#: Other programs' share of the cores above which a remark names it.
 BUSY_MACHINE = 0.05
-#: Settings that leave the speed of a core as it is.
+#: Settings that do not change the speed of a core.
 SAME_CORES: Final = ("policy", "edge", "made.", "config.pace_ns", "config.scene", "idle_cores")
 Documents = Sequence[Mapping[str, Any]]
 
@@ -97,7 +97,7 @@ Rows = dict[Figure, Difference]
 
 
 def rows_of(base: Side, other: Side) -> Rows:
-    """Return every figure that all runs of both sides have."""
+    """Return the difference of every figure that all runs of both sides have."""
     noise = _noise(base, other)
     is_known = all(told.frames is not None for told in (*base.runs, *other.runs))
     rows = dict(_of_frames(base, other, noise) if is_known else _of_summaries(base, other, noise))
@@ -107,10 +107,10 @@ def rows_of(base: Side, other: Side) -> Rows:
 
 
 def named(rows: Rows) -> list[Figure]:
-    """Return the figures that a verdict rests on; all other figures explain these.
+    """Return the figures that a verdict rests on; the other figures explain these.
 
-    Counted instructions stand for a stage's program, and the time of one instruction for the machine. Without counts,
-    the stage's time on its core stands for the program. Where that time is unknown, its service time does.
+    For a stage these are its counted instructions and the time of one. Without counts, its time on the core is used; if
+    this time is unknown too, its service time.
     """
     counted, worked = ({figure.of for figure in rows if figure.measure == each} for each in (INSTRUCTION_TIME, WORK))
 
@@ -144,7 +144,7 @@ def _noise(base: Side, other: Side) -> Noise:
 
 
 def _shared(base: Side, other: Side) -> list[Key]:
-    """Return the series that all runs have; none where a run has no frames."""
+    """Return the keys of the series that all runs have; none if a run has no frames."""
     first, *rest = [told.frames.series if told.frames else {} for side in (base, other) for told in side.runs]
     return [key for key in first if all(key in each for each in rest)]
 
@@ -158,7 +158,7 @@ def _difference(base: Side, other: Side, key: Key, statistic: str, chance: Chanc
 def _of_frames(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figure, Difference]]:
     for key in _shared(base, other):
         if key.measure in (INSTRUCTION_TIME, CPU) and key.of in noise.held:
-            continue  # the stage waits until its time is over, so the time says nothing of its program
+            continue  # a held stage waits until its time is over, so the time says nothing about its program
         for statistic in MEASURES.get(key.measure, ("mean",)):
             change = _difference(base, other, key, statistic, _chance(key.measure, key.of, statistic, noise))
             yield Figure(*key, statistic, UNITS.get(key.measure, BYTES)), change
@@ -177,7 +177,7 @@ def _chance(measure: str, of: str, statistic: str, noise: Noise) -> Chance:
 
 
 def _of_summaries(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figure, Difference]]:
-    """Yield the figures of reports or predictions, each as sure as the document's mean frame time."""
+    """Yield figures from the summaries of reports and predictions, each as uncertain as the mean frame time."""
     sides = [[_summaries(told.document) for told in side.runs] for side in (base, other)]
     within = _relative_variance(base, other)
     for figure in sides[0][0]:
@@ -196,9 +196,9 @@ def _of_summaries(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figur
 
 
 def _relative_variance(base: Side, other: Side) -> float | None:
-    """Return the relative variance of the ratio of mean frame times, from the documents' own intervals.
+    """Return the variance of the logarithm of the ratio of mean frame times, from the intervals in the documents.
 
-    None where a document has no interval. It is 0 for predictions of one chip, which share the model's error.
+    None if a document has no interval; 0 for predictions of one chip, which share the model's error.
     """
     runs = [*base.runs, *other.runs]
     if all(
@@ -247,7 +247,7 @@ def _statistics(measure: str, of: str, times: Mapping[str, Any], names: Sequence
 
 
 def _of_counts(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figure, Difference]]:
-    """Yield the lost and dropped frames, as shares of those asked for."""
+    """Yield the lost and dropped frames by cause, as shares of the requested frames."""
     if any("frames" not in told.document for told in (*base.runs, *other.runs)):
         return
     sides = [[told.document["frames"] for told in side.runs] for side in (base, other)]
@@ -263,7 +263,7 @@ def _of_counts(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figure, 
 
 
 def _of_errors(base: Side, other: Side) -> Iterator[tuple[Figure, Difference]]:
-    """Yield the avatars' figures of accuracy. They were measured once and do not scatter, so every change counts."""
+    """Yield the avatars' accuracy. It was measured once and does not scatter, so every change counts."""
     first, second = (dict(_numbers("", side.runs[0].document.get("accuracy", {}))) for side in (base, other))
     for name, value in first.items():
         if name in second:
@@ -272,9 +272,10 @@ def _of_errors(base: Side, other: Side) -> Iterator[tuple[Figure, Difference]]:
 
 
 def exact_rows(base: Side, other: Side, key: str, unit: str) -> Rows:
-    """Return the numbers under `key` of the reports; empty where a report has none. They only scatter between runs.
+    """Return the differences of the numbers under `key` of the reports, without scatter within a run.
 
-    Lists and texts under `key`, such as the checked frames and their reference, must be the same in all reports.
+    Empty if a report has none, or if the reports differ in lists and texts under `key`, such as the checked frames.
+    `unit`: unit of the numbers.
     """
     sides = [[told.document.get(key) or {} for told in side.runs] for side in (base, other)]
     every = [found for side in sides for found in side]
@@ -305,17 +306,18 @@ def _numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
 
 
 class Noise(NamedTuple):
-    """The causes that make runs of one kind differ, apart from what their frames show.
+    """The differences between runs of one kind that their frames do not show.
 
-    Times on the host clock depend on what a process cannot see of itself. Its memory lies elsewhere, caches are warmer,
-    other programs use the cores, and other machines use what these cores share. (Mytkowicz et al., "Producing wrong
-    data without doing anything obviously wrong!", ASPLOS 2009; Kalibera & Jones, "Rigorous benchmarking in reasonable
-    time", ISMM 2013.) In virtual time there is no such thing. A held job is timed by the
-    clock alone. Counted instructions are the program's, whatever the machine does.
+    Times on the host clock depend on facts that a process cannot see: the place of its memory, the state of caches,
+    other programs on its cores, and other machines that share the hardware. (Mytkowicz et al., "Producing wrong data
+    without doing anything obviously wrong!", ASPLOS 2009; Kalibera & Jones, "Rigorous benchmarking in reasonable time",
+    ISMM 2013.) In virtual time there is no such noise. Only the clock decides how long a held job lasts. Counted
+    instructions hardly depend on the machine.
 
-    `is_real`: whether a run was on the host clock. `others`: change that other programs explain by their larger share
-    of the cores: of times on the clock, of a stage's time on its core, and of shares of the time. `slower`: per stage,
-    change that its cores' own speed explains. `held`: stages whose jobs last as long as they were told to, in all runs.
+    `is_real`: whether a run was on the host clock. `others`: changes that the different share of other programs
+    explains: of times on the clock, of a stage's time on its core (logarithms), and of shares of the time. `slower`:
+    change that the speed of its cores explains, by stage, as a logarithm. `held`: stages whose jobs have a set length
+    in all runs.
     """
 
     is_real: bool
@@ -324,26 +326,26 @@ class Noise(NamedTuple):
     held: frozenset[str] = frozenset()
 
     def of_time(self, statistic: str = "mean") -> Chance:
-        """Return the chance of times on the clock. The cores' own speed excuses none of it; only stages show that."""
+        """Return the `Chance` of times on the clock. The speed of the cores explains no change: only stages show it."""
         return self._chance(TAILS.get(statistic, 1.0) * WALL_DEVIATION, explained=self.others[0])
 
     def of_wait(self, statistic: str) -> Chance:
-        """Return the chance of a wait in ms, which may be almost 0; no known cause explains its growth."""
+        """Return the `Chance` of a wait in ms, which may be almost 0. No change is explained."""
         return self._chance(TAILS.get(statistic, 1.0) * (WALL_DEVIATION + self.others[0]), WAIT_FLOOR_MS)
 
     def of_share(self) -> Chance:
-        """Return the chance of shares of the time."""
+        """Return the `Chance` of shares of the time."""
         return self._chance(0.0, SHARE_DEVIATION, explained=self.others[2])
 
     def of_work(self, stage: str, statistic: str) -> Chance:
-        """Return the chance of a stage's time on its core."""
+        """Return the `Chance` of a stage's time on its core. `statistic`: as in `MEASURES`."""
         tail = TAILS.get(statistic, 1.0)
         if stage in self.held:
             return self._chance(tail * HELD_DEVIATION)
         return self._chance(tail * WORK_DEVIATION, explained=max(self.others[1], self.slower.get(stage, 0.0)))
 
     def of_count(self) -> Chance:
-        """Return the chance of counted instructions."""
+        """Return the `Chance` of counted instructions."""
         return self._chance(COUNT_DEVIATION)
 
     def _chance(self, relative: float, absolute: float = 0.0, explained: float = 0.0) -> Chance:
@@ -353,8 +355,8 @@ class Noise(NamedTuple):
 def noise_between(base: Documents, other: Documents, effects: Mapping[str, float]) -> Noise:
     """Return the noise between the runs of two sides.
 
-    `base`, `other`: reports of their runs, as JSON. `effects`: per stage, the logarithm of the ratio of its typical
-    times on its core.
+    `base`, `other`: reports of their runs, as JSON. `effects`: logarithm of the ratio of the typical times on the core,
+    by stage.
     """
     runs = [*base, *other]
     if all(run["clock"] != HOST_CLOCK for run in runs):
@@ -368,10 +370,10 @@ def noise_between(base: Documents, other: Documents, effects: Mapping[str, float
 
 
 def relief_of(base: Side, other: Side) -> float:
-    """Return how times on the clock change when other programs' share is taken out, as a logarithm.
+    """Return the largest change that other programs explain in the ratio of times, other to base, as a logarithm.
 
-    The change is below 0 where other programs had more of the cores in `other`. Without them, frames would take at most
-    that much less time.
+    The result is negative if other programs had more of the cores in `other`: without them, frames would take less
+    time, at most by this factor.
     """
     sides = [[told.document for told in side.runs if told.document["clock"] == HOST_CLOCK] for side in (base, other)]
     return _wall(*map(_others, sides)) if all(sides) else 0.0
@@ -386,10 +388,7 @@ def _wall(base: Sequence[float], other: Sequence[float]) -> float:
 
 
 def _left(others: float) -> float:
-    """Return the logarithm of the share of the cores that other programs left.
-
-    On full cores, frames take longer by this factor.
-    """
+    """Return log(1 - others): the logarithm of the share of the cores that other programs left to the run."""
     return log1p(-min(others, 1 - LEAST_LEFT))
 
 
@@ -398,10 +397,10 @@ def _held(report: Mapping[str, Any]) -> frozenset[str]:
 
 
 def _slower_cores(base: Mapping[str, Any], other: Mapping[str, Any], effects: Mapping[str, float]) -> dict[str, float]:
-    """Return for each stage the change that the speed of its cores explains, as a logarithm.
+    """Return, by stage, the change that the speed of its cores explains, as a logarithm.
 
-    It is the smallest change of all stages on these cores, if all changed in one direction. Causes are another machine
-    beside this one, its clock, or its temperature. A single stage on its cores shows nothing about them.
+    It is the smallest change of all stages on these cores, if all changed in one direction. The causes may be the
+    clock, the temperature, or another machine on the same hardware. A single stage on its cores shows nothing.
     """
     if any(not change.key.startswith(SAME_CORES) for change in changes(base, other)):
         return {}
@@ -421,7 +420,7 @@ def _stages_by_cores(report: Mapping[str, Any]) -> Iterable[list[str]]:
 
 
 def remarks(reports: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return remarks on the machine."""
+    """Return remarks on other programs' share of the cores. `reports`: name of a run -> its report as JSON."""
     said = []
     for name, report in reports.items():
         others = report.get("other_programs")

@@ -23,12 +23,12 @@ from trilane.pipeline.unit_history import BUSY, IDLE_CAUSES, JOIN, OVERHEAD, PRE
 from trilane.scheduler.ledger import JobRecord
 from trilane.units import NS_PER_MS
 
-STATES = (BUSY, *IDLE_CAUSES)  # and JOIN where branches meet
+STATES = (BUSY, *IDLE_CAUSES)  # and JOIN, for a unit with a stage of several inputs
 INSTRUCTIONS, INSTRUCTION_TIME, CPU = "instructions", "time of an instruction", "CPU time"
-#: Figures of jobs that stages report or the processor counts -> their measures here.
+#: Metric of a stage in the journal -> measure of a series.
 REPORTED = {f"bytes_{name}": f"bytes {name.replace('_', ' ')}" for name in ("read", "written", "uploaded", "read_back")}
 REPORTED["instructions"] = INSTRUCTIONS
-#: Frames that may still be in flight when the first kept one begins.
+#: Number of further frames that are kept, because they may be in flight when the first compared frame begins.
 IN_FLIGHT = 100
 
 
@@ -44,9 +44,9 @@ class Key(NamedTuple):
 class RunFrames:
     """The frames of a run as series.
 
-    `begun`: first record of the journal. `series`: series by subject, times in ms. `ended`: last record; None where the
-    run did not end by itself. `presented`: presented frames of the whole run. `counted`: lost and dropped frames; None
-    where there are none.
+    `begun`: first record of the journal. `series`: series by subject, times in ms. `ended`: last record; None if the
+    journal has no end. `presented`: number of presented frames of the whole run. `counted`: lost and dropped frames;
+    None if there are none.
     """
 
     begun: Begun
@@ -62,7 +62,7 @@ class RunFrames:
 
 
 def read_frames(path: Path) -> RunFrames:
-    """Read the frames of the journal at `path`. Raises BadInputError for another file, or one that ends too early."""
+    """Read the frames of the journal at `path`. Raises BadInputError for no journal, or for less than two frames."""
     frames = frames_of(read_journal(path))
     if frames is None:
         raise BadInputError(path, "fewer than two presented frames", "two or more", "run more frames")
@@ -70,7 +70,7 @@ def read_frames(path: Path) -> RunFrames:
 
 
 def frames_of(records: Iterable[Record]) -> RunFrames | None:
-    """Return the frames of a journal's `records`; None where fewer than two were presented."""
+    """Return the frames of a journal's `records`; None if fewer than two were presented."""
     story = _Story()
     for record in records:
         story.add(record)
@@ -91,7 +91,7 @@ def frames_of(records: Iterable[Record]) -> RunFrames | None:
 
 
 class _Story:
-    """The facts gathered from the records of a journal."""
+    """Gathers facts from the records of a journal. Of a long run, only the last frames are kept."""
 
     def __init__(self) -> None:
         self.jobs: list[JobRecord] = []
@@ -134,7 +134,7 @@ class _Story:
                 self.figures[Key(REPORTED[name], record.job.stage)].append((record.job.frame, value))
 
     def _forget(self, first: JobRecord) -> None:
-        """Forget what was before the job `first`, so that a run of days keeps no more than its last frames."""
+        """Forget everything before the job `first`, so that memory does not grow with the run."""
         self.jobs = self.jobs[self.jobs.index(first) :]
         oldest = min(job.frame for job in self.jobs)
         self._idle = [piece for piece in self._idle if piece.end_ns >= first.begin_ns]
@@ -148,9 +148,9 @@ def _plain(frames: I64, ns: I64) -> Series:
 
 
 def _stage(name: str, jobs: Sequence[JobRecord]) -> dict[Key, Series]:
-    """Return the times of a stage's jobs: `work` on the core, `service` with time off it, `wait` for the unit.
+    """Return times of a stage's jobs, by subject: `work` on the core, `service` from begin to end, `wait` before begin.
 
-    The CPU time of all threads is there too, unless the journal is older than it.
+    The CPU time of all threads is added if the journal has it.
     """
     frames = np.array([job.frame for job in jobs], np.int64)
     service = np.array([job.end_ns - job.begin_ns for job in jobs], np.int64)
@@ -168,7 +168,11 @@ def _stage(name: str, jobs: Sequence[JobRecord]) -> dict[Key, Series]:
 def _unit(
     unit: str, jobs: Sequence[JobRecord], idle: Sequence[IdleSlice], frames: I64, end_ns: I64
 ) -> dict[Key, Series]:
-    """Return busy and idle time of a unit within each frame's own time, by cause, as shares of that time."""
+    """Return the busy time, and the idle time by cause, of a unit in the frame time of each presented frame.
+
+    The series hold shares: values and weights in ms. `frames` (n,): numbers of the presented frames. `end_ns` (n,):
+    times of presentation.
+    """
     pieces: list[tuple[int, int, dict[str, int]]] = []
     for job in jobs:
         busy = job.end_ns - job.begin_ns - job.preempted_ns - job.asleep_ns
@@ -191,9 +195,9 @@ def _unit(
 
 
 def _within(pieces: Sequence[tuple[int, int, Mapping[str, int]]], state: str, edges_ns: I64) -> F64:
-    """Return the ms of `state` between neighbouring edges, (edges - 1,).
+    """Return the ms of `state` between neighbouring edges, (edges - 1,) float64.
 
-    The time of `state` in a piece counts as spread evenly over the piece.
+    `pieces`: begin, end, and ns by state. The time of a state in a piece counts as spread evenly over the piece.
     """
     places, totals, total = [0.0], [0.0], 0
     for begin_ns, end_ns, states in pieces:
@@ -205,7 +209,7 @@ def _within(pieces: Sequence[tuple[int, int, Mapping[str, int]]], state: str, ed
 
 
 def _figures(figures: Mapping[Key, Sequence[tuple[int, float]]]) -> dict[Key, Series]:
-    """Return the figures that stages gave of their jobs."""
+    """Return the metrics of stages as series. `figures`: (frame, value) of each job, by subject."""
     return {
         key: Series(
             np.array([frame for frame, _ in rows], np.int64), np.array([v for _, v in rows]), np.ones(len(rows))
@@ -215,7 +219,7 @@ def _figures(figures: Mapping[Key, Sequence[tuple[int, float]]]) -> dict[Key, Se
 
 
 def _instruction_times(series: Mapping[Key, Series]) -> dict[Key, Series]:
-    """Return the time on the core per instruction, ns, for each stage whose instructions were counted."""
+    """Return the series of time on the core per instruction, ns, for each stage with counted instructions."""
     found = {}
     for key, counted in series.items():
         if key.measure == INSTRUCTIONS:

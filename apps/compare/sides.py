@@ -1,11 +1,11 @@
 """The runs to compare, read from disk: run folders, reports, predictions and imported times, with their settings.
 
-Rule: what cannot be compared is refused by name. A run folder with a journal has every frame; a report alone, or a
+Rule: an error names what cannot be compared. A run folder with a journal has every frame; a report alone, or a
 prediction, has summaries. A run that was killed has no report: its journal gives the keys that a comparison reads, and
-`NOT_KNOWN` names those that the journal lacks.
+`NOT_KNOWN` names the missing keys.
 
-Each imported time is compared with the imported time, or the stage of a run, that has the same name. A single wall time
-stands for the frame time. Nobody knows the machine's state, so two imported times scatter as any two runs on the host
+An imported time is compared with the imported time, or the stage of a run, of the same name. A single wall time
+is used as the frame time. The machine's state is not known, so two imported times scatter like any two runs on the host
 clock.
 """
 
@@ -41,7 +41,7 @@ EXPECTED: Final = (
 )
 #: Keys that a prediction of the application has and a report lacks.
 OF_A_PREDICTION: Final = ("expected_error", "network", "frame_time_ms", "units", "stages")
-#: Facts of the first record that a report has too.
+#: Facts in the first record of a journal that a report has too.
 FACTS: Final = ("config", "machine", "made", "accuracy")
 #: Parts of a report that say how the run was made.
 PARTS: Final = (
@@ -55,16 +55,16 @@ PARTS: Final = (
     "made",
     "idle_cores",
 )
-#: Keys that a report has both at its top and in `config`, and a prediction in `config` alone.
+#: Keys that a report has both at its top and in `config`, and that a prediction has only in `config`.
 TWICE: Final = ("policy", "edge")
-#: Key of a document that lists the parts nobody knows; whether these have changed cannot be told.
+#: Key of a document with its unknown `PARTS`. Changes of these are not listed.
 NOT_KNOWN: Final = "not_known"
 #: Keys that differ between any two runs.
 ALWAYS_DIFFERENT: Final = ("made.at", "made.command")
 
 
 class RunKind(StrEnum):
-    """The known data of a run.
+    """How much is known of a run.
 
     RUN: every frame; REPORT: summaries; PREDICTION: summaries that a model computed; TIMES: imported measurements.
     """
@@ -80,7 +80,7 @@ class ComparedRun:
     """One run of a side.
 
     `name`: name as the user gave it. `document`: JSON with the keys of a report. `frames`: frames of a run with a
-    journal. `remark`: what a person should know of a run without a report.
+    journal. `remark`: remark for the user on a run without a report.
     """
 
     name: str
@@ -99,9 +99,9 @@ class Side:
 
 
 def read_side(text: str) -> Side:
-    """Read the runs of a side. `text`: a path, or several joined by commas.
+    """Read the runs of a side. `text`: a path, or several paths joined by commas.
 
-    Raises BadInputError, also for a run that is named twice.
+    Raises BadInputError, also if a run is named twice.
     """
     names = [text] if text.strip() and _is_there(text) else text.split(",")
     for name in names:
@@ -118,9 +118,9 @@ def read_side(text: str) -> Side:
 
 
 def read_told(name: str) -> ComparedRun:
-    """Read the run at the path `name`, or the run of this name that `trilane watch` finds.
+    """Read the run, report, prediction or imported times at the path `name`, or the run that `trilane watch` finds.
 
-    Raises BadInputError naming what is missing, cut off or of another schema.
+    Raises BadInputError for a file that is missing, cut off or of another schema.
     """
     try:
         path = folder_of(Path(name)) or Path(name)
@@ -189,12 +189,12 @@ def _document(path: Path) -> Mapping[str, Any]:
 
 
 def _journal_document(frames: RunFrames, path: Path) -> dict[str, Any]:
-    """Return the facts of a run from its journal alone, under the report's keys that a comparison reads.
+    """Return those keys of a report that a comparison reads, from a run's journal alone.
 
-    Settings come from the first record, and figures from the frames. If the run has ended, the rest comes from its last
-    record; else the rest is what bounded the run until then.
+    Settings come from the first record, and figures from the frames. If the run has ended, its last record gives all
+    other keys; otherwise only the bound and the efficiency so far are known.
 
-    `frames`: frames of the journal at `path`. Raises BadInputError for facts that no run has.
+    `frames`: frames of the journal at `path`. Raises BadInputError for facts of a wrong form.
     """
     facts = from_json(to_json(dict(frames.begun.facts)))
     for name in FACTS:
@@ -227,7 +227,7 @@ def _journal_document(frames: RunFrames, path: Path) -> dict[str, Any]:
 
 
 def _at_the_end(frames: RunFrames, path: Path) -> dict[str, Any]:
-    """Return what the last record says of the whole run; without one, what bounded it and how full its cores were."""
+    """Return the last record's figures of the whole run; without a last record, the bound and efficiencies so far."""
     if frames.ended is None:
         begun, records = frames.begun, read_journal(path)
         return dict(reckoned(begun.graph, begun.settings, places_of(begun), records).figures)
@@ -240,7 +240,7 @@ def _at_the_end(frames: RunFrames, path: Path) -> dict[str, Any]:
 
 
 def _counts(frames: RunFrames) -> dict[str, Any]:
-    """Return the numbers of frames; `requested` are those asked for until now, without the frames in flight."""
+    """Return the numbers of frames so far. `requested` is their sum; frames in flight do not count."""
     lost = dict(frames.counted.lost) if frames.counted else {}
     dropped = dict(frames.counted.dropped) if frames.counted else {}
     asked = frames.presented + sum(lost.values()) + sum(dropped.values())
@@ -266,7 +266,7 @@ def _unit(frames: RunFrames, unit: str, config: Mapping[str, Any]) -> dict[str, 
 
 
 class Change(NamedTuple):
-    """A dotted key with its value in the base and in the other run; None where a run lacks the key."""
+    """A dotted key with its values in the base and in the other run; None if a run lacks the key."""
 
     key: str
     base: Any
@@ -274,7 +274,7 @@ class Change(NamedTuple):
 
 
 def changes(base: Mapping[str, Any], other: Mapping[str, Any]) -> list[Change]:
-    """Return every setting and fact of the machine that differs between two runs. `base`, `other`: reports as JSON."""
+    """Return the settings and facts of the machine that differ between two runs. `base`, `other`: reports as JSON."""
     first, second = _settings(base), _settings(other)
     found = dict.fromkeys([*first, *second])
     known = [part for part in PARTS if part not in (*base.get(NOT_KNOWN, ()), *other.get(NOT_KNOWN, ()))]
@@ -311,18 +311,18 @@ def _flat(name: str, value: Any) -> Iterator[tuple[str, Any]]:
 MEASUREMENTS: Final = "measurements"
 EXPECTED_TIMES: Final = "imported times: JSON with `measurements`, each with `name`, `kind` and `mean_ms`"
 WALL: Final = "wall"
-#: Unit that imported stages stand on; nothing is known of it.
+#: Name of the unknown unit of imported stages.
 UNIT: Final = "imported"
-#: Longest and shortest time that can be one, in ms: an hour, and a millionth of a nanosecond.
+#: Longest and shortest plausible time, ms: an hour, and a millionth of a nanosecond.
 LONGEST_MS, SHORTEST_MS = 3.6e6, 1e-12
 Ms = Annotated[float, Field(ge=0, le=LONGEST_MS)]
 
 
 class ImportedTime(BaseModel):
-    """One imported time, which is the time of a job of the stage with its name.
+    """An imported time: the time of a job of the stage `name`.
 
-    `kind`: such as `run`, `layer` or `wall`. `count`, `sd_ms`: number and standard deviation of the values.
-    `samples_ms`: every value, where the file has it. `file`: file that it was read from.
+    `kind`: such as `run`, `layer` or `wall`. `count`, `sd_ms`: number and standard deviation of the single times.
+    `samples_ms`: the single times, if the file has them. `file`: file of the measurement.
     """
 
     model_config = ConfigDict(extra="ignore", frozen=True)
@@ -338,19 +338,22 @@ class ImportedTime(BaseModel):
 
     @property
     def ms(self) -> float:
-        """The mean, else the median; 0 for a measurement in another unit, such as cycles."""
+        """The mean or, without one, the median; 0 for a measurement in another unit, such as cycles."""
         return self.mean_ms or self.p50_ms or 0.0
 
     @property
     def error(self) -> float | None:
-        """Standard error of the mean as a share of it; None where nothing shows it."""
+        """The standard error of the mean, as a share of the mean; None if it is unknown."""
         count = len(self.samples_ms) or self.count or 0
         deviation = stdev(self.samples_ms) if len(self.samples_ms) > 1 else self.sd_ms
         return None if deviation is None or count < 2 else deviation / sqrt(count) / self.ms
 
 
 def imported(document: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Return the keys of a report that a comparison reads. Raises BadInputError naming the first wrong key."""
+    """Return those keys of a report that a comparison reads, from a `document` of imported times.
+
+    `path`: its file. Raises BadInputError, which names the first wrong key.
+    """
     rows = [_imported_time(row, f"{path}: {MEASUREMENTS}.{place}") for place, row in enumerate(document[MEASUREMENTS])]
     rows = [row for row in rows if row.ms >= SHORTEST_MS]
     if not rows:
@@ -373,7 +376,7 @@ def imported(document: Mapping[str, Any], path: Path) -> dict[str, Any]:
         "machine": {},
         "frame_time_ms": _imported_statistics(frames) if frames else {},
         "latency_ms": {},
-        # Of every figure: the largest standard error that is known.
+        # Taken for every figure: the largest known standard error.
         "deviation": max((error for row in rows if (error := row.error) is not None), default=None),
     }
 
@@ -388,14 +391,14 @@ def _imported_time(row: Any, where: str) -> ImportedTime:
 
 
 def _told_apart(rows: Sequence[ImportedTime]) -> list[ImportedTime]:
-    """Return the measurements, with its kind in the name of each whose name another kind has too."""
+    """Return the measurements. Where several have the same name, each gets its kind added to the name."""
     counts = Counter(row.name for row in rows)
     longer = [row.model_copy(update={"name": f"{row.name} ({row.kind})"}) for row in rows]
     return [long if counts[row.name] > 1 else row for row, long in zip(rows, longer, strict=True)]
 
 
 def _frames(rows: Sequence[ImportedTime]) -> ImportedTime | None:
-    """Return the measurement that stands for a frame: the only wall time."""
+    """Return the measurement that is used as the frame time: the wall time; None for no or several wall times."""
     found = [row for row in rows if row.kind == WALL]
     return found[0] if len(found) == 1 else None
 

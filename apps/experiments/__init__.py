@@ -1,4 +1,4 @@
-"""Experiments over runs and networks: accuracy, hard cases.
+"""Experiments with runs and networks: image error, flicker, hard cases, the accuracy of predictions.
 
-It may use every lower folder, but neither apps/cli/ nor apps/dashboard/.
+This folder may import from every lower folder, but neither from apps/cli/ nor from apps/dashboard/.
 """

@@ -1,10 +1,10 @@
-"""How far is a run's picture from the reference, and which cause costs how much?
+"""How far is a run's picture from the reference, and how much does each cause contribute?
 
-Rule: causes are counted in two ways, and each way states its remainder. Alone: each cause acts in the reference, with
-only the causes that it needs; the sum may differ from the whole. In order: each cause joins those before it, so the
-picture changes in steps from the reference to the run. The steps' differences of MAE and of mean squares, and the
-products of each step with the whole, each sum to the whole, up to float64's rounding. Figures cover the region with the
-avatars.
+Rule: causes are counted in two ways, and each way states its remainder. Alone: each cause is switched on in the
+reference, with only the causes that it needs; the errors may not sum to the whole error. In order: causes are switched
+on one after the other, so the picture changes in steps from the reference to the run. Three figures of the steps sum to
+the whole error, up to float64's rounding: differences of MAE, differences of mean squares, and products of a step with
+the whole difference. Figures cover the region with the avatars.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ from trilane.units import MEASURED
 from trilane.writing import write_bytes
 
 STEPS = 255
-#: Names of pairs of a picture and its reference, besides the causes.
-WHOLE, REMAINDER = "whole", "remainder"
+#: Name of the heat map of the run against the reference.
+WHOLE = "whole"
 Frames = Callable[[Sequence[int]], Iterable[int]]
 #: The bar's colours from no difference to the largest: black, violet, red, orange, pale yellow.
 COLOURS = np.array([(0, 0, 4), (87, 16, 110), (188, 55, 84), (249, 142, 9), (252, 255, 164)], np.float64)
 LARGEST_FACTOR = 1024
-#: Share of the pixels that has to fit on the bar.
+#: Share of the pixels whose differences must lie within the bar's range.
 ON_THE_BAR = 0.999
-#: Least pixels of a panel's longer side; smaller panels are enlarged by a whole number.
+#: Least length of a panel's longer side, pixels. A smaller panel is enlarged by a whole factor.
 LEAST_SIDE_PX = 320
 BORDER_PX, LINE_PX, BAR_PX, FONT_PX, SCALE_WIDTH_PX = 8, 18, 16, 13, 56
 
@@ -63,13 +63,14 @@ def error_by_cause(
 ) -> dict[str, Any]:
     """Return the error of `frames` frames, evenly spread over the scene in `checked`, split by cause.
 
-    `out`: folder for heat maps; None for none. `shown`: passes the frames' numbers on, such as a progress bar. `lpips`:
-    computes LPIPS; None leaves it out.
-    Keys: `causes`, with a row for each cause; `whole`; `sums`; `remainder`, the difference of the run's own frames from
-    the sequence's end; `truth`; `frames`; `empty_frames` (nobody in view); `network`; `sources`; `config`. Each row has
-    `cause`, `what` and `needs`. `alone` and `step` compare with the picture without the cause, in the reference and in
-    the sequence. `so_far` compares with the reference. `adds` has `mae`, `square` and `product`. Causes of the body
-    also have `moved`.
+    `out`: folder for heat maps; None for no maps. `shown`: iterates over the frames' numbers, such as a progress bar.
+    `lpips`: computes LPIPS; None leaves it out.
+    Keys: `causes`, with a row for each cause; `whole`, the frame with all causes against the reference; `sums` of the
+    rows; `remainder`, the run's own frame against the frame with all causes; `truth`, both against the ground truth;
+    `frames`; `empty_frames` (nobody in view); `network`; `sources`; `config`.
+    A row has `cause`, `what`, `needs`; `alone` and `step`, the picture with the cause against the picture without it,
+    in the reference and in order; `so_far`, the step's picture against the reference; `adds`, the step's `mae`,
+    `square` and `product`; `moved`, for causes of the body.
     Raises BadInputError, MissingPartError.
     """
     numbers = spread(checked.config.scene.frames, frames)
@@ -99,7 +100,7 @@ def error_by_cause(
 
 
 def _truth(path: ReferencePath) -> Any:
-    """Return the clothed bodies of the scene, where they are known; else None."""
+    """Return the pictures of the scene's clothed bodies, which are the ground truth; None if these are unknown."""
     from trilane.bench.lib.full_picture import true_pictures
 
     return true_pictures(path.cast, path.gl)
@@ -107,7 +108,7 @@ def _truth(path: ReferencePath) -> Any:
 
 @dataclass
 class _Pooled:
-    """Figures of pairs of pictures: MAE and mean square over all pixels, all others as means over the frames."""
+    """Figures of all frames together: MAE and mean square over all pixels, other figures as means over the frames."""
 
     lpips: Perceived | None = None
     values: int = 0
@@ -124,12 +125,12 @@ class _Pooled:
 
     @property
     def mae(self) -> float:
-        """Mean absolute error, in steps of 1/255."""
+        """The mean absolute error, in steps of 1/255."""
         return STEPS * self.absolute / self.values if self.values else 0.0
 
     @property
     def mean_square(self) -> float:
-        """Mean square error, in squares of steps of 1/255."""
+        """The mean square error, in squares of steps of 1/255."""
         return STEPS**2 * self.square / self.values if self.values else 0.0
 
     def as_json(self) -> dict[str, float | None]:
@@ -139,7 +140,7 @@ class _Pooled:
 
 @dataclass
 class _Moved:
-    """How far a cause moves the vertices of the avatars that are seen."""
+    """How far a cause moves the vertices of visible avatars."""
 
     largest_mm: float = 0.0
     largest_px: float = 0.0
@@ -161,7 +162,7 @@ class _Moved:
 
 
 def _pixels(vertices: F64, clip: F64, output: Shape) -> tuple[F64, Any]:
-    """Return the place of each of `vertices` (V,3) on the picture, (V,2) pixels, and whether it is inside, (V,)."""
+    """Return the places of `vertices` (V,3) in the picture, (V,2) pixels from its middle, and which are inside (V,)."""
     x, y, _, w = (np.c_[vertices, np.ones(len(vertices))] @ clip.T).T
     in_front = w > 0
     place = np.stack([x, y], axis=1) / np.where(in_front, w, 1.0)[:, None]
@@ -169,7 +170,7 @@ def _pixels(vertices: F64, clip: F64, output: Shape) -> tuple[F64, Any]:
 
 
 class _Split:
-    """The counts of the added frames, by cause."""
+    """The figures of the added frames, by cause. `out`: folder for heat maps, or None."""
 
     def __init__(self, output: Shape, out: Path | None, lpips: Perceived | None = None) -> None:
         self._output, self._out = output, out
@@ -180,7 +181,7 @@ class _Split:
         self._truth = {"reference": _Pooled(lpips), "run": _Pooled(lpips)}
 
     def add(self, moment: ReferenceMoment) -> None:
-        """Count a frame in which somebody is seen."""
+        """Count a frame with a visible avatar."""
         box = region(moment.boxes, self._output)
         reference = _cut(moment.frame(NOTHING), box)
         end = _cut(moment.frame(frozenset(Cause)), box)
@@ -204,7 +205,7 @@ class _Split:
         self._show(moment.number, WHOLE, own, reference)
 
     def add_truth(self, moment: ReferenceMoment, true: Sequence[RasterLayer]) -> None:
-        """Count a frame against its ground truth, which is laid over the frame's background."""
+        """Count a frame against its ground truth. `true`: layers of the truth, to be laid over the background."""
         box = region(moment.boxes, self._output)
         picture, cover = laid_over(moment.background, true)
         wanted = _cut(ReferenceFrame(moment.number, picture, cover >= HALF, moment.boxes), box)
@@ -214,7 +215,7 @@ class _Split:
             self._show(moment.number, f"{name} against truth", shown, wanted)
 
     def document(self) -> dict[str, Any]:
-        """Return the figures, under the keys of `error_by_cause`."""
+        """Return the figures, by keys of `error_by_cause`."""
         rows = [self._row(cause, before) for before, cause in zip([None, *Cause], Cause, strict=False)]
         last = list(Cause)[-1]
         whole = self._so_far[last]
@@ -259,7 +260,7 @@ class _Split:
 
 
 def _run(moment: ReferenceMoment) -> ReferenceFrame:
-    """Return the run's own frame; its mask is that of the sequence's end."""
+    """Return the run's own frame, with the mask of the frame with all causes."""
     return ReferenceFrame(moment.number, moment.own, moment.frame(frozenset(Cause)).mask, moment.boxes)
 
 
@@ -278,17 +279,17 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def write_heat_map(file: Path, title: str, picture: F64, reference: F64) -> None:
-    """Write `heat_map` as the PNG `file`. Raises BadInputError."""
+    """Write the `heat_map` of two pictures as the PNG `file`. Raises BadInputError."""
     content = io.BytesIO()
     Image.fromarray(heat_map(title, picture, reference)).save(content, "PNG")
     write_bytes(file, content.getvalue())
 
 
 def heat_map(title: str, picture: F64, reference: F64) -> U8:
-    """Return a heat map (h,w,3): picture, reference, their difference, and the bar of its colours.
+    """Return a sheet (h,w,3) with the picture, the reference, a heat map of their difference, and its colour bar.
 
-    The difference is the mean absolute difference of the colours, times a power of two that is written on the map.
-    Larger values than those of the bar have the bar's last colour. `picture`, `reference`: (h,w,3) sRGB in 0..1.
+    The map shows the mean absolute difference of the channels, times a power of two, which is written on the sheet.
+    Values beyond the bar have the bar's last colour. `picture`, `reference`: (h,w,3) sRGB in 0..1.
     """
     difference = np.abs(picture - reference).mean(axis=2)
     factor = shown_factor(difference)
@@ -311,9 +312,9 @@ def heat_map(title: str, picture: F64, reference: F64) -> U8:
 
 
 def shown_factor(difference: F64) -> int:
-    """Return the largest power of two that, times `difference` in 0..1, keeps nearly all of it at most 1.
+    """Return the largest power of two, 1 to `LARGEST_FACTOR`, that scales nearly all of `difference` to at most 1.
 
-    It is at most `LARGEST_FACTOR`, and 1 when nothing differs.
+    `difference` (h,w): values in 0..1. If all are 0, return 1.
     """
     most = float(np.quantile(difference, ON_THE_BAR))
     if most == 0.0:
@@ -322,14 +323,17 @@ def shown_factor(difference: F64) -> int:
 
 
 def coloured(values: F64) -> U8:
-    """Return the bar's colours (..., 3) of `values` in 0 to 1; larger values have the last."""
+    """Return the colours (..., 3) uint8 of `values` (...) in 0..1; larger values have the last colour."""
     place = np.clip(values, 0, 1) * (len(COLOURS) - 1)
     channels = [np.interp(place, np.arange(len(COLOURS)), COLOURS[:, channel]) for channel in range(3)]
     return np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
 
 
 def _draw_bar(sheet: Image.Image, draw: Any, place: tuple[int, int, int], most: float, font: Any) -> None:
-    """Draw the colour bar at `place` (left, top, height), with the values of its ends and its middle, of 255."""
+    """Draw the colour bar at `place` (left, top, height), with the values at its ends and its middle.
+
+    `most`: value at its upper end, in steps of 1/255.
+    """
     left, top, height = place
     bar = coloured(np.linspace(1, 0, height))[:, None].repeat(BAR_PX, axis=1)
     sheet.paste(Image.fromarray(bar), (left, top))

@@ -1,8 +1,8 @@
 """What does a speed cost in image error, for each size of tensor on each runtime?
 
-Rule: all rows use the same moments and the same part of the picture, where the avatars are. The pictures are made
-first, as a warm-up. After that, the rows take turns, one job at a time, over the frames in the scene's order. With two
-frames or more, no frame follows itself. Time without a core does not count.
+Rule: all rows use the same frames and the same part of the picture, where the avatars are. The pictures are made
+first, as a warm-up. After that, each round times every frame, in the scene's order, on every row in turn. Time without
+a core does not count.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from trilane.stages.configure import Checked, configure
 from trilane.stages.run_options import RunOptions
 from trilane.units import MEASURED
 
-#: Jobs that an interval of 95 % needs: the median of n jobs lies between the least and the largest with 1 - 2 / 2^n.
+#: Number of jobs that a 95 % interval needs. The median lies between the extremes of n jobs with probability 1 - 2/2^n.
 LEAST_JOBS = 6
 
 
 @dataclass(frozen=True)
 class SizeRow:
-    """The results of one size on one runtime. `infer_ms`, `frame_ms`: times of the jobs. `errors`: one per frame."""
+    """The results of one size on one runtime. `infer_ms`, `frame_ms`: times of each timed frame. `errors`: by frame."""
 
     size: str
     runtime: str
@@ -41,13 +41,13 @@ class SizeRow:
     errors: list[ErrorFigures] = field(default_factory=list)
 
     def time(self, number: int) -> None:
-        """Make frame `number`, and keep its times."""
+        """Make frame `number`, and record its times."""
         _, times = self.pictures.frame(number)
         self.infer_ms.append(sum(ms for stage, ms in times.items() if stage.startswith("infer")))
         self.frame_ms.append(sum(times.values()))
 
     def as_json(self) -> dict[str, Any]:
-        """Return the row of `measure`."""
+        """Return the results as a row of `measure`."""
         low, high = median_interval(self.infer_ms) if len(self.infer_ms) >= LEAST_JOBS else (None, None)
         ssim = [error.ssim for error in self.errors if error.ssim is not None]
         return {
@@ -74,13 +74,13 @@ def measure(
 ) -> dict[str, Any]:
     """Image error and time of `frames` frames, evenly spread over the scene, by size of tensor and runtime.
 
-    Each frame is made once for its error, then `rounds` times for its times.
+    Each frame is made once for its error, then `rounds` times to measure times.
 
     Keys: `rows`: `size`, `runtime`, `threads`, `infer_ms` (median of timed jobs) with its 95 % interval `infer_low_ms`,
-    `infer_high_ms` (null of fewer than 6 jobs), `frame_ms` (median sum of all stages but present), and the error where
-    the avatars are: `psnr_db`, `mae` (steps of 1/255), `ssim`, `flip`, means over the frames, `worst_psnr_db` and
-    `p1_psnr_db`, the 1st percentile; `against`: what they are compared with; `frames`; `empty_frames`: with nobody in
-    view, not counted; `sources`; `config`.
+    `infer_high_ms` (null for fewer than 6 jobs), `frame_ms` (median time of all stages except present). Errors cover
+    the part of the picture with avatars: means over the frames `psnr_db`, `mae` (steps of 1/255), `ssim`, `flip`; the
+    worst frame `worst_psnr_db`; the 1st percentile `p1_psnr_db`. Other keys: `against`: name of the reference;
+    `frames`; `empty_frames`: frames with nobody in view, which do not count; `sources`; `config`.
 
     Raises BadInputError, MissingPartError.
     """
@@ -120,7 +120,7 @@ def measure(
 
 
 def refuse_twice(option: str, values: Sequence[str]) -> None:
-    """Raise BadInputError unless there are `values`, each once."""
+    """Raise BadInputError if there are no `values`, or if a value occurs twice."""
     if not values or len(set(values)) < len(values):
         raise BadInputError(option, ", ".join(values) or "none", "one or more, each once")
 

@@ -1,8 +1,8 @@
-"""How restless is the error of successive frames, which a person sees as flicker?
+"""How much does the error change between successive frames? A person sees this change as flicker.
 
 Rule: flicker of a pair of frames is the mean change of the error, |(P_t - G_t) - (P_t-1 - G_t-1)|, with P the picture
-and G what it should be. Therefore neither the motion of the scene nor an error that stays in place is flicker. An error
-that moves with a surface counts where it passes over a pixel, because surfaces are not followed.
+and G its reference. Therefore neither the motion of the scene nor an error that stays in place is flicker. An error
+that moves with a surface counts, because surfaces are not followed.
 """
 
 from __future__ import annotations
@@ -39,19 +39,19 @@ def flicker(before: F64, now: F64) -> float:
 
 
 class FlickerRow:
-    """The results of one way to make pictures. `changes`: flicker of each pair of frames."""
+    """The results of one variant. `pictures`: makes its pictures. `changes`: flicker of each pair of frames."""
 
     def __init__(self, runtime: str, calibration: str, texture_filter: str, pictures: ScenePictures) -> None:
         self.pictures = pictures
         self.changes: list[float] = []
-        self._way = {"runtime": runtime, "calibration": calibration, "texture_filter": texture_filter}
+        self._variant = {"runtime": runtime, "calibration": calibration, "texture_filter": texture_filter}
         self._before: F64 | None = None
         self._errors: list[float] = []
 
     def add(self, error: F64, part: tuple[slice, slice]) -> None:
         """Count the next frame.
 
-        `error`: its error (h,w,3). `part`: where avatars of it and of the last frame are.
+        `error` (h,w,3): picture minus reference. `part`: rows and columns with the avatars of this and the last frame.
         """
         if self._before is not None:
             self.changes.append(flicker(self._before[part], error[part]))
@@ -59,9 +59,9 @@ class FlickerRow:
         self._before = error
 
     def as_json(self) -> dict[str, Any]:
-        """Return the row of `measure`."""
+        """Return the variant's row of `measure`."""
         return {
-            **self._way,
+            **self._variant,
             "flicker": fmean(self.changes),
             "worst": max(self.changes),
             "worst_frame": 1 + self.changes.index(max(self.changes)),
@@ -79,10 +79,10 @@ def measure(
 ) -> dict[str, Any]:
     """The flicker of the first `frames` frames of a scene, by runtime, calibration and filter of the neural texture.
 
-    Keys: `rows`: `runtime`, `calibration`, `texture_filter`, `flicker` (mean over the pairs of frames), `worst` with
-    the later frame of its pair, `worst_frame`, and `mae` of the frames, all in steps of 1/255 where the avatars are;
-    `scene_change`: by how much what the frames should be changes there; `against`: what that is; `frames`; `sources`;
-    `config`.
+    Figures cover the part of the picture with avatars, in steps of 1/255. Keys: `rows`: `runtime`, `calibration`,
+    `texture_filter`, `flicker` (mean over the pairs of frames), `worst` (largest of a pair), `worst_frame` (the later
+    frame of that pair), `mae` (mean absolute error of the frames); `scene_change`: mean change of the reference between
+    frames; `against`: name of the reference; `frames`; `sources`; `config`.
 
     Raises BadInputError, MissingPartError.
     """
@@ -99,13 +99,13 @@ def measure(
     if not 2 <= frames <= shown.frames:
         raise BadInputError("--frames", str(frames), f"2 to {shown.frames}, the scene's frames")
     cast, made = Cast(first), Calibrations(first)
-    # Views to calibrate on are drawn in an OpenGL context of their own, before the stages have theirs.
-    ways = [
+    # Calibration views are drawn in an OpenGL context of their own, before the stages make theirs.
+    variants = [
         (engine, method, name, _filtered(made.changed(one, method), name))
         for (engine, one), method, name in product(checked.items(), calibration, texture_filter)
     ]
     rows: list[FlickerRow] = []
-    for engine, method, name, one in ways:
+    for engine, method, name, one in variants:
         rows.append(FlickerRow(engine, method, name, ScenePictures(one, rows[0].pictures.gpu if rows else None)))
     wanted, against = wanted_pictures(cast, rows[0].pictures.gl)
     numbers = list(range(frames))
@@ -131,7 +131,7 @@ def _filtered(checked: Checked, name: str) -> Checked:
 
 
 def _follow(cast: Cast, rows: Sequence[FlickerRow], wanted: Callable[[int, U8], U8], numbers: Iterable[int]) -> float:
-    """Count the frames `numbers` for each of `rows`, and return how much the scene itself changes, in 1/255."""
+    """Count the frames `numbers` for each of `rows`, and return the mean change of the reference, in steps of 1/255."""
     last: F64 | None = None
     boxes_before, changes = cast.boxes(0), []
     for number in numbers:

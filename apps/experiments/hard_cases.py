@@ -1,9 +1,10 @@
-"""How near an integer network's picture stays to the float network's on hard networks and inputs, on every runtime.
+"""Errors of integer networks against their float networks, for hard networks and inputs, on every runtime.
 
-Rule: a bound follows from network, input and steps, never from a runtime's picture. It is the smaller of two: that of
-the integer network itself (`noise_model`), and that of an ideal quantiser (`ideal_noise_model`). So coarse steps do not
-widen the bound of their error. A row also fails if a wrong picture would stay within its bound. Networks are seeded,
-untrained, and made so that a wrong picture shows. No input is constant, because a constant picture could then be right.
+Rule: a bound follows from network, input and quantisation steps, never from a runtime's picture. It is the smaller of
+two bounds: with the steps of the integer network (`noise_model`), and with the steps of an ideal quantiser
+(`ideal_noise_model`). Therefore coarse steps do not widen the bound on their own error. A row also fails if a wrong
+picture would stay within its bound. Networks are seeded, untrained, and made so that a wrong picture shows. No input is
+constant, because a constant picture could then be right.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import onnx
@@ -28,39 +29,36 @@ from trilane.training.quantising.noise_model import (
 )
 from trilane.training.quantising.quantise import Quantised, quantise
 
-if TYPE_CHECKING:
-    import onnx
-
-
 UNIT = "mean step of 1/255"
 SOURCE = "computed: the float network with the rounding errors of every stored tensor and weight (docs/networks.md)"
 OWN_STEPS, IDEAL_STEPS = "computed with the integer network's steps", "computed with ideal steps"
-#: Shift of a shifted picture, pixels.
+#: Shift of a wrong, shifted picture, pixels.
 SHIFT = 8
 HOLDS, EXCEEDED, UNTOLD = "holds", "FAILS: error above the bound", "FAILS: a wrong picture would keep the bound"
 SIDE, CHANNELS, WIDTH = 64, 4, 8
 OUTLIER = 100.0
-#: Factor of the input "saturating" over usual frames; the input's bytes end at about three.
+#: Factor of the input "saturating" over usual frames. Bytes of an input represent values up to about 3.
 EXCESS = 10.0
 CALIBRATION_FRAMES = 8
 CASE_SEED, NETWORK_SEED = 7, 0
 #: Semi-axes of the figure and the largest distance of its centre from the middle, as shares of the side.
 FIGURE_HEIGHT, FIGURE_WIDTH, OFF_CENTRE = 0.42, 0.25, 0.1
-#: Size of the figure in "little but background", as a share of the usual one's.
+#: Size of the figure in "little but background", as a share of the usual size.
 SMALL = 0.7
 #: Sides of the cells of smooth and of flat texture, in pixels.
 SMOOTH_CELL, FLAT_CELL = 8, 16
 #: Norm of a kernel's smooth part, and size of its random part.
 GAIN, RANDOM_PART = 2**0.5, 0.5
-#: Factor of deeper features, largest bias of a norm, standard deviation of logits.
+#: Factor on weights for features from deeper levels, largest bias of a norm, standard deviation of logits.
 DEEP, BIAS, CONTRAST = 0.25, 0.05, 1.5
-#: Network -> its norm, and whether one channel of the stem is a hundredfold.
+#: Name of a network -> its norm, and whether the weights of one channel of the stem are `OUTLIER` times as large.
 NETWORKS: dict[str, tuple[str, bool]] = {
     "batch": ("batch", False),
     "instance": ("instance", False),
     "group": ("group", False),
     "outlier channel": ("batch", True),
 }
+#: Name of an input -> function that draws it, (SIDE, SIDE, CHANNELS).
 INPUTS: dict[str, Callable[[np.random.Generator], F32]] = {
     "constant patches": lambda rng: _in_figure(rng, _flat),
     "little but background": lambda rng: _in_figure(rng, _smooth, SMALL),
@@ -71,7 +69,7 @@ INPUTS: dict[str, Callable[[np.random.Generator], F32]] = {
 
 @dataclass(frozen=True)
 class NetworkPair:
-    """A network in float, the same in integers, calibrated on usual frames, and the model of the integers' noise."""
+    """A float network, its integer network, calibrated on usual frames, and the noise model of the integer network."""
 
     network: onnx.ModelProto
     quantised: Quantised
@@ -82,9 +80,9 @@ class NetworkPair:
 class Case:
     """A network with an input, the expected picture, and the bound on a picture's error.
 
-    `tensor`: bytes (1, H, W, C). `wanted`: the float network's picture (1, H, W, 4), of 255. `predicted`, `bound`:
-    expected error and bound, with the steps of `source`, whose bound is the smaller one. `own_bound`: bound with the
-    integer network's steps. `wrong`: least error of each kind of wrong picture.
+    `tensor`: input bytes (1, H, W, C). `wanted`: the float network's picture (1, H, W, 4), in steps of 1/255.
+    `predicted`, `bound`: expected error and bound, by the model with the smaller bound, which `source` names.
+    `own_bound`: bound with the integer network's steps. `wrong`: least error of each kind of wrong picture.
     """
 
     pair: NetworkPair
@@ -98,25 +96,25 @@ class Case:
 
     @property
     def tells(self) -> bool:
-        """Whether every wrong picture is above the bound."""
+        """Whether the error of every wrong picture is above the bound."""
         return self.bound < min(self.wrong.values())
 
     def verdict(self, error: float) -> str:
-        """Return what a picture's `error` means; an error that is not a number is above the bound."""
+        """Return the verdict on a picture's `error`. NaN counts as above the bound."""
         if not self.tells:
             return UNTOLD
         return HOLDS if error <= self.bound else EXCEEDED
 
 
 def make_pair(name: str) -> NetworkPair:
-    """Return the pair of row `name` of `NETWORKS`. Raises MissingPartError without PyTorch."""
+    """Return the network `name` of `NETWORKS`, in float and in integers. Raises MissingPartError without PyTorch."""
     network = float_network(name)
     quantised = quantise(network, calibration_frames())
     return NetworkPair(network, quantised, noise_model(quantised))
 
 
 def make_case(pair: NetworkPair, case: str) -> Case:
-    """Return row `case` of `INPUTS` on the networks of `pair`."""
+    """Return the case of the networks `pair` with the input `case` of `INPUTS`."""
     encoding = pair.quantised.network.input
     steps = np.round(case_input(case) / encoding.scale) + encoding.zero_point
     tensor = np.ascontiguousarray(np.clip(steps, 0, 255).astype(np.uint8)[None])
@@ -128,7 +126,7 @@ def make_case(pair: NetworkPair, case: str) -> Case:
 
 
 def error_of(case: Case, runtime: str) -> float:
-    """Return the mean error of `runtime`'s picture in steps of 1/255; NaN when the float network gives no number."""
+    """Return the mean error of `runtime`'s picture in steps of 1/255; NaN if the float network's picture has NaN."""
     image = np.zeros(case.wanted.shape, np.uint8)
     session = load_runtime(runtime).load(case.pair.quantised.network, RuntimeOptions())
     session.bind([case.tensor], [image]).run()
@@ -136,10 +134,10 @@ def error_of(case: Case, runtime: str) -> float:
 
 
 def wrong_answers(wanted: F32) -> dict[str, float]:
-    """Return the least error of each kind of wrong picture against `wanted` (H, W, 4), of 255.
+    """Return the least error of each kind of wrong picture against `wanted` (H, W, 4), all in steps of 1/255.
 
-    `constant_error`: for the best picture of one colour, which is the median of each channel. `shifted_error`: for
-    `wanted` moved by `SHIFT` pixels, up, down, left or right, wrapped or with its edge repeated. `swapped_error`: for
+    `constant_error`: the best picture of one colour, which is the median of each channel. `shifted_error`: `wanted`
+    moved by `SHIFT` pixels up, down, left or right, wrapped or with its edge repeated. `swapped_error`: `wanted` with
     red and blue exchanged.
     """
     shifted = (
@@ -153,7 +151,7 @@ def wrong_answers(wanted: F32) -> dict[str, float]:
 
 
 def _moved(picture: F32, by: int, axis: int) -> Iterator[F32]:
-    """Yield `picture` moved along `axis`, first wrapped, then with its edge repeated."""
+    """Yield `picture` moved by `by` pixels along `axis`: first wrapped, then with its edge repeated."""
     places = np.arange(picture.shape[axis]) - by
     yield np.take(picture, places % len(places), axis)
     yield np.take(picture, np.clip(places, 0, len(places) - 1), axis)
@@ -162,8 +160,8 @@ def _moved(picture: F32, by: int, axis: int) -> Iterator[F32]:
 def hard_cases(runtimes: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Yield rows of every network, input and runtime. Raises MissingPartError.
 
-    Keys: `name`, `error`, `bound`, `unit`, `source` (of the bound), `predicted_error`, those of `wrong_answers`,
-    `verdict`, `passed`. `error` is None where it is not a number, which counts as above every bound.
+    Keys: `name`, `error`, `bound`, `unit`, `source` (of the bound), `predicted_error`, the keys of `wrong_answers`,
+    `verdict`, `passed`. An `error` that is not a finite number is None, and counts as above every bound.
     """
     for network in NETWORKS:
         pair = make_pair(network)
@@ -186,7 +184,10 @@ def hard_cases(runtimes: Sequence[str]) -> Iterator[dict[str, Any]]:
 
 
 def _smooth(rng: np.random.Generator) -> F32:
-    """Return a texture (SIDE, SIDE, CHANNELS), linear between normal values at the corners of cells."""
+    """Return a texture (SIDE, SIDE, CHANNELS) with normally distributed values at the corners of cells.
+
+    It is linear between the corners.
+    """
     cells = SIDE // SMOOTH_CELL
     corners = rng.normal(size=(cells + 1, cells + 1, CHANNELS))
     place = np.linspace(0, cells, SIDE)
@@ -198,14 +199,17 @@ def _smooth(rng: np.random.Generator) -> F32:
 
 
 def _flat(rng: np.random.Generator) -> F32:
-    """Return a texture (SIDE, SIDE, CHANNELS) with one normal value in each cell."""
+    """Return a texture (SIDE, SIDE, CHANNELS) with one normally distributed value in each cell and channel."""
     cells = SIDE // FLAT_CELL
     values = rng.normal(size=(cells, cells, CHANNELS)).astype(np.float32)
     return values.repeat(FLAT_CELL, axis=0).repeat(FLAT_CELL, axis=1)
 
 
 def _in_figure(rng: np.random.Generator, texture: Callable[[np.random.Generator], F32], size: float = 1.0) -> F32:
-    """Return `texture` inside an ellipse, 0 outside."""
+    """Return a frame (SIDE, SIDE, CHANNELS) with `texture` inside a randomly placed ellipse, 0 outside.
+
+    `size`: size of the ellipse, as a share of the usual size.
+    """
     row, column = np.mgrid[:SIDE, :SIDE] / SIDE - 0.5
     down, right = rng.uniform(-OFF_CENTRE, OFF_CENTRE, 2)
     inside = ((row - down) / FIGURE_HEIGHT) ** 2 + ((column - right) / FIGURE_WIDTH) ** 2 < size**2
@@ -214,20 +218,20 @@ def _in_figure(rng: np.random.Generator, texture: Callable[[np.random.Generator]
 
 
 def case_input(case: str) -> F32:
-    """Return the input (SIDE, SIDE, CHANNELS) of row `case` of `INPUTS`; it is no frame of the calibration."""
+    """Return the input `case` of `INPUTS`, (SIDE, SIDE, CHANNELS). It is not among the calibration frames."""
     return INPUTS[case](np.random.default_rng(CASE_SEED))
 
 
 def calibration_frames() -> list[F32]:
-    """Return usual frames, each (SIDE, SIDE, CHANNELS)."""
+    """Return `CALIBRATION_FRAMES` inputs of the kind "usual", each (SIDE, SIDE, CHANNELS)."""
     rng = np.random.default_rng(NETWORK_SEED)
     return [INPUTS["usual"](rng) for _ in range(CALIBRATION_FRAMES)]
 
 
 def float_network(name: str) -> onnx.ModelProto:
-    """Return the float network of row `name` of `NETWORKS`. Raises MissingPartError without PyTorch.
+    """Return the float network `name` of `NETWORKS`. Raises MissingPartError without PyTorch.
 
-    Kernels are partly smooth, and each level weakens what comes from deeper ones, as in trained networks, so that
+    As in trained networks, kernels are partly smooth, and each level weakens the features from deeper levels. Therefore
     rounding errors do not drown the picture. The heads give every colour its own mean and contrast.
     """
     try:
@@ -254,7 +258,10 @@ def float_network(name: str) -> onnx.ModelProto:
 
 
 def _draw(module: Any, generator: Any) -> None:
-    """Draw weights for a convolution or biases for a norm. A channel's weights add up to about 0 over its inputs."""
+    """Draw random weights for a convolution, or biases for a norm.
+
+    For each output channel, the weights sum to about 0 over the input channels.
+    """
     import torch
 
     if isinstance(module, torch.nn.Conv2d):
@@ -272,7 +279,7 @@ def _draw(module: Any, generator: Any) -> None:
 
 
 def _give_contrast(head: Any, features: Any) -> None:
-    """Scale the last layer of `head` so that on `features` its logits have deviation `CONTRAST` and means -1 to 1."""
+    """Scale the last layer of `head` so that its logits for `features` have deviation `CONTRAST` and means -1 to 1."""
     import torch
 
     logits = head(features)

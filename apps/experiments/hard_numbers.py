@@ -1,13 +1,13 @@
-"""Numbers that are hard to compute, each with a bound: all rows. Those of rotations are in `hard_rotations.py`.
+"""Numbers that are hard to compute, each with an error and a bound. Cases of rotations are in `hard_rotations.py`.
 
 Rule: the body is the default avatar's, so that the rows are the same everywhere. A reference sums in extended precision
 or float64. A bound counts the roundings of the computation, and never follows from a result.
 
-A texture with constant channels makes every covered pixel of a tensor a known byte: q = clamp(round(x / scale) + zero
-point, 0, 255), rounded to even. Values are FP16 numbers. For halves the scale is a power of two, so that x / scale is
-exact however a driver divides. Else x / scale is at least a tenth of a step from a half, which no driver's division
-crosses (2.5 units in the last place, Vulkan 1.3 and OpenCL 3.0 for float32). A frame of a scene is the same to the byte
-whatever was drawn before it; its reference comes from stages that draw nothing else.
+If a texture has constant channels, every covered pixel of a tensor is a known byte: q = clamp(round(x / scale) + zero
+point, 0, 255), rounded to even. Values are FP16 numbers. For halves the scale is a power of two, so x / scale is exact
+however a driver divides. All other x / scale are at least a tenth of a step from a half. The error of a driver's
+division is smaller (2.5 units in the last place, Vulkan 1.3 and OpenCL 3.0 for float32). A frame of a scene must be the
+same to the byte, whatever was drawn before; its reference comes from stages that draw nothing else.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ HOLDS, EXCEEDED = "holds", "FAILS: error above the bound"
 #: Number of rows of `hard_numbers`.
 COUNT = 92
 SIGMAS = 5.0
-#: Drawn shape directions: how many, and how far one sigma of each moves a vertex, metres.
+#: Random shape directions: their number, and how far one sigma of a direction moves a vertex, metres.
 DRAWN_DIRECTIONS, DRAWN_M = 10, 0.01
 #: Distances of the root joint from the origin, metres.
 PLACES = {"0.2 m": 0.2, "20 m": 20.0, "200 m": 200.0}
-#: Sums of a vertex's skin weights in files that are just accepted.
+#: Sums of a vertex's skin weights just within the limits for body files.
 SUMS = (0.9991, 1.0009)
 POSES = 8
-#: Number of drawn skin weights of a vertex, on joints from all over the body.
+#: Number of random skin weights of a vertex, for joints from all over the body.
 DRAWN_WEIGHTS = 16
 WEIGHTS_PROOF = "the bound that body/skinning.py proves"
 NEAR_M, FAR_M = 0.05, 1000.0
@@ -70,7 +70,7 @@ VIEWS = {
 }
 DRAWN_POSES = 6
 SIDE = 512
-#: Crops as parts of the screen's width.
+#: Name of a crop -> its width in NDC; the screen is 2 wide.
 CROPS = {"a whole screen": 2.0, "a tenth": 0.2, "a 4096th": 2 / 4096}
 BOX_PROOF = "no vertex on the screen may be outside: 0, by the proof in stages/cpu/mesh_bounds.py"
 FRAME = 5_000_000
@@ -82,8 +82,8 @@ Shown = Callable[[float], F64]
 def hard_numbers() -> Iterator[dict[str, Any]]:
     """Yield rows with `name`, `error`, `bound`, `unit`, `source` (of the bound), `verdict`, `passed`.
 
-    `error` is None where it is not a number, which counts as above every bound.
-    Raises MissingPartError where no OpenGL context can be made.
+    An `error` that is not a finite number is None, and counts as above every bound.
+    Raises MissingPartError if no OpenGL context can be made.
     """
     for case in _cases():
         error = case.error if math.isfinite(case.error) else None
@@ -91,7 +91,7 @@ def hard_numbers() -> Iterator[dict[str, Any]]:
 
 
 def kept_going(kind: str, cases: Iterable[HardNumber]) -> Iterator[HardNumber]:
-    """Yield `cases` of one kind; when tested code refuses its input, the last row says so and fails."""
+    """Yield `cases` of one kind. If tested code raises an error, a failed row that names the error ends them."""
     try:
         yield from cases
     except (BadInputError, ArithmeticError, ValueError) as error:
@@ -117,7 +117,7 @@ def _cases() -> Iterator[HardNumber]:
 
 
 def _body_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
-    """Yield rows of shapes, skinning and weights of the body `shaped`."""
+    """Yield rows about shapes, skinning and weights of the body `shaped`."""
     yield from _shapes(shaped.body)
     yield from _skinning(shaped)
     yield from _left_out(shaped)
@@ -125,9 +125,9 @@ def _body_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
 
 
 def _shapes(body: Body) -> Iterator[HardNumber]:
-    """Yield rows of extreme shapes, whose shape directions are drawn.
+    """Yield rows about extreme shapes, with random shape directions.
 
-    The rest vertices are a sum in float64 of S + 1 numbers and an offset, rounded to float32.
+    A rest vertex is a sum in float64 of S + 1 numbers and an offset, S the number of directions, rounded to float32.
     """
     rng = np.random.default_rng(9)
     drawn = rng.normal(0, DRAWN_M, (2, *body.v_template.shape, DRAWN_DIRECTIONS)).astype(np.float32)
@@ -160,11 +160,12 @@ def _skinning(shaped: ShapedBody) -> Iterator[HardNumber]:
 
 
 def _skinned(shaped: ShapedBody, matrices: F64, feature: F64) -> tuple[F64, F64]:
-    """Return vertices (V, 3) in float64, and how far float32 may be off them.
+    """Return the skinned vertices (V, 3) in float64, and the bound on the error of float32 (V, 3), metres.
 
-    With n weights of a vertex that are not 0, the blended matrix M is off by gamma_(n+1) of sum w |matrix| in float32:
-    one rounding is for the float32 matrices. M [p, 1] is off by four roundings more. Pose blend shapes move p by a sum
-    of 486 products, which is off by gamma_488 of their absolute values.
+    `matrices` (55, 3, 4): skinning matrices. `feature` (486,): entries of R - I of the joints.
+    Let a vertex have n weights other than 0. The blended matrix M is off by gamma_(n+1) of sum w |matrix| in float32,
+    with one rounding for the float32 matrices. M [p, 1] is off by four roundings more. Pose blend shapes move p by a
+    sum of 486 products, which is off by gamma_488 of the sum of their absolute values.
     """
     body = shaped.body
     rest = shaped.vertices.astype(np.float64)
@@ -184,10 +185,10 @@ def _skinned(shaped: ShapedBody, matrices: F64, feature: F64) -> tuple[F64, F64]
 
 
 def _left_out(shaped: ShapedBody) -> Iterator[HardNumber]:
-    """Yield rows of skinning with fewer weights: the four largest of the body, and every offered count of drawn ones.
+    """Yield rows about skinning with only the largest weights: four of the body's, and each count of random weights.
 
-    The body's vertices have seven weights at most. The drawn weights skin a body 200 m away, where remaining weights
-    that do not sum to 1 would show.
+    The body's vertices have seven weights at most. With random weights the body is 200 m away, where an error would
+    show if the kept weights did not sum to 1.
     """
     rng = np.random.default_rng(5)
     poses = [rng.normal(0, 1.0, (JOINTS, 3)) for _ in range(POSES)]
@@ -201,9 +202,9 @@ def _left_out(shaped: ShapedBody) -> Iterator[HardNumber]:
 
 
 def _fewer(shaped: ShapedBody, count: int, poses: Sequence[F64], metres: float, what: str) -> HardNumber:
-    """Return the row of skinning by the `count` largest weights.
+    """Return the row about skinning with the `count` largest weights. `metres`: distance of the body from the origin.
 
-    Beside the proof's bound each of the two sums of weights is off by gamma_n, times the reach of the body.
+    The bound is the proof's, plus gamma_n times the reach of the body for the rounding of each of the weighted sums.
     """
     skeleton = Skeleton(shaped.joints, shaped.body.parents)
     few, whole = CpuSkinner(shaped, count, pose_blend=False), CpuSkinner(shaped, pose_blend=False)
@@ -216,7 +217,7 @@ def _fewer(shaped: ShapedBody, count: int, poses: Sequence[F64], metres: float, 
 
 
 def _sums(shaped: ShapedBody) -> Iterator[HardNumber]:
-    """Yield rows of weights that do not sum to 1. At 200 m, weights that sum to 1 + d move a body by 200 d metres."""
+    """Yield rows about weights that do not sum to 1. At 200 m, a sum of 1 + d would move the body by 200 d metres."""
     skeleton = Skeleton(shaped.joints, shaped.body.parents)
     posed = skeleton.pose(np.zeros((JOINTS, 3)), np.array([200.0, 0.0, 0.0]))
     wanted = CpuSkinner(shaped, pose_blend=False).vertices(posed)
@@ -237,9 +238,9 @@ def _sums(shaped: ShapedBody) -> Iterator[HardNumber]:
 
 
 def _camera_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
-    """Yield rows of rectangles, of crops and of vertices on the screen.
+    """Yield rows about rectangles, about crops, and about vertices on the screen.
 
-    The rectangle of a body is right when no vertex on the screen lies outside it.
+    The rectangle of a body is right if no vertex on the screen lies outside it.
     """
     bounds, skinner = MeshBounds(shaped), CpuSkinner(shaped)
     skeleton = Skeleton(shaped.joints, shaped.body.parents)
@@ -255,7 +256,7 @@ def _camera_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
 
 
 def _drawn(skeleton: Skeleton, fov_deg: float, metres: float) -> Iterator[tuple[Posed, F64]]:
-    """Yield poses never trained, and a camera for each, (4, 4) to clip space."""
+    """Yield `DRAWN_POSES` random poses, each with a camera at `metres` from a joint: projection @ view (4, 4)."""
     rng = np.random.default_rng(round(1e3 * metres + fov_deg))
     for _ in range(DRAWN_POSES):
         posed = skeleton.pose(rng.normal(0, 0.6, (JOINTS, 3)))
@@ -266,7 +267,10 @@ def _drawn(skeleton: Skeleton, fov_deg: float, metres: float) -> Iterator[tuple[
 
 
 def _outside(bounds: MeshBounds, posed: Posed, vertices: F64, clip: F64) -> float:
-    """Return how far vertices in front of the near plane and on the screen leave the rectangle; inf without one."""
+    """Return how far visible vertices lie outside the body's rectangle, NDC; inf if there is no rectangle.
+
+    A vertex is visible if it is on the screen and in front of the near plane.
+    """
     found = bounds.rect(posed, clip)
     x, y, z, w = clip @ np.concatenate([vertices, np.ones((len(vertices), 1))], axis=1).T
     seen = (w > 0) & (z > -w) & (np.abs(x) <= w) & (np.abs(y) <= w)
@@ -287,10 +291,10 @@ def _behind(bounds: MeshBounds, skeleton: Skeleton) -> Iterator[HardNumber]:
 
 
 def _crops() -> Iterator[HardNumber]:
-    """Yield rows of the cropped projection beside the map of the rectangle after projection, in extended precision.
+    """Yield rows about points in a crop: by the cropped projection, and by the whole projection in extended precision.
 
-    X' = (2 X - (x0 + x1) W) / (x1 - x0) and W are sums of at most 8 products in float64, each of a size of at most
-    2 (|X| + 2 |W|) / (x1 - x0) in sum.
+    X' = (2 X - (x0 + x1) W) / (x1 - x0) and W are sums of at most 8 products in float64. The absolute values of the
+    products sum to at most 2 (|X| + 2 |W|) / (x1 - x0).
     """
     rng = np.random.default_rng(3)
     points = np.concatenate([rng.uniform(-2, 2, (4000, 2)), rng.uniform(-9, -1, (4000, 1)), np.ones((4000, 1))], axis=1)
@@ -307,11 +311,11 @@ def _crops() -> Iterator[HardNumber]:
 
 
 def _on_screen(skinner: CpuSkinner, skeleton: Skeleton) -> Iterator[HardNumber]:
-    """Yield rows of where vertices land in float32, beside float64, with the roundings of the shader counted.
+    """Yield rows about places of vertices on the screen: float32, with the shader's roundings, against float64.
 
-    With clip coordinates C = M [x, 1], M and x in float32, each coordinate is off by gamma_6 of |M| |x| in float32:
-    four products, two roundings of the inputs. X / W is off by that of X, plus X / W times that of W, over W, and by a
-    rounding of the quotient. A pixel is half a tensor's side for each 1 of X / W.
+    Let C = M [x, 1] be clip coordinates, with M and x in float32. Each coordinate is off by gamma_6 of |M| |x| in
+    float32: four products, two roundings of the inputs. If X is off by dX and W by dW, X / W is off by
+    (dX + |X / W| dW) / W and by a rounding of the quotient. X / W is multiplied by half a tensor's side to get pixels.
     """
     posed = skeleton.pose(random_pose(JOINTS))
     vertices = skinner.vertices(posed)
@@ -334,11 +338,12 @@ def _on_screen(skinner: CpuSkinner, skeleton: Skeleton) -> Iterator[HardNumber]:
 
 
 def time_cases() -> Iterator[HardNumber]:
-    """Yield rows of the built-in walk and camera at each rate, after a day of media time.
+    """Yield rows about the built-in walk and camera at each rate, after a day of media time.
 
-    Frame 5,000,000 shows what the same moment of the motion's period shows. The reference reduces the frame's time by
-    the period in fractions, which are exact. frame / fps rounds by U of itself and the remainder is exact, so the time
-    is off by at most U t. What is shown is off by that times its greatest change in a second, and by a few roundings.
+    Frame 5,000,000 must show the same as the same moment in the first period of the motion. The reference reduces the
+    frame's time by the period in fractions, which are exact. The tested time t = frame / fps is off by at most U t, and
+    its remainder is exact. A shown value is off by the error of the time, times the largest change of the value in a
+    second, and by a few roundings.
     """
     motion, camera = walk_wave_turn(), load_builtin("orbit", CameraSpec())
     assert camera is not None
@@ -357,14 +362,17 @@ def time_cases() -> Iterator[HardNumber]:
 
 
 def _moment(fps: float, times_s: F64, wrap: Wrap) -> float:
-    """Return the time of frame `FRAME` within one period."""
+    """Return the time of frame `FRAME` at `fps`, reduced to the length of the motion, seconds.
+
+    `times_s`: times of the motion's samples. `wrap`: how the motion goes on after its end.
+    """
     length = Fraction(float(times_s[-1])) * (1 if wrap is Wrap.LOOP else 2)
     phase = (Fraction(FRAME) / Fraction(fps)) % length
     return float(phase if wrap is Wrap.LOOP or phase <= length / 2 else length - phase)
 
 
 def _fastest(at: Shown, times_s: F64) -> float:
-    """Return the greatest change per second of any number, between neighbouring samples."""
+    """Return the largest change per second of any value of `at`, between neighbouring samples."""
     values = np.array([at(float(t)).ravel() for t in times_s])
     return float(np.abs(np.diff(values, axis=0) / np.diff(times_s)[:, None]).max())
 
@@ -373,7 +381,7 @@ SHAPE = (64, 64)
 CHANNELS = 16
 POWER = 2.0**-5
 NO_TENSOR = np.empty(0, np.uint8)
-#: Name -> scale, zero point, and the channels' values: in steps here (halves are exact), as they are in `NUMBERS`.
+#: Name -> scale, zero point, and the values of the channels in steps of the scale.
 STEPS: dict[str, tuple[float, int, Sequence[float]]] = {
     "halves above 0": (POWER, 117, [k + 0.5 for k in range(16)]),
     "halves below 0": (POWER, 117, [-k - 0.5 for k in range(16)]),
@@ -385,6 +393,7 @@ STEPS: dict[str, tuple[float, int, Sequence[float]]] = {
     "a zero point of 255": (POWER, 255, [k - 7.5 for k in range(16)]),
 }
 LARGEST, LEAST_NORMAL, LEAST = 65504.0, 2.0**-14, 2.0**-24
+#: Name -> scale, zero point, and the values of the channels.
 NUMBERS: dict[str, tuple[float, int, Sequence[float]]] = {
     "the largest FP16 numbers": (6 / 255, 117, [LARGEST, -LARGEST] * 8),
     "FP16 subnormals at a scale of their own": (LEAST, 3, [k * LEAST for k in range(16)]),
@@ -393,13 +402,13 @@ NUMBERS: dict[str, tuple[float, int, Sequence[float]]] = {
     "a scale so large that all is 0": (1e30, 117, [LARGEST, -LARGEST] * 8),
 }
 HALF_ULP = "FP16 rounds to the nearest: 2^-11 of a number, 2^-25 at least"
-#: Scene -> frames, each as unlike the one before as possible: camera, pose, rectangle, tensor shape, who is in view.
+#: Scene -> frames that differ much from the one before: in camera, pose, rectangle, tensor shape, avatars in view.
 JUMPS = {"walk-past": (0, 180, 30, 299, 0), "leave-and-return": (0, 150, 20, 240), "top-to-floor": (0, 90, 180, 0)}
 RUNTIME = "ort"
 
 
 def tensor_cases(shaped: ShapedBody, ctx: Any) -> Iterator[HardNumber]:
-    """Yield rows of packing and of texels, drawn in the OpenGL context `ctx`."""
+    """Yield rows about packing and texels, drawn in the OpenGL context `ctx`."""
     mesh, view, placement = _scene(shaped, ctx)
     rows = {name: (s, z, [step * s for step in steps]) for name, (s, z, steps) in STEPS.items()} | NUMBERS
     for name, (scale, zero_point, numbers) in rows.items():
@@ -415,7 +424,7 @@ def tensor_cases(shaped: ShapedBody, ctx: Any) -> Iterator[HardNumber]:
 
 
 def _scene(shaped: ShapedBody, ctx: Any) -> tuple[SkinnedMesh, F64, Placement]:
-    """Return the body at rest before a camera, in the middle of the tensor."""
+    """Return a mesh of the body at rest, the view matrix (4, 4) of a camera before it, and its place in the tensor."""
     body = shaped.body
     joint = np.zeros((len(shaped.vertices), 4), np.int64)
     weight = np.tile([1.0, 0.0, 0.0, 0.0], (len(joint), 1))
@@ -427,7 +436,10 @@ def _scene(shaped: ShapedBody, ctx: Any) -> tuple[SkinnedMesh, F64, Placement]:
 
 
 def _steps_off(pixels: U8, values: F64, scale: float, zero_point: int) -> float:
-    """Return the largest difference, in steps, of a covered pixel of `pixels` (N, C) from the formula."""
+    """Return the largest difference, in steps, of a covered pixel of `pixels` (N, C) from the formula of this module.
+
+    `values` (C,): values of the texture.
+    """
     wanted = np.clip(np.rint(values / np.float64(np.float32(scale))) + zero_point, 0, 255)
     middle = pixels.reshape(*SHAPE, -1)[SHAPE[0] // 2, SHAPE[1] // 2]
     background = (pixels == zero_point).all(axis=1)
@@ -436,7 +448,7 @@ def _steps_off(pixels: U8, values: F64, scale: float, zero_point: int) -> float:
 
 
 def _texels(ctx: Any) -> Iterator[HardNumber]:
-    """Yield rows of the texture's values on the GPU, and of values that it refuses."""
+    """Yield rows about a texture's values on the GPU, and about values that must be refused."""
     rng = np.random.default_rng(11)
     for name, exponents in {"usual numbers": (-6, 6), "subnormals": (-24, -14), "large numbers": (10, 15)}.items():
         sizes = 2.0 ** rng.uniform(*exponents, (8, 8, 4)) * rng.choice([-1.0, 1.0], (8, 8, 4))
@@ -457,7 +469,7 @@ def _is_taken(value: float) -> bool:
 
 
 def scene_cases() -> Iterator[HardNumber]:
-    """Yield a row for each scene of `JUMPS`."""
+    """Yield a row for each scene of `JUMPS`: bytes of tensors that depend on the frames drawn before."""
     for scene, frames in JUMPS.items():
         checked = configure(RunOptions(scene=scene, runtime=RUNTIME), Path.cwd())
         last = checked.config.scene.frames - 1
@@ -467,7 +479,7 @@ def scene_cases() -> Iterator[HardNumber]:
 
 
 def _differing(checked: Checked, numbers: list[int]) -> int:
-    """Return how many bytes of the tensors differ from those of stages that drew no other frame."""
+    """Return how many bytes of the frames' tensors differ if stages draw all frames, or only this frame."""
     used, found = DrawnTensors(checked), 0
     for number in numbers:
         after, fresh = used.tensors(number), DrawnTensors(checked).tensors(number)
@@ -477,5 +489,5 @@ def _differing(checked: Checked, numbers: list[int]) -> int:
 
 
 def _different_bytes(one: U8, other: U8) -> int:
-    """Return how many bytes differ; all of the larger tensor for two of different shapes."""
+    """Return how many bytes differ; for different shapes, the size of the larger tensor."""
     return max(one.size, other.size) if one.shape != other.shape else int(np.count_nonzero(one != other))

@@ -1,7 +1,7 @@
-"""Rotations at the angles where formulas break, a million at random, and the longest chain of joints.
+"""Hard cases: rotations at angles where formulas break, a million random rotations, and the longest chain of joints.
 
-Rule: a bound follows from the formulas that are computed and from the precision of the numbers, never from a result. An
-error that is not a number is above every bound. The references share nothing with the tested code, body/joints.py.
+Rule: a bound follows from the tested formulas and the precision of the numbers, never from a result. An error that is
+not a number is above every bound. The references share no code with the tested body/joints.py.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ ANGLES = {
     "100 pi": 100 * np.pi,
     "1e6": 1e6,
 }
-#: Angles whose vector comes back from a quaternion: up to half a turn.
+#: Angles that are tested to a quaternion and back. Only vectors up to half a turn come back.
 RETURNED = ("1e-12", "1e-6", "1e-3", "pi - 1e-7")
 RANDOM, CHUNK, SEED = 1_000_000, 100_000, 17
 LEAST = 2.0**-1074
@@ -49,7 +49,7 @@ PI = Decimal("3.1415926535897932384626433832795028841971693993751058209749445923
 TINY = Decimal("1e-30")
 MM = 1e3
 Wide = NDArray[np.longdouble]
-#: Name of a turn of every joint of the chain -> its angle about the axis (1, 2, 3) / sqrt(14).
+#: Name of a pose -> angle by which every joint turns about the axis (1, 2, 3) / sqrt(14).
 TURNS = {
     "all turned by 1e-7": 1e-7,
     "all turned by pi - 1e-7": np.pi - 1e-7,
@@ -62,7 +62,7 @@ CHAIN_SEED = 23
 
 
 class HardNumber(NamedTuple):
-    """One hard case of plain numbers. `error`, `bound`: both in `unit`. `source`: origin of the bound."""
+    """One hard case. `error`, `bound`: both in `unit`. `source`: origin of the bound."""
 
     name: str
     error: float
@@ -76,16 +76,19 @@ class HardNumber(NamedTuple):
 
 
 def gamma(n: float, unit: float = U) -> float:
-    """Return the largest relative error of a sum of `n` products, in numbers of unit roundoff `unit`.
+    """Return gamma_n = n u / (1 - n u) for numbers of unit roundoff u = `unit`.
 
-    A sum of n products is off by at most gamma_n times the sum of their absolute values, gamma_n = n U / (1 - n U):
-    N. Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed. 2002, sections 2.2 and 3.1.
+    A sum of n products is off by at most gamma_n times the sum of their absolute values: N. Higham, Accuracy and
+    Stability of Numerical Algorithms, 2nd ed. 2002, sections 2.2 and 3.1.
     """
     return n * unit / (1 - n * unit)
 
 
 def worst(errors: ArrayLike, bounds: ArrayLike) -> tuple[float, float]:
-    """Return the error nearest to its bound, or furthest above it, and that bound; NaN where any error is NaN."""
+    """Return the error with the largest ratio to its bound, and this bound.
+
+    If an error is NaN, return NaN and its bound. If all errors are 0, return 0 and the largest bound.
+    """
     found: Any = np.broadcast_arrays(np.asarray(errors, np.float64), np.asarray(bounds, np.float64))
     error, bound = (each.ravel() for each in found)
     if np.isnan(error).any():
@@ -97,7 +100,7 @@ def worst(errors: ArrayLike, bounds: ArrayLike) -> tuple[float, float]:
 
 
 def rotation_cases() -> Iterator[HardNumber]:
-    """Yield a row for each angle, for orthonormality and determinant of random rotations, and for the way back."""
+    """Yield rows: rotations by each angle, random rotations, and vectors to a quaternion and back."""
     axes = _axes()
     for name, angle in ANGLES.items():
         vectors = axes * angle
@@ -114,25 +117,26 @@ def rotation_cases() -> Iterator[HardNumber]:
 
 
 def turn_bound(angle: F64) -> F64:
-    """Return how far an entry of R - I may be off, by the angle in radians (...).
+    """Return the bound on the error of an entry of R - I (...), for rotations by `angle` (...), radians.
 
-    h = |v| / 2 is off by at most 2.5 U of itself: a sum of three squares, its root. With s = min(1, h) each part of the
-    quaternion is then off by at most e = U (2.5 h + 7.5 s), its first part by at most f = U (2.5 h + 2). An entry of
-    R - I is a sum of at most two products of parts, doubled. So it is off by at most
+    h = |v| / 2 is off by at most 2.5 U of itself: it is the root of a sum of three squares. Let s = min(1, h). The
+    first part of the quaternion is off by at most f = U (2.5 h + 2), each other part by at most e = U (2.5 h + 7.5 s).
+    An entry of R - I is a sum of at most two products of parts, doubled. Therefore it is off by at most
 
         (4 s + 2) e + 2 s f + 6 s U
 
-    U^2 and smaller are left out, and the whole is taken 1.01 times for them. Below the least normal number each of the
-    eight roundings may add the least number that there is.
+    The factor 1.01 covers terms of U^2 and smaller. Below the least normal number, each of the eight roundings may add
+    the least subnormal number.
     """
     s, e, f = _parts(np.asarray(angle, np.float64))
     return np.asarray(1.01 * ((4 * s + 2) * e + 2 * s * f + 6 * s * U) + np.where(angle > 0, 8 * LEAST, 0.0))
 
 
 def return_bound(angle: F64) -> F64:
-    """Return how far a part of a vector from a quaternion may be off, radians, by the angle up to pi (...).
+    """Return the bound on the error of a part of a vector from a quaternion (...), radians.
 
-    The angle is 2 atan2(sine, w), off by 2 (f + sqrt(3) e) and four roundings; the axis is divided by sine.
+    `angle` (...): angle of the rotation, up to pi. With e and f as in `turn_bound`, the angle 2 atan2(sine, w) is off
+    by 2 (f sine + sqrt(3) e) and four roundings. The axis is the quaternion's other parts divided by sine.
     """
     _, e, f = _parts(np.asarray(angle, np.float64))
     sine = np.sin(np.minimum(angle / 2, np.pi / 2))
@@ -141,24 +145,25 @@ def return_bound(angle: F64) -> F64:
 
 
 def _parts(angle: F64) -> tuple[F64, F64, F64]:
-    """Return s, e and f of the bound."""
+    """Return s, e and f of `turn_bound`."""
     h = angle / 2
     s = np.minimum(1.0, h)
     return s, U * (2.5 * h + 7.5 * s), U * (2.5 * h + 2)
 
 
 def _axes() -> F64:
-    """Return unit vectors (26, 3) to the faces, edges and corners of a cube."""
+    """Return unit vectors (26, 3) from the centre of a cube to its faces, edges and corners."""
     grid = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * 3), axis=-1).reshape(-1, 3)
     directions = grid[np.abs(grid).any(axis=1)]
     return np.asarray(directions / np.linalg.norm(directions, axis=1, keepdims=True))
 
 
 def _random_cases() -> Iterator[HardNumber]:
-    """Yield rows of R^T R = I and det R = 1 for random rotations by 0 to 2 pi.
+    """Yield rows about R^T R = I and det R = 1 for random rotations by 0 to 2 pi.
 
-    With each entry off by at most b, an entry of R^T R is off by 2 sqrt(3) b (the columns have length 1) and by three
-    roundings; the determinant by b times the sum of all cofactors, at most 3 sqrt(3), and by ten roundings.
+    Let each entry be off by at most b. An entry of R^T R is off by at most 2 sqrt(3) b, because columns have length 1,
+    and by four roundings. The determinant is off by b times the sum of all cofactors, at most 3 sqrt(3), and by ten
+    roundings.
     """
     rng = np.random.default_rng(SEED)
     square, volume = [], []
@@ -177,10 +182,10 @@ def _random_cases() -> Iterator[HardNumber]:
 
 
 def exact_turn(rotvec: Sequence[float]) -> list[list[Decimal]]:
-    """Return R - I of the axis-angle vector `rotvec` (3,), radians, below 1e9 of magnitude, in `DIGITS` digits.
+    """Return R - I (3, 3) of the axis-angle vector `rotvec` (3,), radians, with |rotvec| below 1e9, in `DIGITS` digits.
 
-    R - I = a [v]x + b [v]x^2, a = sin(t) / t, b = (1 - cos(t)) / t^2, t = |v|, with series in t^2 after t was reduced
-    by multiples of 2 pi.
+    R - I = a [v]x + b [v]x^2, a = sin(t) / t, b = (1 - cos(t)) / t^2, t = |v|. Series compute sin and cos after t was
+    reduced by multiples of 2 pi.
     """
     with localcontext() as context:
         context.prec = DIGITS
@@ -195,7 +200,7 @@ def exact_turn(rotvec: Sequence[float]) -> list[list[Decimal]]:
 
 
 def turn_error(found: F64, exact: Sequence[Sequence[Decimal]]) -> float:
-    """Return the largest difference of an entry of `found` (3, 3); NaN where one is not a number."""
+    """Return the largest difference of an entry of `found` (3, 3) from `exact`; NaN if an entry is not finite."""
     if not np.isfinite(found).all():
         return float("nan")
     with localcontext() as context:
@@ -217,7 +222,7 @@ def _factors(squared: Decimal) -> tuple[Decimal, Decimal]:
 
 
 def _series(angle: Decimal) -> tuple[Decimal, Decimal]:
-    """Return sin and 1 - cos of an angle of at most pi, by Taylor's series."""
+    """Return sin and 1 - cos of an angle from -pi to pi, by Taylor's series."""
     term, sine, missing = angle, angle, Decimal(0)
     power = Decimal(1)
     for n in range(1, 60):
@@ -229,7 +234,7 @@ def _series(angle: Decimal) -> tuple[Decimal, Decimal]:
 
 
 def chain_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
-    """Yield rows of the longest chain, and of the matrices that the GPU gets, which are float32."""
+    """Yield rows about the joints of the whole body, and about the float32 skinning matrices for the GPU."""
     skeleton = Skeleton(shaped.joints, shaped.body.parents)
     axis = np.array([1.0, 2.0, 3.0]) / np.sqrt(14.0)
     poses = {name: np.tile(axis * angle, (len(shaped.joints), 1)) for name, angle in TURNS.items()}
@@ -252,9 +257,9 @@ def chain_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
 
 
 def walked(shaped: ShapedBody, pose: F64, root: F64) -> Wide:
-    """Return world transforms (55, 3, 4) of the joints, one after the other from the root, in extended precision.
+    """Return the world transforms (55, 3, 4) of the joints in extended precision, joint by joint from the root.
 
-    body/joints.py jumps from joint to joint by powers of two instead.
+    `root` (3,): place of the root joint's origin, metres. body/joints.py doubles its step along the chain instead.
     """
     wide = np.longdouble
     found: Wide = np.zeros((len(shaped.joints), 3, 4), wide)
@@ -273,11 +278,12 @@ def walked(shaped: ShapedBody, pose: F64, root: F64) -> Wide:
 
 
 def joint_bounds(shaped: ShapedBody, pose: F64, root_m: float) -> F64:
-    """Return how far each joint (55,) may be off, metres.
+    """Return the bounds on the errors of the joints' places (55,), metres. `root_m`: distance of the root, metres.
 
-    A local rotation is off by at most 3 b in norm, b the bound of a rotation and U for adding I. A product of two rows
-    and columns rounds by gamma_4 of at most sqrt(3) * sqrt(3) for rotations, or sqrt(3) |place| + |place| for places.
-    Over d joints these add up. With L the length of the chain's bones, the place of the last joint is off by at most
+    A local rotation is off by at most 3 b in norm, with b the bound of `turn_bound` plus U for adding I. A product of a
+    row and a column rounds by gamma_4 of at most sqrt(3) * sqrt(3) for rotations, or sqrt(3) |place| + |place| for
+    places. Over d joints these errors add up. With L the length of the chain's bones, the place of the last joint is
+    off by at most
 
         L sum (3 b + 12 U) + d gamma_4 (sqrt(3) + 1) (|root| + L)
     """
@@ -294,7 +300,7 @@ def joint_bounds(shaped: ShapedBody, pose: F64, root_m: float) -> F64:
 
 
 def _rotation_bounds(shaped: ShapedBody, pose: F64) -> F64:
-    """Return how far each joint's world rotation (55,) may be off, in norm."""
+    """Return the bounds on the errors of the joints' world rotations (55,), in norm."""
     local = 3 * (turn_bound(np.linalg.norm(pose, axis=1)) + U) + 12 * U
     total = np.zeros(len(local))
     for joint, parent in enumerate(shaped.body.parents):
@@ -303,7 +309,10 @@ def _rotation_bounds(shaped: ShapedBody, pose: F64) -> F64:
 
 
 def _wide_rotation(v: Wide) -> Wide:
-    """Return the matrix (3, 3) of an axis-angle vector, by 1 - cos = 2 sin^2, in the vector's precision."""
+    """Return the matrix (3, 3) of an axis-angle vector (3,), in the vector's precision.
+
+    It uses 1 - cos(t) = 2 sin^2(t / 2).
+    """
     angle = np.sqrt(v @ v)
     if angle == 0:
         return np.eye(3, dtype=v.dtype)

@@ -34,7 +34,7 @@ MIN_FRAMES = 100  # frames of a run that is placed by its times
 
 
 class Predicted(NamedTuple):
-    """A predicted time in milliseconds, and its 80 % interval; None where nothing could be measured."""
+    """A predicted time in milliseconds, and the ends of its 80 % interval, None if nothing could be measured."""
 
     ms: float
     low_ms: float | None
@@ -44,16 +44,16 @@ class Predicted(NamedTuple):
 def measure(
     avatar: str = "default", width: tuple[int, ...] = (8, 24, 32, 40, 48), frames: int = 200, seconds: float = 3.0
 ) -> dict[str, Any]:
-    """Predicted beside measured: the avatar with its own network, then with an untrained one of each `width`.
+    """Predicted and measured times: the avatar with its own network, then with an untrained network of each `width`.
 
-    Two rows for each network: `what` is `run` (time between frames of a run of `frames` frames) or `network` (median of
-    the calls of `seconds` seconds). `predicted_ms`, `low_ms`, `high_ms`; `measured_ms`; `error`: predicted over
-    measured, less 1; `inside`: whether the measured time is in the 80 % interval; `others`: share of the cores that
+    Two rows for each network: `what` is `run` (mean frame time of a run of `frames` frames) or `network` (median time
+    of calls in `seconds` seconds). `predicted_ms`, with the 80 % interval `low_ms`, `high_ms`; `measured_ms`; `error`:
+    predicted / measured - 1; `inside`: whether the measured time is in the interval; `others`: share of the cores that
     other programs had in the run. Above 0.1, the row says little.
 
     `run`, `network`: summary of the rows of that kind. `inside`: number of rows in their interval, out of `of` rows.
-    `median_error`: median of the absolute errors. `leave_one_out_error`: root mean square of the errors as logarithms.
-    `inside_left_out`: number of rows in the interval that follows from the other rows' errors alone.
+    `median_error`: median of the absolute errors. `leave_one_out_error`: root mean square of log(predicted / measured).
+    `inside_left_out`: number of rows in the 80 % interval that follows from the errors of all other rows.
 
     Raises BadInputError, MissingPartError without PyTorch, TrilaneError when a run fails.
     """
@@ -83,7 +83,7 @@ def _of_run(avatar: str) -> Predicted:
 
 
 def _run(avatar: str, frames: int, out: Path) -> tuple[float, float | None]:
-    """Return the milliseconds between the frames of a run, and the share of the cores that other programs had."""
+    """Do a run, and return its mean frame time in ms, and the share of the cores that other programs had."""
     options = RunOptions(avatar=avatar, frames=frames, baseline_frames=0, out=out)
     report = run_asked(options, quiet, ("trilane", "bench")).report
     return report.frame_time_ms.mean or 0.0, report.other_programs
@@ -117,7 +117,7 @@ def _row(name: str, what: str, predicted: Predicted, measured_ms: float, others:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the summary of rows of one kind, at least two."""
+    """Return the summary of rows of one kind (keys: see `measure`). `rows`: at least two."""
     squares = [math.log1p(row["error"]) ** 2 for row in rows]
     left_out = [(sum(squares) - one) / (len(squares) - 1) for one in squares]
     return {
@@ -131,5 +131,5 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[Hooks]:
-    """Give the hooks of a run that nobody watches."""
+    """Give hooks that print nothing."""
     yield Hooks(lambda *_: None, lambda _: None)

@@ -1,8 +1,8 @@
-"""How far a picture is from another one, and a mask from another one, by the usual measures.
+"""Error of a picture against a reference, and of a mask against a reference, by the usual measures.
 
 Rule: pictures are (h,w,3) sRGB, bytes or real numbers in 0..1, masks (h,w) of bools. SSIM is as in the avatars'
-validations: windows of 7 x 7 pixels, mean over the colours. The weights of LPIPS come from a given file: nothing is
-downloaded, and only tensors are read from it. Sources: SSIM: Wang et al., "Image Quality Assessment", IEEE TIP 13
+validations: windows of 7 x 7 pixels, mean over the colours. The weights of LPIPS come from a file that the user names;
+only tensors are read from the file. Sources: SSIM: Wang et al., "Image Quality Assessment", IEEE TIP 13
 (2004); MS-SSIM: Wang, Simoncelli and Bovik, "Multiscale structural similarity", Asilomar 2003; FLIP: Andersson et al.,
 HPG 2020, at 67 pixels a degree; LPIPS: Zhang et al., "Unreasonable Effectiveness", CVPR 2018, version 0.1.
 """
@@ -24,19 +24,19 @@ from trilane.errors import BadInputError, MissingPartError
 __all__ = ["ErrorFigures", "dice", "figures", "flip", "iou", "mae", "ms_ssim", "psnr_db", "require_metrics", "ssim"]
 #: Exponents of MS-SSIM's scales, the finest first.
 SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
-#: MS-SSIM's window: a Gaussian of this deviation, in pixels, over 11 x 11 of them.
+#: MS-SSIM's window: standard deviation of a Gaussian, and side, pixels.
 DEVIATION_PX, WINDOW_PX = 1.5, 11
-#: The least side of a picture with room for the window at the coarsest scale.
+#: The least side of a picture for MS-SSIM: its coarsest scale has room for one window.
 LEAST_MS_SSIM_PX = WINDOW_PX * 2 ** (len(SCALES) - 1)
-#: The least side of a picture that SSIM has windows for.
+#: The least side of a picture for SSIM: one window.
 LEAST_SSIM_PX = 7
-#: Constants that keep SSIM's quotients from 0 / 0, of values in 0..1.
+#: Constants of SSIM for values in 0..1. They prevent 0 / 0.
 C1, C2 = 0.01**2, 0.03**2
-#: LPIPS of a picture and its reference, real numbers in 0..1: `trilane.apps.experiments.picture_errors.Lpips`.
+#: Function that returns the LPIPS of a picture and its reference, real numbers in 0..1, such as an `Lpips`.
 Perceived = Callable[[F64, F64], float | None]
 LPIPS_FILE = "a file of all weights of lpips.LPIPS(net='alex')"
 LPIPS_REMEDY = "torch.save(lpips.LPIPS().state_dict(), FILE) writes one"
-#: AlexNet's convolutions: name in the file, outputs, inputs, side, stride, padding, whether pooling comes before.
+#: AlexNet's convolutions: name in the file, outputs, inputs, kernel side, stride, padding, whether pooling is before.
 LPIPS_LAYERS = (
     ("slice1.0", 64, 3, 11, 4, 2, False),
     ("slice2.3", 192, 64, 5, 1, 2, True),
@@ -44,9 +44,9 @@ LPIPS_LAYERS = (
     ("slice4.8", 256, 384, 3, 1, 1, False),
     ("slice5.10", 256, 256, 3, 1, 1, False),
 )
-#: A picture in -1..1 less the shift, divided by the scale, is the network's input.
+#: The network's input is (picture in -1..1 - shift) / scale.
 LPIPS_SHIFT, LPIPS_SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
-#: Keeps an all-zero feature vector from 0 / 0.
+#: Added to the length of a feature vector, which may be 0.
 LPIPS_TINY = 1e-10
 #: The least side of a picture for which every layer has an output.
 LEAST_LPIPS_PX = 64
@@ -57,9 +57,9 @@ class ErrorFigures:
     """Errors of a picture against a reference.
 
     `mae`: mean absolute difference, in steps of 1/255. `psnr_db`: PSNR, at most 100, which means no error. `ssim`,
-    `ms_ssim`: similarity, 1 without an error; None where the picture is too small. `flip`: mean FLIP, 0 without an
-    error. `dice`, `iou`: agreement of the masks, 1 where they are the same; None without masks. `lpips`: 0 without an
-    error; None without its weights and where the picture is too small.
+    `ms_ssim`: similarity, 1 without an error; None if the picture is too small. `flip`: mean FLIP, 0 without an error.
+    `dice`, `iou`: agreement of the masks, 1 if they are equal; None without masks. `lpips`: LPIPS, 0 without an error;
+    None without weights, or if the picture is too small.
     """
 
     mae: float
@@ -86,7 +86,7 @@ def figures(
     """Return all errors of `picture` against `reference`.
 
     `mask`, `reference_mask`: masks to compare, or None. `lpips`: computes LPIPS; None leaves it out.
-    Raises ValueError when shapes or numbers are not those of two pictures, ImportError without the extra `metrics`.
+    Raises ValueError if the shapes differ or an argument is no picture, ImportError without the extra `metrics`.
     """
     masks = None if mask is None or reference_mask is None else (mask, reference_mask)
     if np.array_equal(*_pair(picture, reference)):
@@ -104,7 +104,7 @@ def figures(
 
 
 def _no_error(side: int, masks: tuple[Mask, Mask] | None, lpips: Perceived | None) -> ErrorFigures:
-    """Return the figures of two equal pictures, without computing anything. `side`: their shorter side, pixels."""
+    """Return the figures of two equal pictures without computing errors. `side`: their shorter side, pixels."""
     return ErrorFigures(
         mae=0.0,
         psnr_db=picture_error.psnr_db(0.0),
@@ -124,26 +124,26 @@ def mae(picture: Floats, reference: Floats) -> float:
 
 
 def mse(picture: Floats, reference: Floats) -> float:
-    """Return the mean square of the differences of all values, in 0..1."""
+    """Return the mean square difference of all values, which are in 0..1."""
     shown, wanted = _pair(picture, reference)
     return float(((shown - wanted) ** 2).mean())
 
 
 def psnr_db(picture: Floats, reference: Floats) -> float:
-    """Return PSNR, -10 log10 of the mean square; at most 100 dB."""
+    """Return the PSNR, -10 log10 of the mean square difference; at most 100 dB."""
     return picture_error.psnr_db(mse(picture, reference))
 
 
 def ssim(picture: Floats, reference: Floats) -> float | None:
-    """Return the mean SSIM; None when a side is shorter than `LEAST_SSIM_PX`."""
+    """Return the mean SSIM; None if a side is shorter than `LEAST_SSIM_PX`."""
     shown, wanted = _pair(picture, reference)
     return None if min(shown.shape[:2]) < LEAST_SSIM_PX else float(ssim_map(shown, wanted).mean())
 
 
 def ms_ssim(picture: Floats, reference: Floats) -> float | None:
-    """Return MS-SSIM of five scales, mean over the colours; None when a side is shorter than `LEAST_MS_SSIM_PX`.
+    """Return MS-SSIM of five scales, mean over the colours; None if a side is shorter than `LEAST_MS_SSIM_PX`.
 
-    Between scales squares of 2 x 2 pixels are averaged. A mean contrast and structure below 0 counts as 0.
+    From scale to scale, squares of 2 x 2 pixels are averaged. A mean contrast-structure term below 0 counts as 0.
     """
     shown, wanted = _pair(picture, reference)
     if min(shown.shape[:2]) < LEAST_MS_SSIM_PX:
@@ -162,19 +162,19 @@ def flip(picture: Floats, reference: Floats) -> float:
 
 
 def dice(mask: Mask, reference: Mask) -> float:
-    """Return Dice's coefficient: twice the common area over the sum of both areas; 1 when both are empty."""
+    """Return Dice's coefficient: twice the common area over the sum of both areas; 1 if both masks are empty."""
     total = int(mask.sum()) + int(reference.sum())
     return 1.0 if total == 0 else 2 * int((mask & reference).sum()) / total
 
 
 def iou(mask: Mask, reference: Mask) -> float:
-    """Return intersection over union; 1 when both masks are empty."""
+    """Return intersection over union; 1 if both masks are empty."""
     either = int((mask | reference).sum())
     return 1.0 if either == 0 else int((mask & reference).sum()) / either
 
 
 def _similarity(picture: F64, reference: F64) -> tuple[F64, F64]:
-    """Return for each colour (3,) the mean SSIM, and the mean of its contrast and structure, where windows fit."""
+    """Return the mean SSIM (3,) and its mean contrast-structure term (3,), by colour, over windows that fit."""
     from skimage.metrics import structural_similarity
 
     _, whole = structural_similarity(
@@ -195,7 +195,7 @@ def _similarity(picture: F64, reference: F64) -> tuple[F64, F64]:
 
 
 def _means(picture: F64) -> F64:
-    """Return the window's weighted mean around each pixel, as `structural_similarity` computes it."""
+    """Return the weighted mean of the window around each pixel (h,w,3), as `structural_similarity` computes it."""
     from skimage.filters import gaussian
 
     reach = WINDOW_PX // 2 / DEVIATION_PX
@@ -216,7 +216,7 @@ def _pair(picture: Floats, reference: Floats) -> tuple[F64, F64]:
 
 
 def _real(picture: Floats) -> F64:
-    """Return `picture` as real numbers in 0..1. Raises ValueError when it is no picture."""
+    """Return `picture` as real numbers in 0..1. Raises ValueError if it is no picture."""
     if picture.ndim != 3 or picture.shape[2] != 3 or not picture.size:
         raise ValueError(f"a picture of shape {picture.shape}, expected (height, width, 3)")
     if picture.dtype == np.uint8:
@@ -244,12 +244,12 @@ class Lpips:
             state = torch.load(weights, map_location="cpu", weights_only=True)
         except OSError as error:
             raise BadInputError.of_os_error(weights, error, LPIPS_FILE) from None
-        except Exception:  # of whatever kind: PyTorch raises many, some with the advice to read the file less carefully
+        except Exception:  # PyTorch raises many kinds; some messages advise to load the file unsafely
             raise BadInputError(str(weights), "a file that is not of tensors alone", LPIPS_FILE, LPIPS_REMEDY) from None
         self._state = {name: _tensor(state, name, shape, weights) for name, shape in _shapes()}
 
     def __call__(self, picture: F64, reference: F64) -> float | None:
-        """Return LPIPS of pictures (h,w,3), sRGB in 0..1; 0 without an error, None below `LEAST_LPIPS_PX` a side."""
+        """Return the LPIPS of two pictures (h,w,3), sRGB in 0..1; None if a side is below `LEAST_LPIPS_PX`."""
         import torch
 
         if min(picture.shape[:2]) < LEAST_LPIPS_PX:
@@ -262,7 +262,7 @@ class Lpips:
             )
 
     def _features(self, picture: F64) -> Iterator[Any]:
-        """Yield the unit feature vectors of each layer, (1,C,h,w)."""
+        """Yield the features of each layer (1,C,h,w), scaled to length 1 along C."""
         import torch
         from torch.nn import functional
 
@@ -276,7 +276,7 @@ class Lpips:
 
 
 def _shapes() -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Yield the names and shapes that the file needs."""
+    """Yield the name and shape of each tensor that the file must have."""
     for number, (name, outputs, inputs, side, *_) in enumerate(LPIPS_LAYERS):
         yield f"net.{name}.weight", (outputs, inputs, side, side)
         yield f"net.{name}.bias", (outputs,)

@@ -1,10 +1,10 @@
-"""The reference path of a frame. Causes of error can be switched on, up to those of the run's own picture.
+"""The reference path of a frame, with causes of error that can be switched on.
 
-Rule: with no cause it is the plan `full` (`bench/lib/full_picture.py`): float64 body with everything on, supersampled
-float64 raster, float texture, unrounded tensor of the network's own area, FP32 network, blend in linear light in
-float64, not rounded. Each cause replaces one of these by the run's; with all of them the picture is the run's. Motion,
-camera, background and contact shadows are always the run's. A cause that cannot stand alone names the causes it needs:
-bytes for a runtime, the run's tensor for stages that draw into it or read it.
+Rule: without a cause, the path is the plan `full` (`bench/lib/full_picture.py`): float64 body with everything on,
+supersampled float64 raster, float texture, unrounded tensor of the network's own area, FP32 network, blend in linear
+light in float64, not rounded. Each cause replaces one of these by the run's way; with all causes, the picture is the
+run's. Motion, camera, background and contact shadows are always the run's. `NEEDS` names the causes that a cause needs:
+a runtime needs bytes, and stages that draw into the run's tensor or read it need that tensor.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ from trilane.stages.configure import Checked
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
 from trilane.stages.gpu.skinned_mesh import MeshArrays, avatar_mesh, enough_weights
 
-#: Least cover of a pixel that belongs to a mask.
+#: A pixel belongs to a mask if avatars cover at least this share of it.
 HALF = 0.5
 
 
 class Cause(StrEnum):
-    """A cause of the difference between a run's picture and the reference's, in the order of adding them."""
+    """A cause of the difference between a run's picture and the reference, in the order of switching them on."""
 
     WEIGHTS = "skin weights"
     BLEND = "blend shapes"
@@ -69,6 +69,7 @@ Causes = frozenset[Cause]
 NOTHING: Causes = frozenset()
 BODY: Causes = frozenset({Cause.WEIGHTS, Cause.BLEND, Cause.FLOAT32})
 _DRAWN = BODY | {Cause.FLOAT16, Cause.CROP, Cause.READS, Cause.PACKING}
+#: Cause -> the causes that must be on too.
 NEEDS: dict[Cause, Causes] = {
     Cause.RASTER: _DRAWN,
     Cause.RUNTIME: frozenset({Cause.PACKING, Cause.QUANTISATION}),
@@ -90,7 +91,7 @@ WHAT: dict[Cause, str] = {
 
 
 def needs(cause: Cause) -> Causes:
-    """Return the causes that `cause` needs to be switched on."""
+    """Return the causes that must be on for `cause`."""
     return NEEDS.get(cause, NOTHING)
 
 
@@ -101,7 +102,7 @@ def up_to(cause: Cause) -> Causes:
 
 
 def require_complete(causes: Iterable[Cause]) -> Causes:
-    """Return `causes` as a set. Raises ValueError when one lacks what it needs."""
+    """Return `causes` as a set. Raises ValueError if a cause is among them without the causes that it needs."""
     found = frozenset(causes)
     for cause in found:
         if missing := needs(cause) - found:
@@ -110,10 +111,10 @@ def require_complete(causes: Iterable[Cause]) -> Causes:
 
 
 class RunBody:
-    """The body of one distinct avatar.
+    """The body of one distinct avatar. `on_cpu`: whether the CPU unit skins it; otherwise the GPU unit does.
 
-    In float64, the body is computed joint by joint. In float32, Trilane's own skinning computes it. With all causes on,
-    it has the CPU unit's vertices to the bit. `on_cpu`: whether the CPU unit skins it, else the GPU unit does.
+    In float64, the vertices are computed joint by joint. In float32, Trilane's own skinning computes them. With all
+    causes on, they equal the CPU unit's vertices to the bit.
     """
 
     def __init__(self, data: AvatarData, *, on_cpu: bool) -> None:
@@ -125,8 +126,8 @@ class RunBody:
     def vertices(self, seen: CastView, level: int | None, causes: Causes) -> F64:
         """Return the vertices (V,3), metres, in the world.
 
-        `seen`: the avatar in a frame. `level`: index into `DETAILS` by the run's plan; None where the run does not show
-        it. `causes`: causes that are switched on; those of the body count.
+        `seen`: the avatar in a frame. `level`: index into `DETAILS` by the run's plan; None if the run does not show
+        the avatar. `causes`: causes that are on; only causes of the body have an effect.
         """
         detail = self._detail(level, causes)
         if Cause.FLOAT32 not in causes:
@@ -135,7 +136,7 @@ class RunBody:
         return (self._by_cpu(detail, posed) if self._on_cpu else self._by_gpu(detail, posed)).astype(np.float64)
 
     def _detail(self, level: int | None, causes: Causes) -> Detail:
-        """Return what is modelled: the run's detail where `causes` say so, else everything."""
+        """Return the level of detail: the run's for causes that are on, otherwise everything."""
         run = EVERYTHING
         if self._on_cpu:
             run = EVERYTHING if level is None else DETAILS[level]
@@ -157,7 +158,7 @@ class RunBody:
         return self._full[detail]
 
     def _blend(self, detail: Detail) -> F32 | None:
-        """Return the pose blend shapes. The GPU unit never leaves them out, but has them in float16."""
+        """Return the pose blend shapes. Without them in `detail`, the CPU unit has none, the GPU unit float16."""
         if detail.pose_blend or self._body.posedirs is None:
             return self._body.posedirs
         return None if self._on_cpu else self._body.posedirs.astype(np.float16).astype(np.float32)
@@ -170,7 +171,7 @@ class RunBody:
         return vertices
 
     def _by_gpu(self, detail: Detail, posed: Posed) -> F32:
-        """Return vertices by the vertex shader's formula, rounded to float32 after each step."""
+        """Return the vertices (V,3) by the vertex shader's formula, rounded to float32 after each step."""
         rest, blend = self._data.shaped.vertices.astype(np.float32), self._blend(detail)
         if blend is not None:
             rest = rest + (blend.reshape(-1, POSE_FEATURES) @ posed.feature).reshape(-1, 3)
@@ -180,10 +181,10 @@ class RunBody:
 
 @dataclass(frozen=True)
 class ReferenceFrame:
-    """Frame `number`.
+    """Frame `number`, with or without causes.
 
-    `picture`: (h,w,3) sRGB in 0..1. `mask`: pixels (h,w) that avatars cover at least half. `boxes`: parts of the
-    picture with avatars.
+    `picture`: (h,w,3) sRGB in 0..1. `mask`: pixels (h,w) that avatars cover at least half. `boxes`: rectangles around
+    the avatars.
     """
 
     number: int
@@ -193,9 +194,10 @@ class ReferenceFrame:
 
 
 class ReferencePath:
-    """The frames of the scene in `checked`.
+    """The reference path of the scene in `checked`.
 
-    `networks`: names of the networks that paint the reference. `gl`: OpenGL context.
+    `networks`: names of the networks that paint the reference. `gl`: OpenGL context in use. `output`: (height, width)
+    of the picture. `avatars`: distinct avatars by folder.
     """
 
     def __init__(self, checked: Checked) -> None:
@@ -216,20 +218,20 @@ class ReferencePath:
         return self.frames.gl
 
     def network_of(self, seen: CastView) -> int:
-        """Return the number of the network that paints an avatar."""
+        """Return the number of the network that paints the visible avatar `seen`."""
         return self._network_of(seen.index)
 
     def frame(self, number: int) -> ReferenceFrame:
-        """Return frame `number` by the reference."""
+        """Return frame `number` without causes."""
         return self.moment(number).frame(NOTHING)
 
     def moment(self, number: int) -> ReferenceMoment:
-        """Return frame `number` in a form that can be drawn with any causes."""
+        """Return frame `number` as a `ReferenceMoment`, which can be drawn with any causes."""
         return ReferenceMoment(self, number)
 
 
 class ReferenceMoment:
-    """One frame, each part of which is made once.
+    """One frame, to be drawn with any causes. Parts that several drawings share are made once.
 
     `own`: the run's picture, (h,w,3) in 0..1. `seen`: visible avatars by number.
     """
@@ -244,7 +246,7 @@ class ReferenceMoment:
         self._made: dict[Hashable, Any] = {}
 
     def frame(self, causes: Causes) -> ReferenceFrame:
-        """Return the frame with `causes` switched on. Raises ValueError when one lacks what it needs."""
+        """Return the frame with `causes` on. Raises ValueError if a cause lacks a cause that it needs."""
         made: ReferenceFrame = self._once(("frame", require_complete(causes)), lambda: self._frame(causes))
         return made
 
@@ -255,7 +257,7 @@ class ReferenceMoment:
         return ReferenceFrame(self.number, picture, cover >= HALF, self.boxes)
 
     def vertices(self, index: int, causes: Causes) -> F64:
-        """Return the vertices (V,3), metres, of the visible avatar `index`."""
+        """Return the vertices (V,3), metres in the world, of the visible avatar number `index`."""
         seen = self.seen[index]
         body = self._path.avatars[seen.folder].body
         level = self._levels.get(index)
@@ -264,7 +266,7 @@ class ReferenceMoment:
         return vertices
 
     def clip(self, index: int) -> F64:
-        """Return projection @ view (4,4) of the whole picture."""
+        """Return projection @ view (4,4) of the whole picture, for avatar number `index`."""
         return self._path.cast.projection(self.number) @ self.seen[index].view
 
     def _layers(self, causes: Causes) -> list[RasterLayer]:
@@ -285,7 +287,10 @@ class ReferenceMoment:
         ]
 
     def _own_layer(self, seen: CastView, causes: Causes) -> RasterLayer:
-        """Return the layer of an avatar with a tensor of its own, on the picture's grid, as in the plan `full`."""
+        """Return the layer of an avatar, painted from a tensor for this avatar alone, on the picture's grid.
+
+        The plan `full` does the same.
+        """
         avatar = self._path.avatars[seen.folder]
         times = fineness(seen.box.shape, avatar.area)
         box = grown(seen.box, BUCKET_STEP * times.denominator)
@@ -297,14 +302,14 @@ class ReferenceMoment:
         return RasterLayer(box, seen.depth, enlarged(shrunk(painted, times.numerator), times.denominator))
 
     def _cells(self) -> list[tuple[CastView, Rect, Cell]]:
-        """Return the avatars in the run's tensors, each with its crop rectangle and its part of its tensor."""
+        """Return the avatars in the run's tensors, each with its crop rectangle and its cell of the tensor."""
         if int(self._header["work"]) != FrameWork.FULL:
             return []
         visible = [row for row in self._header["avatars"] if row["visible"] and int(row["avatar"]) in self.seen]
         return [(self.seen[int(row["avatar"])], Rect(*map(float, row["rect"])), _cell(row)) for row in visible]
 
     def _painted(self, causes: Causes) -> dict[int, F32]:
-        """Return the picture (h,w,4) of the run's tensor of each network in use, which its avatars share."""
+        """Return, for each network in use, its picture (h,w,4) of the run's tensor. Avatars of a network share it."""
         avatars = {self._path.network_of(seen): self._path.avatars[seen.folder] for seen, _, _ in self._cells()}
         return {
             network: self._paint(avatar, self._tensor(network, avatar, causes), causes)
@@ -312,9 +317,9 @@ class ReferenceMoment:
         }
 
     def _tensor(self, network: int, avatar: _Avatar, causes: Causes) -> F64:
-        """Return the tensor (h,w,C) of a network, with the run's shape and crops, in real numbers.
+        """Return the tensor (h,w,C) of network number `network`, with the run's shape and crops, in real numbers.
 
-        `avatar`: one of those that it paints.
+        `avatar`: any avatar that this network paints.
         """
         if Cause.RASTER in causes:
             drawn = self._once(("drawn", network), lambda: self._path.frames.tensor_of(self.number, network))
@@ -330,7 +335,7 @@ class ReferenceMoment:
         return avatar.packed(tensor, causes)
 
     def _drawn(self, seen: CastView, clip: F64, shape: Shape, causes: Causes) -> F64:
-        """Return one avatar (h,w,C) by the float64 rasteriser."""
+        """Return a tensor (h,w,C) with one avatar, drawn by the float64 rasteriser. `clip`: projection @ view (4,4)."""
         avatar = self._path.avatars[seen.folder]
         vertices, texture = self.vertices(seen.index, causes), avatar.texture
         if Cause.FLOAT16 in causes:
@@ -350,7 +355,7 @@ class ReferenceMoment:
         return painted
 
     def _composited(self, causes: Causes) -> F64:
-        """Return the frame (h,w,3) by the composite stage, from the networks' pictures in bytes."""
+        """Return the frame (h,w,3) in 0..1 by the composite stage, from the networks' pictures in bytes."""
         if not self._cells():
             return self.own
         painted = {one: np.asarray(np.rint(made * 255), np.uint8) for one, made in self._painted(causes).items()}
@@ -359,7 +364,7 @@ class ReferenceMoment:
         return composited
 
     def _once(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        """Return the result of `make`, which is called once per `key`, so that a cause without effect costs nothing."""
+        """Return the result of `make`, called once per `key`. Therefore a cause without effect costs nothing."""
         if key not in self._made:
             self._made[key] = make()
         return self._made[key]
@@ -369,9 +374,9 @@ class ReferenceMoment:
 class _Avatar:
     """One distinct avatar.
 
-    `encoding`: encoding of the tensor's bytes. `area`: pixels of the tensor that its network is for. `paint`,
+    `encoding`: scale and zero point of the tensor's bytes. `area`: pixels of its network's own tensor. `paint`,
     `as_written`, `by_runtime`: the network in FP32, in integers as its file says, and on the run's runtime; all take
-    real numbers. `network`: name of `paint`.
+    tensors of real numbers. `network`: name of the network `paint`.
     """
 
     body: RunBody
@@ -385,13 +390,13 @@ class _Avatar:
     by_runtime: Paint
 
     def packed(self, tensor: F64, causes: Causes) -> F64:
-        """Return the values that the bytes of `tensor` represent, if packing is among the causes; else `tensor`."""
+        """Return `tensor`; if packing is on, rounded to values that bytes represent."""
         if Cause.PACKING not in causes:
             return tensor
         return self.real(quantise(tensor, self.encoding.scale, self.encoding.zero_point))
 
     def real(self, tensor: U8) -> F64:
-        """Return the values that the bytes of a tensor represent."""
+        """Return the real numbers that the bytes of a tensor represent."""
         return (tensor.astype(np.float64) - self.encoding.zero_point) * self.encoding.scale
 
 
@@ -413,7 +418,7 @@ def _avatar(data: AvatarData, runtime: str, on_cpu: bool) -> _Avatar:
 
 
 def _by_runtime(network: NetworkFile, name: str) -> Paint:
-    """Return `network` on runtime `name`; its input holds only real numbers that bytes can represent."""
+    """Return `network` on the runtime `name`, as a function of a tensor of real numbers that bytes can represent."""
     bound: dict[Shape, tuple[U8, U8, Binding]] = {}
 
     def paint(tensor: F64) -> F32:
@@ -431,7 +436,7 @@ def _by_runtime(network: NetworkFile, name: str) -> Paint:
 
 
 def _rounded(causes: Causes, *matrices: F64) -> list[F64]:
-    """Return `matrices`, rounded to float32 if the causes say so."""
+    """Return `matrices`, rounded to float32 if `Cause.FLOAT32` is on."""
     if Cause.FLOAT32 not in causes:
         return list(matrices)
     return [matrix.astype(np.float32).astype(np.float64) for matrix in matrices]

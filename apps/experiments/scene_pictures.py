@@ -1,7 +1,7 @@
-"""The frames of a scene in this process: their pictures, times and references; how far apart the runtimes are on them.
+"""The frames of a scene, made in this process: pictures, times, references, and differences between runtimes.
 
-Rule: the run's own stages draw tensors and make pictures, one after the other. Their reference is the ground truth (the
-clothed body) if the scene has one, else the plan `full`; a caller that compares names it.
+Rule: the run's own stages draw tensors and make pictures, one after the other. The reference is the ground truth (the
+clothed body) if the scene has one, otherwise the plan `full`. A result names its reference.
 """
 
 from __future__ import annotations
@@ -39,13 +39,16 @@ from trilane.units import MEASURED
 MAX_FRAMES = 10_000
 TRUTH = "ground truth: the clothed body that the avatar was trained on"
 FULL = "the plan full: float64 body, supersampled raster, FP32 network"
-MS = 1e-6  # milliseconds of a nanosecond
-#: Gives frame `number` over its background, both (h,w,3) uint8.
+MS = 1e-6  # a nanosecond in milliseconds
+#: Function of a frame's number and background (h,w,3) uint8 that returns the reference picture (h,w,3) uint8.
 Wanted = Callable[[int, U8], U8]
 
 
 class ScenePictures:
-    """The frames of the scene in `checked`. `gpu`: OpenGL context that all pictures in this process share."""
+    """Makes the frames of the scene in `checked`. `gpu`: GPU unit with the OpenGL context to use; None for a new one.
+
+    `output`: (height, width) of the picture.
+    """
 
     def __init__(self, checked: Checked, gpu: UnitContext | None = None) -> None:
         """Raise BadInputError, MissingPartError."""
@@ -62,9 +65,9 @@ class ScenePictures:
         return self.gpu.shared(CONTEXT, open_context)
 
     def frame(self, number: int) -> tuple[U8, Mapping[str, float]]:
-        """Return frame `number`, (h,w,3) uint8 sRGB, and milliseconds by stage; stages that it skips take none.
+        """Return frame `number`, (h,w,3) uint8 sRGB, and the time of each stage, ms. A skipped stage takes no time.
 
-        Time in which a thread that was ready had no core does not count.
+        Time in which a ready thread had no core does not count.
         """
         cores, times = len(machine.here.cores()), {}
         with closing(CoreMeter()) as meter:
@@ -78,7 +81,7 @@ class ScenePictures:
         return self._picture(packet), times
 
     def background(self, number: int) -> U8:
-        """Return the background under the frame's avatars, with their shadows, (h,w,3) uint8."""
+        """Return frame `number` without its avatars, but with their shadows, (h,w,3) uint8."""
         self._chain.run(number, len(self._names) - 2).payload[:] = 0
         return self._picture(self._chain.go_on(number))
 
@@ -89,7 +92,10 @@ class ScenePictures:
 
 
 def wanted_pictures(cast: Cast, ctx: Any) -> tuple[Wanted, str]:
-    """Return the reference pictures of `cast`, and the name of the reference. `ctx`: OpenGL context in use."""
+    """Return the function that makes reference pictures of `cast`, and the name of the reference.
+
+    `ctx`: OpenGL context in use.
+    """
     from trilane.bench.lib.full_picture import true_pictures
 
     true = true_pictures(cast, ctx)
@@ -105,13 +111,16 @@ def spread(total: int, frames: int) -> list[int]:
 
 
 def around(boxes: Sequence[Box], output: Shape) -> tuple[slice, slice]:
-    """Return rows and columns of the `region` of a picture of `output` that holds all `boxes`, at least one."""
+    """Return `region` as slices of rows and columns. `boxes`: at least one."""
     box = region(boxes, output)
     return slice(box.top, box.bottom), slice(box.left, box.right)
 
 
 def region(boxes: Sequence[Box], output: Shape) -> Box:
-    """Return the smallest rectangle of a picture of `output` that holds `boxes`, with room for MS-SSIM if it fits."""
+    """Return the rectangle of a picture that holds all `boxes`, enlarged for MS-SSIM if the picture has the room.
+
+    `output`: (height, width) of the picture.
+    """
     top, left = min(box.top for box in boxes), min(box.left for box in boxes)
     bottom, right = max(box.bottom for box in boxes), max(box.right for box in boxes)
     rows, columns = _with_room(top, bottom, output[0]), _with_room(left, right, output[1])
@@ -124,18 +133,18 @@ def _with_room(first: int, last: int, side: int) -> tuple[int, int]:
     return begin, begin + length
 
 
-#: Bounds on the difference of any two runtimes, of 255.
+#: Bounds on the mean and the largest difference of two runtimes' pictures, in steps of 1/255.
 MEAN_BOUND, LARGEST_BOUND = 0.5, 4
 
 
 def runtime_differences(checked: Checked, runtimes: Sequence[str], frames: int) -> dict[str, Any]:
-    """Return how far apart the pictures of each pair of runtimes are, which all get the same bytes.
+    """Return the differences between the pictures of each pair of runtimes, which get the same input bytes.
 
     `checked`: the scene and its avatars. `runtimes`: names of two or more runtimes. `frames`: number of frames, evenly
     spread over the scene.
-    Keys: `rows`, one per pair: `first`, `second`, `mean`, `largest` (of 255, over all channels and frames),
-    `worst_frame`; `sources`; `bounds`; `frames` (numbers of those that show an avatar); `runtimes` (name to version).
-    Raises BadInputError and MissingPartError.
+    Keys: `rows`, one per pair: `first`, `second`, `mean`, `largest` (in steps of 1/255, over all channels and frames),
+    `worst_frame`; `sources`; `bounds`; `frames` (numbers of the frames that show an avatar); `runtimes` (name ->
+    version). Raises BadInputError and MissingPartError.
     """
     wanted = spread(checked.config.scene.frames, frames)
     if len(set(runtimes)) < 2 or len(set(runtimes)) < len(runtimes):
@@ -163,7 +172,7 @@ def runtime_differences(checked: Checked, runtimes: Sequence[str], frames: int) 
 
 
 def _row(pair: tuple[str, str], steps: list[tuple[float, int, int]]) -> dict[str, Any]:
-    """Return the row of a pair. `steps`: (mean, largest, number) of each frame."""
+    """Return the row of a pair. `steps`: (mean difference, largest difference, number of the frame) of each frame."""
     return {
         "first": pair[0],
         "second": pair[1],
@@ -174,7 +183,7 @@ def _row(pair: tuple[str, str], steps: list[tuple[float, int, int]]) -> dict[str
 
 
 class _Sessions:
-    """A network on each runtime, by tensor shape."""
+    """Runs a network on several runtimes. Sessions are kept by runtime and tensor shape."""
 
     def __init__(self, network: NetworkFile, runtimes: Sequence[str]) -> None:
         self._network = network
@@ -182,7 +191,7 @@ class _Sessions:
         self._bound: dict[tuple[str, Shape], tuple[U8, U8, Binding]] = {}
 
     def picture(self, runtime: str, tensor: U8) -> U8:
-        """Return the picture (h,w,4) that `runtime` makes of `tensor` (h,w,C)."""
+        """Return the picture (h,w,4) uint8 by `runtime` from `tensor` (h,w,C) uint8."""
         shape = (int(tensor.shape[0]), int(tensor.shape[1]))
         if (runtime, shape) not in self._bound:
             slots = np.empty((1, *tensor.shape), np.uint8), np.empty((1, *shape, 4), np.uint8)
@@ -196,9 +205,9 @@ class _Sessions:
 
 
 def _tensors(checked: Checked, frames: Sequence[int]) -> Iterator[tuple[int, int, U8]]:
-    """Yield frame, network and tensor (h,w,C) of those of `frames` that show an avatar.
+    """Yield (frame, network, tensor) for each network that paints an avatar in one of `frames`.
 
-    A frame has a tensor for each network that paints somebody in it.
+    The frame and the network are numbers; a tensor is (h,w,C) uint8.
     """
     painter = DrawnTensors(checked)
     for frame in frames:
@@ -207,7 +216,7 @@ def _tensors(checked: Checked, frames: Sequence[int]) -> Iterator[tuple[int, int
 
 
 class DrawnTensors:
-    """The pose and raster stages of the scene in `checked`, as in a run, and the slots between them."""
+    """Draws the tensors of the scene in `checked` with a run's pose and raster stages."""
 
     def __init__(self, checked: Checked) -> None:
         config, assets = checked.config, checked.assets
@@ -223,9 +232,9 @@ class DrawnTensors:
         self._config = config
 
     def tensors(self, frame: int) -> dict[int, U8]:
-        """Return the tensors (h, w, C) of a frame, valid until the next call, by the number of the network.
+        """Return the tensors (h, w, C) uint8 of a frame, by the number of the network, valid until the next call.
 
-        A network that paints nobody in the frame has none.
+        A network that paints nobody in the frame has no tensor.
         """
         self._pose.run(frame, None, 0)
         self._raster.run(frame, 0, 0)

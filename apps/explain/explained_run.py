@@ -1,8 +1,8 @@
 """Where the time of a run went, as a document and as a table of its jobs.
 
 Rule: the figures come from one pass over the journal of a live or finished run, in bounded memory. The report of a
-finished run says how it ended. The table is written during a second pass, because the first pass finds the figures that
-stages report, which are the last columns.
+finished run says how it ended. The table is written during a second pass, because the first pass finds the metrics of
+the stages, which are the last columns.
 """
 
 from __future__ import annotations
@@ -58,16 +58,16 @@ ENDINGS = (".csv", ".parquet")
 
 
 def _explained_jobs(begun: Begun, records: Iterable[Record]) -> Iterator[ExplainedJob]:
-    """Yield every job of a journal with its wait explained. `records`: the records that follow `begun`."""
+    """Yield every job of a journal with the causes of its wait. `records`: the records that follow `begun`."""
     timeline = Timeline(begun.graph, begun.settings, waits=True)
     for record in records:
         yield from (fact for fact in timeline.add(record) if isinstance(fact, ExplainedJob))
 
 
 def open_journal(folder: Path) -> tuple[Begun, Iterator[Record]]:
-    """Return the first record of a run folder's journal, and the records that follow it.
+    """Return the first record of the journal in a run folder, and an iterator over the records that follow.
 
-    Raises BadInputError for a folder without a journal and, also while it is read, for a file that is no journal.
+    Raises BadInputError for a folder without a journal and, also from the iterator, for a broken journal.
     """
     path = journal_in(folder)
     if path is None:
@@ -81,7 +81,7 @@ def open_journal(folder: Path) -> tuple[Begun, Iterator[Record]]:
 
 
 class RunExplanation:
-    """Takes the records of a journal after the first; `document` is the explanation.
+    """Explains a run. `add` takes the records of its journal after the first; `document` returns the explanation.
 
     `begun`: first record of the journal. `report`: report of the run, None while it goes on. `slowest`: number of
     frames to name. `name`: the run's folder.
@@ -100,7 +100,7 @@ class RunExplanation:
         self._said: deque[str] = deque(maxlen=MOST_MESSAGES)
 
     def add(self, record: Record) -> None:
-        """Take the next record."""
+        """Take the next record of the journal."""
         if isinstance(record, Said):
             self._said.append(record.text)
         for fact in self._timeline.add(record):
@@ -168,7 +168,7 @@ class RunExplanation:
         }
 
     def _of_run(self) -> dict[str, Any]:
-        """Return the facts of the run from before its first frame, and how it ended."""
+        """Return the facts of the run that are known before its first frame, and how it ended."""
         facts, report = self._begun.facts, self._report
         return {
             "scene": config_of(self._begun).get("scene", {}).get("name"),
@@ -196,7 +196,10 @@ class RunExplanation:
         }
 
     def _of_cores(self, frame_ms: float | None, efficiency: float | None) -> dict[str, Any] | None:
-        """Return the CPU time of all jobs per frame, and the time of the run's cores; None if either is unknown."""
+        """Return the run's cores and, for a mean frame, the time that the cores had and the CPU time of all jobs.
+
+        `frame_ms`: mean frame time. `efficiency`: machine efficiency. None if a part is unknown.
+        """
         cores = sorted({core for place in self._places.values() for core in place.cores})
         if frame_ms is None or efficiency is None or not cores or len(self._places) < len(self._begun.graph.units):
             return None
@@ -204,7 +207,7 @@ class RunExplanation:
         return {"numbers": cores, "cpu_ms": efficiency * had_ms, "had_ms": had_ms}
 
     def _spare_cores(self, unit_of: Mapping[str, str]) -> int:
-        """Return the number of cores that the run had beyond one for each unit; below 0, units share cores."""
+        """Return the number of cores that the run had beyond one for each unit; negative if units must share cores."""
         cpu = self._begun.facts.get("machine", {}).get("cpu", {})
         return len(cpu.get("cores_allowed", ())) - len(set(unit_of.values()))
 
@@ -212,7 +215,7 @@ class RunExplanation:
 def explain_run(folder: Path, slowest: int = 10) -> dict[str, Any]:
     """Return where the time of the run in `folder` went, as plain data. `slowest`: number of frames to name.
 
-    Raises BadInputError for a folder that is no run's, or whose journal or report cannot be read.
+    Raises BadInputError if `folder` is no run folder, or if its journal or report cannot be read.
     """
     report = read_report(folder) if (folder / "report.json").exists() else None  # there is none while a run goes on
     begun, records = open_journal(folder)
@@ -229,8 +232,8 @@ def explain_frame(folder: Path, number: int) -> dict[str, Any]:
     """Return what became of frame `number` of the run in `folder`, with a row for each of its jobs, as plain data.
 
     `outcome` is `presented`, `dropped`, `lost` or `under way`; `cause` is the key of the report that counts a dropped
-    or lost frame. `after_ms` and the begins of jobs count from the frame's release. Raises BadInputError as
-    `explain_run` does, and for a frame that the journal does not tell.
+    or lost frame. `after_ms` and the jobs' `begin_ms` count from the frame's release. Raises BadInputError as
+    `explain_run` does, and for a frame that is not in the journal.
     """
     begun, records = open_journal(folder)
     timeline = Timeline(begun.graph, begun.settings, waits=True)
@@ -321,20 +324,23 @@ def _slow_row(shown: ShownFrame, usual: Usual) -> dict[str, Any]:
 
 
 def figure_names(folder: Path) -> list[str]:
-    """Return the names of the figures that the stages of a run report, sorted. Raises BadInputError."""
+    """Return the names of the metrics that the stages of a run report, sorted. Raises BadInputError."""
     _, records = open_journal(folder)
     return sorted({name for record in records if isinstance(record, Worked) for name in record.figures})
 
 
 def job_rows(folder: Path, figures: Sequence[str]) -> Iterator[tuple[Any, ...]]:
-    """Yield a row for each job, in the order of their ends: COLUMNS, then `figures`, None where a stage has none."""
+    """Yield a row for each job, in the order of their ends: COLUMNS, then `figures`; None if a job has no such figure.
+
+    `figures`: names of metrics of the stages.
+    """
     values = [value for _, value in COLUMNS.values()]
     for one in _explained_jobs(*open_journal(folder)):
         yield (*(value(one) for value in values), *(one.figures.get(name) for name in figures))
 
 
 def check_ending(target: Path) -> None:
-    """Raise BadInputError for a name that ends in none of ENDINGS."""
+    """Raise BadInputError if the name of `target` ends in none of ENDINGS."""
     if target.suffix.lower() not in ENDINGS:
         raise BadInputError("--jobs", f"'{target}'", f"a name that ends in {' or '.join(ENDINGS)}")
 
@@ -342,8 +348,8 @@ def check_ending(target: Path) -> None:
 def write_jobs(folder: Path, target: Path) -> int:
     """Write every job of the run in `folder` to `target`, a .csv or .parquet file, and return their number.
 
-    Raises BadInputError for another ending, a folder that is no run's and a place that cannot be written;
-    MissingPartError where .parquet lacks its library.
+    Raises BadInputError for another ending, for a folder that is no run folder, and for a place that cannot be written.
+    Raises MissingPartError if .parquet lacks its library.
     """
     check_ending(target)
     figures = figure_names(folder)
@@ -386,10 +392,9 @@ MOST_ENDS: Final = 1024  # frames whose ends are kept for each stage; far more t
 
 
 class Joins:
-    """For stages with several inputs: which input of each frame came last, and how long after the others.
+    """For stages with several inputs: which input of a frame came last, and how long after the one before.
 
-    It takes the jobs of a run in the order of their ends: an input came when the job that wrote it ended. Inputs of the
-    newest frame are not waited for.
+    An input comes when the job that writes it ends. Inputs with `sync = "latest"` do not count: no job waits for them.
     """
 
     def __init__(self, graph: Graph) -> None:
@@ -401,7 +406,7 @@ class Joins:
         self._after_ns = {name: Counter[str]() for name in self._reads}
 
     def add(self, explained: ExplainedJob) -> None:
-        """Take the next job that has ended."""
+        """Count a job. Jobs must come in the order of their ends."""
         job = explained.job
         if read := self._reads.get(job.stage):
             ends = sorted((self._ends[name].get(job.frame, -1), name) for name in read)
@@ -414,7 +419,7 @@ class Joins:
                 del kept[next(iter(kept))]
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return, for each stage that joins, in how many jobs each input came last, and how long after the others."""
+        """Return, by stage and input, in how many jobs the input came last, and its mean time after the one before."""
         return [
             {
                 "stage": stage,
@@ -428,7 +433,7 @@ class Joins:
 
 
 def join_text(row: dict[str, Any]) -> str:
-    """Return a sentence on a row of `Joins.rows`: the inputs of the stage, the most frequent last one first."""
+    """Return a sentence about a row of `Joins.rows`. The input that came last most often is named first."""
     inputs = sorted(row["inputs"].items(), key=lambda each: -each[1]["last"])
     jobs = sum(each["last"] for _, each in inputs)
     found = [

@@ -1,8 +1,8 @@
 """Why a run takes its time, in words: its slowest frames with their reasons, what bounded it, and what to try.
 
-Rule: each cause names its evidence. A frame's time is the path that ends with it, from the presentation of the frame
-before to its own. The usual length of a part of the path is its median over the run's frames. Parts that took longer
-than usual made the frame slow.
+Rule: each cause names its evidence. A frame's time is the critical path between the presentation of the frame before
+and its own presentation. The usual length of a part of the path is its median over the run's frames. Parts that took
+longer than usual made the frame slow.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from trilane.scheduler.events import Graph
 from trilane.scheduler.ledger import JobRecord
 from trilane.units import NS_PER_MS
 
-DELAY: Final = 16  # presented frames; by then all jobs beside those of a frame have ended
+DELAY: Final = 16  # in presented frames; all jobs that ran beside a frame's jobs have ended by then
 MOST_SAMPLES: Final = 4096
 LEAST_LONGER: Final = 0.05  # share of the median; a frame that took hardly longer than usual has no reason
 LEAST_SHARE: Final = 0.1  # share of a frame's extra time that a reason needs to be named
 MOST_REASONS: Final = 3
-#: Least share of the frame time for advice; what bounds less is not worth an attempt.
+#: Least share of the frame time for advice; a smaller part is not worth an attempt.
 LEAST_ADVISED_SHARE: Final = 0.1
 MOST_ADVICE: Final = 4
 
@@ -46,8 +46,8 @@ T = TypeVar("T")
 class ShownFrame(NamedTuple):
     """A presented frame and the one that was presented before it.
 
-    `frame_ns`: time from the one to the other, ns. `parts_ns`: parts of that time, ns. `longest`: for each part the job
-    with the largest piece of it.
+    `frame_ns`: time between the two presentations. `parts_ns`: parts of that time. `longest`: for each part, the job
+    with its largest piece.
     """
 
     now: Presented
@@ -58,7 +58,7 @@ class ShownFrame(NamedTuple):
 
 
 class Usual(NamedTuple):
-    """Medians over a run: frame time, its parts and each stage's service time, ns. `unit_of`: unit of each stage."""
+    """Medians over a run: frame time, its parts, and service time by stage. `unit_of`: unit of each stage."""
 
     frame_ns: float
     parts_ns: Mapping[Part, float]
@@ -67,7 +67,10 @@ class Usual(NamedTuple):
 
 
 class Reason(NamedTuple):
-    """Why a frame was slow. `stage`: where. `longer_ms`: extra time for this reason. `text`: the reason in words."""
+    """Why a frame was slow: the part (`cause`, `stage`) of its path took `longer_ms` more than usual.
+
+    `text`: the reason in words.
+    """
 
     cause: str
     stage: str
@@ -76,7 +79,7 @@ class Reason(NamedTuple):
 
 
 class EvenSample(Generic[T]):
-    """A sample of at most MOST_SAMPLES of the added values, evenly spaced; of fewer values it has all."""
+    """At most MOST_SAMPLES of the added values, evenly spaced; all values if they are not more."""
 
     def __init__(self) -> None:
         self.values: list[T] = []
@@ -94,9 +97,9 @@ class EvenSample(Generic[T]):
 
 
 class SlowFrames:
-    """Finds the slowest frames from the jobs of a run in order; `paths` and `sharing` get each job first.
+    """Finds the slowest frames of a run.
 
-    `most`: number of slowest frames to keep.
+    `paths`, `sharing`: the caller adds each job to these two first. `most`: number of slowest frames to keep.
     """
 
     def __init__(self, graph: Graph, paths: Paths, sharing: Sharing, most: int) -> None:
@@ -183,7 +186,7 @@ def reasons(shown: ShownFrame, usual: Usual) -> list[Reason]:
 
 
 def notes(shown: ShownFrame) -> list[str]:
-    """Return what else differs from the frame before: frames lost between the two, the rung, and the bypass."""
+    """Return, in words, what else differs from the frame before: frames missing between the two, rung and bypass."""
     said = []
     now, before = shown.now, shown.before
     missing = now.frame - before.frame - 1
@@ -222,7 +225,10 @@ def _text(shown: ShownFrame, usual: Usual, part: Part, longer_ns: float) -> str:
 
 
 def _work(shown: ShownFrame, usual: Usual, job: JobRecord, longer_ns: float) -> str:
-    """Return why a stage had a larger part: its job was long, or more of the job lay between the two frames."""
+    """Return, in words, why a stage's work took a larger part of the path.
+
+    Either its job took longer, or less of the job overlapped with the frame before.
+    """
     service_ns, usual_ns = job.end_ns - job.begin_ns, usual.service_ns.get(job.stage, 0.0)
     times = f"{service_ns / NS_PER_MS:.1f} ms, median {usual_ns / NS_PER_MS:.1f}"
     whose = "" if job.frame == shown.now.frame else f" of frame {job.frame}"
@@ -236,7 +242,7 @@ def _work(shown: ShownFrame, usual: Usual, job: JobRecord, longer_ns: float) -> 
 def bound_text(bound: Mapping[str, Any]) -> str:
     """Return a report's `bound` in words: the unit and the stage, what slowing them costs and their shares of the path.
 
-    Units and stages with most of the path, if others than the bound, come last.
+    If another unit or stage has most of the path, it is named last.
     """
     named = ", and of stages most ".join(part_text(part) for part in (bound["unit"], bound["stage"]) if part)
     path = bound.get("path") or {}
@@ -245,7 +251,7 @@ def bound_text(bound: Mapping[str, Any]) -> str:
 
 
 def part_text(part: Mapping[str, Any]) -> str:
-    """Return a unit or stage of a report's `bound` in words, with its interval and its rivals."""
+    """Return an entry of a report's `bound`, a unit or a stage, in words, with its interval and its rivals."""
     cost = part.get("cost")
     key, value = ("share", part["share"]) if cost is None else ("cost", cost)
     low, high = part[f"{key}_low"], part[f"{key}_high"]
@@ -265,8 +271,9 @@ SHORTER = {
     "present": "a smaller `--picture`: the picture is encoded there",
 }
 
-#: Cause -> what to try where a run of a pipeline file has no such option.
+#: Replaces rows of `OF_CAUSES` for a pipeline file, whose run has no `--latch`.
 OF_FILES = {HELD: "another `--policy` or `--edge` lets {stage} begin sooner (docs/policies-and-edges.md)"}
+#: Part of the path that is no work -> what to try.
 OF_CAUSES = {
     THROTTLED: "a performance profile with more power, such as `--performance-profile burst`, caps {unit} less",
     DOWN: "{unit} was restarted: the run's messages say why",
@@ -285,9 +292,9 @@ def advice(
 ) -> list[str]:
     """Return what a person could try, as sentences that name their reason.
 
-    First comes the policy, then what other programs took, then the largest rows. `budget`: rows of the document, the
-    largest first. `policy`: policy of the run. `spare_cores`: cores of the machine beyond one for each unit.
-    `is_of_file`: whether the run is of a pipeline file. Otherwise its stages are the avatar's.
+    The policy comes first, then time taken by other programs, then the largest rows. `budget`: rows of the document's
+    `budget`, the largest first. `policy`: policy of the run. `spare_cores`: cores of the machine beyond one for each
+    unit. `is_of_file`: whether a pipeline file was run. Otherwise the stages are the avatar's.
     """
     found = []
     works = [row for row in budget if row["what"] == WORK]

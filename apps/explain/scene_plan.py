@@ -1,10 +1,10 @@
-"""The plan that a run makes for each frame of a scene: in words and figures, with costs and savings, and drawn.
+"""The plan that a run makes for each frame of a scene: in words and figures, with costs and savings, and as a drawing.
 
 Rule: the run's own pose stage decides. `ScenePlan` measures how far a level of detail moves vertices on the picture,
 against the whole body in float64. Costs are computed, never measured, by the same model as `trilane predict`; joints
 and vertices count for each avatar in view. Every figure says whether it is a bound, measured or computed. The drawing
-shows the plan, not the painted frame: the bodies' vertices, their rectangles and the tensor's, for a frame of each
-phase.
+shows the plan for a frame of each phase, not the painted frame: the bodies' vertices, the bodies' rectangles and the
+tensor's crop rectangles.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class PlannedFrame:
 
 
 class ScenePlan:
-    """The plan of a configuration that was checked, frame by frame in order."""
+    """Plans the frames of a checked configuration, one after the other. `output`: (height, width) of the picture."""
 
     def __init__(self, config: RunConfig, assets: Assets) -> None:
         self.config, self._assets = config, assets
@@ -78,20 +78,20 @@ class ScenePlan:
         self._staged = staged_of(assets)
 
     def decide(self, frame: int) -> PlannedFrame:
-        """Decide `frame` as the run does. Frames come in order, because the shape of one depends on the one before."""
+        """Return the plan of `frame`, as a run decides. Call it in order: the shape depends on the frame before."""
         self._stage.run(frame, None, 0)
         plan = self._stage.plan
         crops = {number: Rect(*self._packet.header["avatars"][number]["rect"].tolist()) for number in plan.seen}
         return PlannedFrame(frame, plan, crops)
 
     def places(self, frame: int, avatar: int) -> F64:
-        """Return the pixels (V,2) of the picture where the whole body's vertices lie; NaN for any outside of it."""
+        """Return where the vertices of the whole body lie in the picture (V,2): x, y in pixels; NaN outside of it."""
         return self._places(self._exact(frame, avatar), frame)
 
     def measured_px(self, frame: int, avatar: int) -> float:
-        """Return the largest distance in pixels by which the last decision, for `frame`, moves a vertex of `avatar`.
+        """Return the largest distance by which the plan of `frame` moves a vertex of `avatar` in the picture, pixels.
 
-        Vertices that the level of the mesh leaves out do not count.
+        Call it after `decide(frame)`. Vertices that the level of the mesh leaves out do not count.
         """
         if not self._drawn:
             return 0.0
@@ -119,7 +119,10 @@ class ScenePlan:
 
 
 def _kept(assets: Assets, number: int) -> list[I64 | slice]:
-    """Return the numbers of the vertices that each level of the mesh of distinct avatar `number` keeps."""
+    """Return the vertices that each level of an avatar's mesh keeps, as indices; level 0 is the whole mesh.
+
+    `number`: number of the avatar among the distinct ones.
+    """
     return [slice(None), *(np.unique(level.faces).astype(np.int64) for level in mesh_levels_of(assets, number))]
 
 
@@ -129,7 +132,7 @@ def _packet(config: RunConfig) -> Packet:
 
 
 def phases(frames: Sequence[PlannedFrame]) -> list[list[PlannedFrame]]:
-    """Group frames in a row of equal work and tensor shape that model the same avatars at the same levels."""
+    """Return groups of successive frames with the same work, tensor shape, visible avatars and levels."""
     groups: list[list[PlannedFrame]] = []
     for planned in frames:
         if groups and _kind(groups[-1][-1]) == _kind(planned):
@@ -145,7 +148,7 @@ def _kind(planned: PlannedFrame) -> tuple[object, ...]:
 
 
 def draw_plan(plan: ScenePlan, frames: Sequence[PlannedFrame], file: Path) -> None:
-    """Write a sheet of at most `MOST_FRAMES` of `frames`, evenly spread, as PNG; `file` is replaced whole."""
+    """Draw at most `MOST_FRAMES` of `frames`, evenly spread, into one picture, and write it as a PNG file."""
     step = max(1, math.ceil(len(frames) / MOST_FRAMES))
     tiles = [_tile(plan, planned) for planned in frames[::step]]
     columns = math.ceil(math.sqrt(len(tiles)))
@@ -189,7 +192,7 @@ def _label(planned: PlannedFrame) -> str:
     return f"frame {planned.frame}: tensor {shape[0]}x{shape[1]}{density}"
 
 
-#: What every plan is compared with: the square that the reference application fills.
+#: Tensor shape of the reference application. Every plan is compared with it.
 FIXED: Shape = (512, 512)
 BOUND = "proved bound, in pixels of the picture"
 WHY = {
@@ -208,8 +211,8 @@ ALWAYS = ("pose", "composite", "present")
 class PlanExplanation:
     """An explained plan.
 
-    `document`: keys of `trilane plan --json`. `plan`, `first_frames`: plan and first frame of each phase, to be
-    drawn.
+    `document`: document of `trilane plan --json`. `plan`: the plan, and `first_frames`: the first frame of each phase,
+    both for the drawing.
     """
 
     document: dict[str, Any]
@@ -218,7 +221,7 @@ class PlanExplanation:
 
 
 def explain(checked: Checked, profile: str, performance_profile: str, most_measured: int = 24) -> PlanExplanation:
-    """Explain the plan of a scene that was checked.
+    """Return the explained plan of a checked scene.
 
     `profile`, `performance_profile`: hardware profile and performance profile that the costs are computed with.
     `most_measured`: number of phases whose error is measured, at one frame each.
@@ -268,7 +271,7 @@ def explain(checked: Checked, profile: str, performance_profile: str, most_measu
 
 
 class _Bodies:
-    """The bodies of the avatars, and what each level of detail leaves out of them."""
+    """The bodies of the avatars, and the parts that each level of detail leaves out."""
 
     def __init__(self, checked: Checked) -> None:
         folders = distinct(checked.config)
@@ -277,7 +280,7 @@ class _Bodies:
         self.left_out = cache(self._left_out)
 
     def triangles(self, avatar: int) -> int:
-        """Return the number of triangles of the whole mesh."""
+        """Return the number of triangles of the avatar's whole mesh."""
         return len(self._bodies[avatar].faces)
 
     def _left_out(self, avatar: int, level: int) -> list[str]:
@@ -285,7 +288,7 @@ class _Bodies:
 
 
 def _image(checked: Checked) -> dict[str, Any]:
-    """Return the size of a planned tensor as a share of its network's own pixels, and the loss that it costs."""
+    """Return the pixels of a planned tensor as a share of its network's own, and the loss of PSNR that this costs."""
     if not checked.config.scene.plans_tensor:
         return {"work": None, "psnr_loss_db": None, "source": "the scene fixes the tensor's size"}
     work = checked.config.works[0]
@@ -355,7 +358,7 @@ def _most(group: Sequence[PlannedFrame]) -> float:
 
 
 def _why(group: Sequence[PlannedFrame]) -> str:
-    """Say why the tensor of a phase is as it is."""
+    """Return, in words, why the tensor of a phase has its size."""
     first = group[0].plan
     if first.work in WHY:
         return WHY[first.work]
@@ -375,14 +378,17 @@ def _saved(cost: FrameCost, fixed: FrameCost) -> dict[str, float]:
 
 
 def _usual(frames: Sequence[PlannedFrame], costs: CostModel) -> tuple[Shape | None, int, Networks]:
-    """Return the shape of most full frames, and what is in view there; None, 0 and the first network without any."""
+    """Return the most frequent kind of a frame with all work: tensor shape, number of avatars in view, their networks.
+
+    Without such a frame, return None, 0 and the first network.
+    """
     full = [one.plan for one in frames if one.plan.work is FrameWork.FULL]
     kinds = Counter((plan.shape, *costs.in_view(plan)) for plan in full)
     return kinds.most_common(1)[0][0] if kinds else (None, 0, FIRST)
 
 
 def _totals(frames: Sequence[PlannedFrame], costs: CostModel) -> dict[str, Any]:
-    """Add up all frames, as planned and with the fixed square that shows the same avatars."""
+    """Add up the costs of all frames: as planned, and with a tensor of shape `FIXED` for the same avatars."""
     planned = [_cost(one.plan, costs) for one in frames]
     fixed = [costs.of(FIXED, *costs.in_view(one.plan)) for one in frames]
     return {
@@ -401,9 +407,8 @@ def _totals(frames: Sequence[PlannedFrame], costs: CostModel) -> dict[str, Any]:
 class FrameCost:
     """The cost of one frame.
 
-    `pixels`: pixels of its tensors. `gmac`: products of the networks, 1e9. `work_ms`: time of all stages, one after the
-    other.
-    `frame_ms`: time between frames of its kind when they are pipelined.
+    `pixels`: pixels of its tensors. `gmac`: multiply-accumulates of its networks, in 1e9. `work_ms`: time of all
+    stages, one after the other. `frame_ms`: frame time if all frames are like this one and pipelined.
     """
 
     pixels: int
@@ -416,9 +421,9 @@ class FrameCost:
 
 
 def least_frame_ms(chip: Profile, times: Mapping[tuple[str, UnitName], float]) -> float:
-    """Return the time between frames whose jobs take `times`, ms by stage and unit.
+    """Return the least frame time of pipelined frames: the time of the busiest core, or the display's if longer.
 
-    It is the time of the busiest core, and no less than that of the display.
+    `times`: time of each stage's job, ms, by stage and unit. A unit without a core counts as a core of its own.
     """
     worker = workers_of(chip)
     busy = (sum(ms for (_, unit), ms in times.items() if worker[unit] == one) for one in set(worker.values()))
@@ -435,23 +440,20 @@ class CostModel:
         performance_profile: str,
         painters: Callable[[Iterable[int]], Networks] = lambda _avatars: FIRST,
     ) -> None:
-        """Take the chip.
-
-        `painters`: numbers of the networks that paint avatars, given by their numbers.
-        """
+        """`painters`: function from the numbers of avatars to the numbers of the networks that paint them."""
         self._networks, self._chip, self._painters = networks, load_runnable(profile), painters
         self._corners = corners_of(self._chip, performance_profile)
         self.of = cache(self._of)
 
     def in_view(self, plan: FramePlan) -> tuple[int, Networks]:
-        """Return the number of avatars that a frame shows, and the networks that paint them."""
+        """Return the number of avatars that a frame shows, and the numbers of the networks that paint them."""
         return len(plan.seen), self._painters(plan.seen) or FIRST
 
     def _of(self, shape: Shape | None, avatars: int = 1, networks: Networks = FIRST) -> FrameCost:
-        """Return the cost of a frame whose tensors have `shape`, None for no tensor, with `avatars` avatars in view.
+        """Return the cost of a frame with `avatars` avatars in view. `shape`: shape of its tensors; None for no tensor.
 
-        `networks`: numbers of the networks that paint them, each on a tensor. A frame with nobody in view still counts
-        one avatar's pose, because the pose stage looks for somebody.
+        `networks`: numbers of the networks that paint the avatars, each on a tensor of its own. With nobody in view,
+        the pose of one avatar still counts, because the pose stage looks for somebody.
         """
         plan = self._plan(shape, avatars, networks)
         times = stage_times_ms(self._chip, plan, self._corners)
@@ -470,8 +472,8 @@ class CostModel:
     ) -> dict[str, Any]:
         """Return the best placement of the units for frames of `shape` that show `avatars` avatars, and why.
 
-        The model of `trilane predict` decides. `networks`: as in `of`. `asked`: cores of units of this machine. Raises
-        BadInputError when cores of another chip are asked for.
+        The model of `trilane predict` decides. `networks`: as in `of`. `asked`: cores that the user chose for units of
+        this machine. Raises BadInputError if cores are chosen for another chip.
         """
         asked = asked or {}
         if self._chip.name != HOST:

@@ -2,8 +2,8 @@
 
 Rule: memory is bounded by what the run has in flight. A slice is a recorded job, or the time between two jobs with its
 cause; only measured times are drawn. The slices of a unit do not overlap, so they sum to its accounts. A frame is late
-as in the report: past its deadline or, without one, longer after the frame before than the scene's rate allows. A file
-is complete or absent.
+as in the report: past its deadline or, without a deadline, after a longer frame time than the scene's rate allows. A
+file is complete or absent.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from trilane.writing import write_atomically
 
 NAME: Final = "trace.pftrace"
 CHROME_NAME: Final = "trace.json"
-#: Ranks of the tracks of a process.
+#: Ranks of tracks within the group of a run: a viewer shows them in this order.
 RUN_RANK, MESSAGE_RANK, FRAME_RANK, UNIT_RANK, SAMPLE_RANK = 0, 1, 2, 10, 1000
-#: Numbers of arrows that each pipeline of a trace has for its frames.
+#: How many numbers of arrows each run in a trace has: one for each of its frames.
 FLOWS_PER_PIPELINE: Final = 1 << 40
-#: First part of a sampled value's name -> what people call it, unit.
+#: First part of a sampled value's name -> title, unit.
 SAMPLED: Final = {"temperature_c": ("temperature", "°C"), "duty": ("duty", ""), "memory_bytes": ("memory", "B")}
 NS_PER_US: Final = 1000
 MOST_LANES: Final = 32
 EXPECTED, ACTUAL, LEFT_OUT, IN_FLIGHT = "Expected frames", "Actual frames", "Lost and dropped", "Frames in flight"
-#: Figures of jobs that become counters of their stage: name -> title, unit.
+#: Metrics of stages that are drawn as counters: name -> title, unit.
 FIGURE_COUNTERS: Final = {
     "bytes_read": ("bytes read", "B"),
     "bytes_written": ("bytes written", "B"),
@@ -46,7 +46,7 @@ FIGURE_COUNTERS: Final = {
     "cache_misses": ("cache misses", ""),
 }
 WAITING: Final = "frames that wait"
-#: Slices that may wait for an earlier one; where a piece of time never gets one, the wait ends after so many.
+#: Slices of a track that may wait for an earlier slice. With more, the earlier slice is taken as missing.
 MOST_WAITING: Final = 256
 Item = TypeVar("Item")
 
@@ -91,7 +91,7 @@ class RunTracks:
                 self._end_ns = record.now_ns
 
     def close(self) -> None:
-        """Write the remaining slices: the run has ended, or its journal has no more records."""
+        """Write the remaining slices, after the last record."""
         for piece in self._timeline.end():
             self._units.idle(piece)
         self._units.close()
@@ -100,14 +100,14 @@ class RunTracks:
             self._sink.end(self._run, max(self._now_ns, self._end_ns))
 
     def _end_step(self, now_ns: int) -> None:
-        """End the step before the one at `now_ns`; before the first step the run's slice begins."""
+        """Write the counters of the step before the one at `now_ns`; at the first step, begin the run's slice."""
         if self._now_ns is None:
             self._sink.begin(self._run, now_ns, "run", _facts_of(self._begun))
         self._count()
         self._now_ns = now_ns
 
     def _count(self) -> None:
-        """Write the counters of the last step, whose records are all known now."""
+        """Write the counters of the last step. Call it when all records of the step are known."""
         if self._now_ns is not None:
             line, stages = self._timeline, self._begun.graph.stages
             self._frames.count(self._now_ns, len(line.frames))
@@ -135,18 +135,21 @@ class TraceWriter:
         self._tracks.add(record)
 
     def close(self) -> None:
-        """Complete the trace."""
+        """Write the rest of the trace. The file stays open."""
         self._tracks.close()
         self._sink.close()
 
 
 def write_trace(records: Iterable[Record], file: IO[bytes]) -> None:
-    """Write the trace of a journal's `records` as Perfetto's packets."""
+    """Write the trace of a journal's `records` to `file` as Perfetto's packets."""
     write_tracks(PacketSink(file), {"trilane": records})
 
 
 def write_tracks(sink: Sink, runs: Mapping[str, Iterable[Record]]) -> None:
-    """Write several runs to one trace, one after the other, each as a group of tracks by its name; close the sink."""
+    """Write several runs to one trace, one after the other, and close `sink`.
+
+    `runs`: name of a group of tracks -> records of the run's journal.
+    """
     for number, (name, records) in enumerate(runs.items()):
         tracks: RunTracks | None = None
         for record in records:
@@ -160,7 +163,7 @@ def write_tracks(sink: Sink, runs: Mapping[str, Iterable[Record]]) -> None:
 
 
 def _facts_of(begun: Begun) -> dict[str, Any]:
-    """Return the facts of a run from before its first frame, and the clock of its times."""
+    """Return the facts of a run that are known before its first frame, and the clock of its times."""
     clocks = {"host": "CLOCK_MONOTONIC", "virtual": "simulated time from 0 on"}
     times = f"ns of {clocks.get(str(begun.facts.get('clock')), 'an unknown clock')}"
     settings = {key: value for key, value in asdict(begun.settings).items() if not isinstance(value, Sequence) or value}
@@ -179,9 +182,9 @@ def write_run(records: Iterable[Record], target: Path, *, chrome: bool = False) 
 
 
 def write_predicted(runs: Mapping[str, Simulation], facts: Mapping[str, Any], target: Path) -> None:
-    """Write the trace of recorded runs in virtual time, each as a group of tracks by its name. Raises BadInputError.
+    """Write the trace of recorded runs in virtual time to `target`. Raises BadInputError.
 
-    `facts`: facts of all the runs, as in `Begun`.
+    `runs`: name of a group of tracks -> run. `facts`: facts that all runs have, as in `Begun`.
     """
     records: dict[str, Iterable[Record]] = {}
     for name, run in runs.items():
@@ -192,7 +195,10 @@ def write_predicted(runs: Mapping[str, Simulation], facts: Mapping[str, Any], ta
 
 
 class _FrameTracks:
-    """The frames of a run as tracks below `parent`, from `rank` on: expected, presented, and lost or dropped ones."""
+    """Tracks of a run's frames, below the track `parent`: expected, presented, and lost or dropped frames.
+
+    `rank`: rank of the first track.
+    """
 
     def __init__(self, sink: Sink, begun: Begun, parent: int, rank: int) -> None:
         self._sink, self._parent = sink, parent
@@ -207,7 +213,7 @@ class _FrameTracks:
         self._before_ns: int | None = None
 
     def add(self, frame: Presented | Gone) -> None:
-        """Take a frame that has left the pipeline: presented, lost or dropped."""
+        """Write a frame that has left the pipeline: presented, lost or dropped."""
         if isinstance(frame, Gone):
             if frame.frame != UNKNOWN:
                 self._expect(frame.frame, frame.release_ns)
@@ -228,7 +234,10 @@ class _FrameTracks:
             self._sink.count(self._in_flight, at_ns, self._flying)
 
     def _expect(self, frame: int, release_ns: int) -> int:
-        """Write when the frame was to be presented, and return its due time; NEVER where none is expected."""
+        """Write the slice of time in which a frame is expected, and return its end, when the frame is due.
+
+        Without a deadline and a rate, write nothing and return NEVER.
+        """
         if self._deadline_ns:
             begin_ns, due_ns = release_ns, release_ns + self._deadline_ns
         elif self._target_ns and self._before_ns is not None:
@@ -246,17 +255,17 @@ class _FrameTracks:
 
 
 def target_period_ns(begun: Begun) -> int:
-    """Return the frame time that the scene of a run is meant for, ns; 0 where the journal says none."""
+    """Return the frame time of the scene's rate in ns; 0 if the journal names no rate."""
     scene = begun.facts.get("config", {}).get("scene", {})
     fps = scene.get("fps") if isinstance(scene, dict) else None
     return round(1e9 / fps) if isinstance(fps, int | float) and fps > 0 else 0
 
 
 class _UnitTracks:
-    """The units of a run as tracks below `parent`, from `rank` on: jobs, idle time by cause, and the stages.
+    """Tracks of a run's units, below the track `parent`: jobs, idle time by cause, and the unit's stages.
 
-    A job that its unit held while the unit did another one is shown from its begin on; its notes say how long it had no
-    core. `flows_from`: number of frame 0's arrow; frame n is part of arrow `flows_from` + n.
+    A job that was dispatched ahead is shown from its begin on. `rank`: rank of the first track. `flows_from`: number of
+    frame 0's arrow; frame n is part of arrow `flows_from` + n.
     """
 
     def __init__(self, sink: Sink, graph: Graph, parent: int, rank: int, flows_from: int = 1) -> None:
@@ -277,12 +286,12 @@ class _UnitTracks:
         self._figures: dict[tuple[str, str], float] = {}
 
     def start(self, at_ns: int) -> None:
-        """Begin the time of the accounts."""
+        """Begin the time that the ledger accounts for."""
         for tiles in self._tiles.values():
             tiles.start(at_ns)
 
     def work(self, worked: Worked) -> None:
-        """Take a job that has ended."""
+        """Write a job that has ended, and the counters that it changed."""
         job = worked.job
         self._tiles[job.unit].add(job.begin_ns, job.end_ns, job)
         self._sink.slice(self._stages[job.stage], job.begin_ns, job.end_ns, f"{job.frame}")
@@ -290,12 +299,12 @@ class _UnitTracks:
         self._write(job.unit)
 
     def idle(self, piece: IdleSlice) -> None:
-        """Take a slice of a unit's idle time."""
+        """Write a slice of a unit's idle time."""
         self._tiles[piece.unit].add(piece.begin_ns, piece.end_ns, piece)
         self._write(piece.unit)
 
     def count(self, at_ns: int, waiting: Mapping[str, int]) -> None:
-        """Write how many frames wait before each stage, where that has changed."""
+        """Write how many frames wait before each stage, if their number has changed."""
         for stage, frames in waiting.items():
             counter, depth = self._depths.get(stage, (0, 0))
             if frames == depth:
@@ -321,7 +330,7 @@ class _UnitTracks:
                 self._sink.slice(track, begin_ns, end_ns, piece.stage, _notes_of(piece), flow)
 
     def _count_figures(self, job: JobRecord, figures: Mapping[str, float]) -> None:
-        """Write the counters that changed since the stage's last job, at the job's begin. A counter begins above 0."""
+        """Write, at the job's begin, each counter of the stage that has changed. A counter starts with the value 0."""
         for rank, (name, (title, unit)) in enumerate(FIGURE_COUNTERS.items(), start=1):
             key, value = (job.stage, name), figures.get(name)
             if value is None or self._figures.get(key, 0) == value:
@@ -338,15 +347,15 @@ def _notes_of(job: JobRecord) -> dict[str, int | str]:
 
 
 def _if_any(**notes: int | str) -> dict[str, int | str]:
-    """Return those that are neither 0 nor empty."""
+    """Return the notes that are neither 0 nor empty."""
     return {name: value for name, value in notes.items() if value}
 
 
 class Tiles(Generic[Item]):
-    """The slices of one track, which come in any order and leave in order, without overlap.
+    """Puts the slices of one track in order, without overlap.
 
-    A unit always has a job or is idle, so a slice can be written as soon as the slices before it reach its begin. A
-    slice that begins within the written time is cut.
+    A unit always has a job or is idle, so a slice can be written as soon as earlier slices fill the time up to its
+    begin. If a slice begins within the written time, its begin is cut.
     """
 
     def __init__(self) -> None:
@@ -360,7 +369,7 @@ class Tiles(Generic[Item]):
         heappush(self._waiting, (begin_ns, end_ns, self._count, item))
 
     def start(self, at_ns: int) -> None:
-        """Begin the track's time."""
+        """Set the time at which the first slice of the track begins."""
         self._until_ns = at_ns
 
     def take(self, *, rest: bool = False) -> Iterator[tuple[int, int, Item]]:
@@ -378,9 +387,9 @@ class Tiles(Generic[Item]):
 
 
 class Lanes:
-    """Puts overlapping slices into lanes in which they do not overlap; lanes are numbered from 0.
+    """Distributes overlapping slices over lanes, numbered from 0, so that those of a lane do not overlap.
 
-    `most`: largest number of lanes; where more slices overlap, the begin of one is cut.
+    `most`: largest number of lanes. If more slices overlap, the begin of the last one is cut.
     """
 
     def __init__(self, most: int) -> None:

@@ -1,8 +1,8 @@
 """The formats of a trace: Perfetto's packets (ui.perfetto.dev) or Chrome's JSON (chrome://tracing).
 
-Rule: both have tracks, slices, instants, counters and flows. Times are ns of the run's clock. The slices of one track
-come in the order of their begins and do not overlap. Memory is bounded: packets are written in blocks, JSON event by
-event. A file that ends early is readable up to its last block.
+Rule: both have tracks, slices, instants, counters and flows. Times are ns of the run's clock. The caller writes the
+slices of a track in the order of their begins, without overlap. Memory is bounded: packets are written in blocks, JSON
+event by event. A file that ends early is readable up to its last block.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from typing import IO, Any, Final, NamedTuple, Protocol
 
 from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TracePacket, TrackDescriptor, TrackEvent
 
-#: Notes of a slice: numbers, texts, and mappings and sequences of them.
+#: Notes of a slice by name: numbers and texts, also in mappings and sequences.
 Notes = Mapping[str, Any]
 NO_NOTES: Notes = {}
 SEQUENCE: Final = 1
 BLOCK_BYTES: Final = 1 << 18
 PLAIN_BYTES: Final = 16 << 20
 LONGEST_INT: Final = 1 << 63
-#: Tag of `Trace.packet`: a trace is its packets one after the other, each behind this and its length.
+#: Tag of `Trace.packet`. In a trace, this tag and a length stand before each packet.
 PACKET_FIELD: Final = b"\x0a"
 NS_PER_US: Final = 1000
 CATEGORY: Final = "frame"
 
 
 class FlowArrow(NamedTuple):
-    """The arrow that a slice is part of.
+    """The arrow that goes through a slice: it connects the jobs of a frame.
 
     `number`: number of the arrow, above 0. `begins`, `ends`: whether the arrow begins or ends at the slice.
     """
@@ -40,48 +40,51 @@ class FlowArrow(NamedTuple):
 
 
 class Sink(Protocol):
-    """A trace file that is being written."""
+    """A writer of a trace file. Tracks have numbers, which its methods return and take."""
 
     def recurring(self, names: Iterable[str]) -> None:
-        """Announce names of slices and instants that come again and again."""
+        """Announce names of slices and instants that will occur often."""
 
     def process(self, name: str) -> int:
-        """Begin a group of tracks of its own; return the number of its track."""
+        """Begin a group of tracks; return the number of its top track."""
 
     def track(self, name: str, parent: int, rank: int = 0) -> int:
-        """Begin a track below another one, in the order of `rank`; return its number. Viewers join equal names."""
+        """Begin a track below the track `parent`; return its number. Tracks of equal name may be shown as one.
+
+        `rank`: place among the tracks below `parent`, the smallest on top.
+        """
 
     def counter_track(self, name: str, parent: int, rank: int = 0, unit: str = "") -> int:
-        """Begin a track of numbers; return its number. `unit`: unit of the numbers, as people write it."""
+        """Begin a track of a counter; return the track's number. `unit`: unit of the values, such as "B"."""
 
     def slice(
         self, track: int, begin_ns: int, end_ns: int, name: str, notes: Notes = NO_NOTES, flow: FlowArrow | None = None
     ) -> None:
-        """Write a piece of time on a track."""
+        """Write a slice of a track. `flow`: arrow that goes through it."""
 
     def begin(self, track: int, at_ns: int, name: str, notes: Notes = NO_NOTES) -> None:
-        """Begin a slice whose end is not known yet."""
+        """Begin a slice; `end` ends it."""
 
     def end(self, track: int, at_ns: int) -> None:
-        """End the slice that has begun on the track."""
+        """End the slice of the track that `begin` began."""
 
     def instant(self, track: int, at_ns: int, name: str, notes: Notes = NO_NOTES) -> None:
-        """Write something that took no time."""
+        """Write an event without duration."""
 
     def count(self, track: int, at_ns: int, value: float) -> None:
-        """Give the counter this value from now on."""
+        """Give the counter `track` this value from `at_ns` on."""
 
     def close(self) -> None:
-        """Write everything to the file."""
+        """Write the rest to the file, which stays open."""
 
 
 class PacketSink:
     """A `Sink` that writes Perfetto's packets.
 
-    The first `plain_bytes` are packets as they are, so any protobuf reader can read a trace of some minutes. What
-    follows is compressed, a block at a time (`TracePacket.compressed_packets`, zlib), as Perfetto's own recorder does.
-    Recurring names are interned: the first packet that uses one brings it along. `file`: opened for writing bytes; its
-    opener closes it after `close`.
+    The first `plain_bytes` bytes are plain packets, so any protobuf reader can read a trace of some minutes. Later
+    packets are compressed in blocks (`TracePacket.compressed_packets`, zlib), as Perfetto's own recorder does.
+    Recurring names are interned: the first packet that uses a name defines its number. `file`: opened for writing
+    bytes; its opener closes it after `close`.
     """
 
     def __init__(self, file: IO[bytes], plain_bytes: int = PLAIN_BYTES) -> None:
@@ -128,7 +131,7 @@ class PacketSink:
         self._add(packet)
 
     def end(self, track: int, at_ns: int) -> None:
-        packet = self._ended  # one packet serves all ends, because it holds numbers alone
+        packet = self._ended  # reused: the ends of slices differ only in these two numbers
         packet.timestamp, packet.track_event.track_uuid = at_ns, track
         self._add(packet)
 
@@ -155,7 +158,7 @@ class PacketSink:
         return self._tracks
 
     def _named(self, track: int, at_ns: int, kind: int, name: str, notes: Notes) -> Any:
-        """Return an event; a recurring name is interned, and so are the names of notes."""
+        """Return a packet with a named event. Recurring names and the names of notes are interned."""
         packet = _packet(track, at_ns, kind)
         event = packet.track_event
         if name in self._recurring:
@@ -198,7 +201,7 @@ def packets_in(content: bytes) -> Iterator[TracePacket]:
 
 @lru_cache(maxsize=1024)
 def _varint(number: int) -> bytes:
-    """Return a length as protobuf writes it: seven bits a byte, lowest first, the top bit set except in the last."""
+    """Return `number` as a protobuf varint: seven bits a byte, lowest first; the top bit is set except in the last."""
     groups = bytearray()
     while number > 0x7F:
         groups.append(number & 0x7F | 0x80)
@@ -207,7 +210,7 @@ def _varint(number: int) -> bytes:
 
 
 def _packet(track: int, at_ns: int, kind: int) -> Any:
-    """Return an event of a track."""
+    """Return a packet with an event of a track. `kind`: a type of `TrackEvent`, such as TYPE_INSTANT."""
     packet = TracePacket(timestamp=at_ns, trusted_packet_sequence_id=SEQUENCE)
     event = packet.track_event
     event.type, event.track_uuid = kind, track
@@ -215,14 +218,17 @@ def _packet(track: int, at_ns: int, kind: int) -> Any:
 
 
 def _intern(numbers: dict[str, int], name: str, packet: Any, table: str) -> int:
-    """Return the number of a name that no packet before this one has."""
+    """Give `name` the next number, define it in `packet`, and return the number.
+
+    `table`: field of the packet's interned data that defines such names.
+    """
     numbers[name] = number = len(numbers) + 1
     getattr(packet.interned_data, table).add(iid=number, name=name)
     return number
 
 
 def _fill(note: Any, value: Any) -> None:
-    """Give an annotation its value."""
+    """Set the debug annotation `note` to `value`, which may be nested."""
     if isinstance(value, bool):
         note.bool_value = value
     elif isinstance(value, int) and -LONGEST_INT <= value < LONGEST_INT:
@@ -244,9 +250,9 @@ def _fill(note: Any, value: Any) -> None:
 class ChromeSink:
     """A `Sink` that writes Chrome's JSON, event by event.
 
-    The format is the Trace Event Format, docs.google.com/document/d/1CvAClvFfyA5R-PhYUmn5OOQtYMH4h6I0nSsKchNAySU. A
-    process is a process, a track one of its threads; times are in us. `file`: opened for writing text; its opener
-    closes it after `close`.
+    The format is the Trace Event Format, docs.google.com/document/d/1CvAClvFfyA5R-PhYUmn5OOQtYMH4h6I0nSsKchNAySU. In
+    the file, a group of tracks is a process, and a track is a thread; times are in us. `file`: opened for writing text;
+    its opener closes it after `close`.
     """
 
     def __init__(self, file: IO[str]) -> None:
@@ -307,9 +313,9 @@ class ChromeSink:
         return self._tracks
 
     def _child(self, name: str, parent: int) -> int:
-        """Begin a track below `parent`; its name has the parent's in front unless that is a process.
+        """Begin a track below `parent`, and return its number.
 
-        Chrome's threads have no hierarchy of their own.
+        The name of a parent track is put in front of the name, because Chrome's threads have no hierarchy.
         """
         pid = self._process_of[parent]
         number = self._new(name if parent == pid else f"{self._names[parent]}: {name}")

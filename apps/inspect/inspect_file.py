@@ -1,7 +1,7 @@
 """Says what a file or folder is. Rule: content identifies a file, and only the reader of its kind reads it.
 
-If the content is ambiguous, the ending of the name decides. To identify a file, only its head, the names in an archive
-or a JSON document are read.
+If the content is ambiguous, the ending of the name decides. To identify a file, only its head, the names in an archive,
+or a text are read.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ MOTION, CAMERA, PICTURE_FOLDER, BODY, TEXTURE, AVATAR = "motion", "camera", "pic
 NETWORK, SCENE, TRACE, RUN, REPORT, SWEEP = "network", "scene", "trace", "run", "report", "sweep"
 PROFILE, PLANNED_SWEEP, GLTF, OTHER = "hardware profile", "sweep file", "glTF", "other"
 EXPECTED = "a motion, camera, picture, video, body, avatar, network, scene, trace or run"
-#: Endings that say what their files are, where the head of the file does not.
+#: Ending of a name -> kind, for files whose content does not show their kind.
 ENDINGS = {
     ".bvh": MOTION,
     ".pkl": MOTION,
@@ -73,15 +73,15 @@ ENDINGS = {
     ".m4v": VIDEO,
     **dict.fromkeys(PICTURES, PICTURE),
 }
-#: Files by which a folder is known, and what it then is. The first match counts.
+#: Names of files, and the kind of a folder that has one of them. The first match counts.
 MARKS: tuple[tuple[tuple[str, ...], str], ...] = (
     ((MANIFEST,), AVATAR),
     (("report.json", JOURNAL), RUN),
     (("trials.jsonl",), SWEEP),
 )
-#: Key of a JSON document -> what a file with it is. The first match counts.
+#: Key of a JSON document -> kind of a file with this key. The first match counts.
 JSON_KEYS = {"traceEvents": TRACE, "clock": REPORT, "network": AVATAR, "frames": CAMERA, "poses": CAMERA}
-#: Kind -> its reader, and its name for a file that could not be read.
+#: Kind -> its reader, and the words for a file of this kind that the reader refuses.
 READERS: dict[str, tuple[Callable[[Path], Inspection], str]] = {
     MOTION: (inspect_motion, "a motion, by its content or ending"),
     CAMERA: (inspect_camera, "a camera, by its content"),
@@ -100,7 +100,7 @@ READERS: dict[str, tuple[Callable[[Path], Inspection], str]] = {
     PLANNED_SWEEP: (inspect_sweep_file, "a sweep that is to be done"),
     TRACE: (inspect_trace, "a trace"),
 }
-#: Files of a folder that are looked at, and files that are named.
+#: Largest numbers of files of an unknown folder that are identified, and that are named.
 MOST_LOOKED_AT, MOST_NAMED = 50, 6
 UNKNOWN = Inspection(
     OTHER,
@@ -112,7 +112,7 @@ AS_BVH = "export the motion as BVH, such as in Blender: File > Import, then File
 
 
 def inspect_file(path: Path) -> Inspection:
-    """Return what `path` is, usable or not. Raises BadInputError only where there is no readable file or folder."""
+    """Return the inspection of `path`, usable or not. Raises BadInputError only without a readable file or folder."""
     kind, signature = kind_of(path)
     if signature is not None:
         return _foreign(signature)
@@ -128,7 +128,7 @@ def inspect_file(path: Path) -> Inspection:
 
 
 def _other(path: Path) -> Inspection:
-    """Return the inspection of an unknown file; broken JSON gets its own words, because it may have been something."""
+    """Return the inspection of an unknown file. A broken JSON file is named as such: it may be a damaged known file."""
     if path.suffix.lower() != ".json":
         return UNKNOWN
     try:
@@ -141,7 +141,7 @@ def _other(path: Path) -> Inspection:
 
 
 def _folder_of(path: Path) -> Inspection:
-    """Return the inspection of an unknown folder, with the files in it that may be meant."""
+    """Return the inspection of an unknown folder. The advice names files in it that Trilane knows."""
     files = itertools.islice((file for file in sorted(path.iterdir()) if file.is_file()), MOST_LOOKED_AT)
     known = [f"{file.name} ({kind})" for file in files if (kind := _kind_or_none(file)) in READERS]
     if not known:
@@ -165,9 +165,10 @@ def _foreign(signature: Signature) -> Inspection:
 
 
 def kind_of(path: Path) -> tuple[str, Signature | None]:
-    """Return the kind of `path`, a word from above or from `trilane.files`, and for FOREIGN and archives the signature.
+    """Return the kind of `path`: a constant of this module or of `trilane.files`.
 
-    Raises BadInputError for a path without a readable file or folder.
+    For a foreign file, an archive, and a file with a remedy, also return its signature. Raises BadInputError without a
+    readable file or folder.
     """
     if path.is_dir():
         return _folder(path), None
@@ -203,7 +204,7 @@ def _arrays(path: Path) -> str:
 
 
 def _by_text(path: Path) -> str:
-    """Return the kind of a file without a signature: text, or a format that has none."""
+    """Return the kind of a file that has no signature in its head: by its name, its text, or its ending."""
     if path.name == JOURNAL:
         return RUN
     if path.name in COLMAP_FILES:
@@ -256,7 +257,7 @@ def _is_camera(path: Path) -> bool:
 
 
 def _is_table(text: str) -> bool:
-    """Return whether most of the first lines that are no comments are numbers."""
+    """Return whether more than half of the first lines, without comments, are rows of two or more numbers."""
     lines = [line.split("#", 1)[0].replace(",", " ").split() for line in text[:20_000].splitlines()[:50]]
     rows = [words for words in lines if words]
     return 2 * sum(_are_numbers(words) for words in rows) > len(rows)
@@ -269,6 +270,7 @@ def _are_numbers(words: list[str]) -> bool:
         return False
 
 
+#: Test of a text, and the kind of a text that passes; with an empty kind, the test returns the kind.
 _TEXTS: tuple[tuple[Callable[[str], bool | str], str], ...] = (
     (_is_bvh, MOTION),
     (_json_kind, ""),

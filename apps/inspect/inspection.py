@@ -1,8 +1,8 @@
 """The description of one file, as plain data for people and JSON, and its sheet of skeletons, paths or points.
 
-Rule: a file is usable when the reader of a run takes it; a problem is that reader's own sentence. All skeletons of a
-row have one scale, and so has a path, so that lengths compare. Y is up, and a person who faces +Z faces the reader; the
-person's left is blue, the right is orange.
+Rule: a file is usable if the reader of a run accepts it; a problem is that reader's own sentence. All skeletons of a
+row have one scale, and so have all views of a path, so that lengths can be compared. Y is up, and a person who faces +Z
+faces the reader; the person's left is blue, the right is orange.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ VIEWS: Final = {
 TILE, PATH_TILE = 190, 380  # pixels
 MARGIN = 0.86  # share of a tile that is drawn on
 LEAST_EXTENT_M = 0.2
-SHARP = 2  # the sheet is drawn larger by this and then made smaller, so that lines look smooth
+SHARP = 2  # the sheet is drawn this factor larger and then reduced, so that lines look smooth
 #: Bones of the face are left out.
 DRAWN: Final = tuple(k for k in range(1, len(JOINT_NAMES)) if JOINT_NAMES[k] not in ("jaw", "left_eye", "right_eye"))
 CAMERAS = 14
@@ -42,7 +42,7 @@ FRUSTUM = np.array([[-0.8, -0.6, -1.0], [0.8, -0.6, -1.0], [0.8, 0.6, -1.0], [-0
 
 @dataclass(frozen=True)
 class Length:
-    """The length of a recording. `samples`: usable frames or poses. `rate_hz`: rate of the median step, if any."""
+    """The length of a recording. `samples`: number of usable frames or poses. `rate_hz`: 1 / median step, or None."""
 
     samples: int
     seconds: float
@@ -60,8 +60,9 @@ class Length:
 class Inspection:
     """The description of one file.
 
-    `what`: the file in words. `problem`: why it is not usable, empty when it is. `advice`: how to use it, or what to
-    do. `notes`: notes as a run prints them. `draw`: draws the contact sheet; None where there is nothing to draw.
+    `what`: the file in words. `problem`: why the file is not usable; empty if it is usable. `advice`: a command that
+    uses the file, or a remedy. `detected`: what its reader detected. `notes`: notes as a run prints them. `draw`:
+    draws the contact sheet; None if there is nothing to draw.
     """
 
     kind: str
@@ -79,7 +80,7 @@ class Inspection:
         return not self.problem
 
     def document(self, file: Path, sheet: Path | None) -> dict[str, Any]:
-        """Return what JSON says. `sheet`: path of the written contact sheet."""
+        """Return the JSON document of the inspection. `sheet`: path of the written contact sheet, or None."""
         found = {key: value for key, value in asdict(self.detected).items() if key not in ("joints", "unmapped")}
         mapped = dict(self.detected.joints)
         missing = [name for name in BODY_JOINTS if name not in mapped] if mapped else []
@@ -100,12 +101,12 @@ class Inspection:
 
 
 def used(option: str, file: Path) -> str:
-    """Return the command that takes `file`, after `option` or by itself, quoted for a shell."""
+    """Return a `trilane run` command with `file`, after `option` if that is not empty, quoted for a shell."""
     return shlex.join(["trilane", "run", *([option] if option else []), str(file)])
 
 
 def refused(kind: str, what: str, error: BadInputError, file: Path) -> Inspection:
-    """Return the inspection of a file that its reader refuses."""
+    """Return the inspection of a file that its reader refuses with `error`."""
     where = error.where
     for itself in (str(file), str(file.absolute())):
         if where.startswith(itself):
@@ -116,7 +117,7 @@ def refused(kind: str, what: str, error: BadInputError, file: Path) -> Inspectio
 
 @dataclass(frozen=True)
 class _Tile:
-    """A square of `side` pixels. `middle`: the point in its middle, (2,) metres. `scale`: pixels per metre."""
+    """A square of `side` pixels to draw on. `middle` (2,): point at its centre, metres. `scale`: pixels per metre."""
 
     draw: ImageDraw.ImageDraw
     side: int
@@ -124,7 +125,7 @@ class _Tile:
     scale: float
 
     def at(self, points: F64) -> list[tuple[float, float]]:
-        """Return points (N, 2), metres, in pixels."""
+        """Return the pixels (x, y) of points (N, 2), metres."""
         pixels = (points - self.middle) * (self.scale, -self.scale) + self.side / 2
         return [(float(x), float(y)) for x, y in pixels]
 
@@ -144,9 +145,10 @@ class _Tile:
 
 
 def drawn_skeletons(joints: F64, times_s: F64, path: F64) -> Image.Image:
-    """Return a row of tiles for each view: the skeleton at each moment, and the path of the pelvis.
+    """Return a sheet with a row of tiles for each view: the skeleton at each moment, and the path of the pelvis.
 
-    `joints`: joints (M, 55, 3), metres, Y up, at the moments `times_s` (M,). `path`: path of the pelvis, (T, 3) metres.
+    `joints` (M, 55, 3): places of the joints, metres, Y up, at the times `times_s` (M,). `path` (T, 3): places of the
+    pelvis, metres.
     """
     rows: list[list[Image.Image]] = []
     extent = _extent(path)
@@ -168,9 +170,10 @@ def drawn_skeletons(joints: F64, times_s: F64, path: F64) -> Image.Image:
 
 
 def drawn_cameras(turns: F64, places: F64) -> Image.Image:
-    """Return one row of three views of the path, with the camera at some of its moments.
+    """Return a sheet with three views of a camera path, and the camera at some of its places.
 
-    `turns`, `places`: camera to world, (N, 3, 3) and (N, 3) metres, Y up; the camera looks along its -Z.
+    `turns` (N, 3, 3), `places` (N, 3): rotation and place of the camera, camera to world, metres, Y up; the camera
+    looks along its -Z.
     """
     chosen = np.unique(np.linspace(0, len(places) - 1, min(CAMERAS, len(places))).round().astype(int))
     size = max(float(np.ptp(places, axis=0).max()), LEAST_EXTENT_M) * 0.09
@@ -184,7 +187,7 @@ def drawn_cameras(turns: F64, places: F64) -> Image.Image:
 
 
 def drawn_points(vertices: F64) -> Image.Image:
-    """Return one row of three views of points (V, 3), metres, Y up."""
+    """Return a sheet with three views of points. `vertices` (V, 3): places, metres, Y up."""
     tiles, extent = [], _extent(vertices)
     radius = 0.5 if len(vertices) > SPARSE else 3
     for name, view in VIEWS.items():
@@ -213,10 +216,10 @@ def _path_tile(
     every: F64 | None = None,
     seen: tuple[F64, F64, F64] | None = None,
 ) -> Image.Image:
-    """Return a path (T, 2) in a tile of `extent` metres, with a bar for a length.
+    """Return a tile with a path and a scale bar. `path` (T, 2): points, metres. `side`: pixels of the tile.
 
-    `every`: points in whose middle the tile is centred; None for the path's own points. `seen`: eyes, corners and view
-    of the cameras.
+    `extent`: metres that the tile shows. `every` (N, 2): points around whose middle the tile is centred; None for
+    `path`. `seen`: cameras to draw, as (eyes, corners, view), or None.
     """
     room = path if every is None else every
     low, high = room.min(axis=0), room.max(axis=0)
@@ -236,7 +239,7 @@ def _path_tile(
 
 
 def _extent(points: F64) -> float:
-    """Return the longest side of a box around points (N, 3)."""
+    """Return the longest side of the box around points (N, 3), metres, at least `LEAST_EXTENT_M`."""
     return max(float(np.ptp(points, axis=0).max()), LEAST_EXTENT_M)
 
 

@@ -1,7 +1,7 @@
 """Describes motions, cameras, pictures, bodies, avatars, networks, scenes and runs, each by a command's own reader.
 
-Rule: the reader finds all facts and decides whether a file is usable; this file only adds words. Nothing is placed in a
-scene, so all facts are about the file alone. Pictures and videos are read as a background is.
+Rule: the reader finds all facts and decides whether a file is usable; this module only adds words. Nothing is placed in
+a scene, so all facts are about the file alone. Pictures and videos are read like a background.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ MOST_PATH_POINTS = 2000
 
 
 def inspect_body(path: Path) -> Inspection:
-    """Read a body. Raises BadInputError when it is not usable."""
+    """Describe a body. Raises BadInputError if it is not usable."""
     shaped = load_body(path).shape()
     height = float(np.ptp(shaped.vertices[:, 1]))
     facts = {
@@ -78,7 +78,7 @@ def _drawn_body(vertices: F32) -> Image.Image:
 
 
 def inspect_avatar(path: Path) -> Inspection:
-    """Read an avatar. `path`: its folder or manifest. Raises BadInputError when the bundle is not usable."""
+    """Describe an avatar. `path`: its folder or manifest. Raises BadInputError if the bundle is not usable."""
     folder = path if path.is_dir() else path.parent
     bundle = load_bundle(folder)
     found = bundle_facts(bundle)
@@ -103,7 +103,7 @@ def inspect_avatar(path: Path) -> Inspection:
 
 
 def inspect_texture(path: Path) -> Inspection:
-    """Read a neural texture. Raises BadInputError when that fails."""
+    """Describe a neural texture. Raises BadInputError if the file cannot be read."""
     shape = list(read_npz(path, ("texture",), "a neural texture")["texture"].shape)
     what = f"a neural texture of shape {tuple(shape)}, a part of an avatar"
     found = Detected("neural texture", "an array `texture`")
@@ -111,9 +111,9 @@ def inspect_texture(path: Path) -> Inspection:
 
 
 def inspect_network(path: Path) -> Inspection:
-    """Read an ONNX network; one that no avatar can use is usable for predictions.
+    """Describe an ONNX network. A network that no avatar can use is still usable for predictions.
 
-    Raises BadInputError when it is none.
+    Raises BadInputError if the file is no ONNX network.
     """
     graph = read_graph(path)
     facts: dict[str, Any] = {"parameters": graph.work.weights, "gmac": graph.work.macs / 1e9, "numbers": graph.numbers}
@@ -130,10 +130,10 @@ def inspect_network(path: Path) -> Inspection:
 
 
 def inspect_scene(path: Path) -> Inspection:
-    """Read a scene, without the files that it names. Raises BadInputError when the scene is refused."""
+    """Describe a scene. The files that it names are not read; a missing one makes it unusable. Raises BadInputError."""
     values = load_scene(path)
     avatars = values["avatars"]
-    named = [values["background"], values["camera"]["source"], *(raw[key] for raw in avatars for key in ("motion",))]
+    named = [values["background"], values["camera"]["source"], *(raw["motion"] for raw in avatars)]
     facts = {"name": values["name"], "avatars": len(avatars), "sources": [str(source) for source in named]}
     missing = [source for source in facts["sources"] if "/" in source and not Path(source).exists()]
     notes = tuple(f"{source}: no such file, which the scene names" for source in missing)
@@ -144,7 +144,7 @@ def inspect_scene(path: Path) -> Inspection:
 
 
 def inspect_profile(path: Path) -> Inspection:
-    """Read a hardware profile. Raises BadInputError when it is refused."""
+    """Describe a hardware profile. Raises BadInputError if it is not usable."""
     profile = load_profile(path)
     found = Detected("hardware profile", "TOML with a title and units")
     return Inspection(
@@ -158,7 +158,7 @@ def inspect_profile(path: Path) -> Inspection:
 
 
 def inspect_run(path: Path) -> Inspection:
-    """Read a run folder, or the journal of one. Raises BadInputError when neither report nor journal is readable."""
+    """Describe a run. `path`: its folder or journal. Raises BadInputError if neither report nor journal is readable."""
     folder = path if path.is_dir() else path.parent
     sheet = folder / SHEET
     detected = Detected("run folder", "a report or a journal in it")
@@ -181,7 +181,7 @@ def _copied(sheet: Path) -> Image.Image:
 
 
 def inspect_report(path: Path) -> Inspection:
-    """Read the report of a run. Raises BadInputError when it is none."""
+    """Describe the report of a run. Raises BadInputError if `path` is no report."""
     report = read_report(path)
     presented = report.frames.presented
     seconds = report.duration_s
@@ -194,7 +194,7 @@ def inspect_report(path: Path) -> Inspection:
 
 
 def inspect_sweep(path: Path) -> Inspection:
-    """Read the folder of a sweep. Raises BadInputError when its trials are not readable."""
+    """Describe the folder of a sweep. Raises BadInputError if its trials are not readable."""
     entries = read_entries([path])
     what = f"a folder of {len(entries)} trials of a sweep"
     found = Detected("sweep", "a file trials.jsonl")
@@ -202,7 +202,7 @@ def inspect_sweep(path: Path) -> Inspection:
 
 
 def inspect_sweep_file(path: Path) -> Inspection:
-    """Read the file of a sweep. Raises BadInputError when it is no sweep."""
+    """Describe a sweep file. Raises BadInputError if `path` is no sweep file."""
     sweep = read_sweep(path)
     command = " ".join(sweep.command)
     facts = {"command": command, "axes": list(sweep.axes)}
@@ -211,7 +211,7 @@ def inspect_sweep_file(path: Path) -> Inspection:
 
 
 def inspect_trace(path: Path) -> Inspection:
-    """Read a trace, of Perfetto or in Chrome's format. Raises BadInputError when it is none."""
+    """Describe a trace, of Perfetto or in Chrome's format. Raises BadInputError if `path` is no trace."""
     events = _trace_events(path)
     found, advice = Detected("trace", "its events"), "open it at https://ui.perfetto.dev"
     return Inspection("trace", f"a trace of {events} events", "", advice, found, facts={"events": events})
@@ -245,7 +245,7 @@ def _packets(path: Path) -> int:
 
 
 def inspect_motion(path: Path) -> Inspection:
-    """Read a motion. Raises BadInputError when it is not usable."""
+    """Describe a motion. Raises BadInputError if it is not usable."""
     motion = load_motion(AvatarSpec(motion=str(path.absolute())), Path(), _body().joints)
     places = motion.translation
     facts = {
@@ -268,7 +268,7 @@ def inspect_motion(path: Path) -> Inspection:
 
 
 def inspect_camera(path: Path) -> Inspection:
-    """Read a camera. Raises BadInputError when it is not usable."""
+    """Describe a camera path. Raises BadInputError if it is not usable."""
     camera = load_camera(CameraSpec(source=str(path.absolute())), Path())
     low, high = camera.places.min(axis=0), camera.places.max(axis=0)
     steps = np.linalg.norm(np.diff(camera.places, axis=0), axis=1)
@@ -295,7 +295,7 @@ def inspect_camera(path: Path) -> Inspection:
 
 @cache
 def _body() -> ShapedBody:
-    """Return the body that shows motions, which is the default avatar's."""
+    """Return the body on which motions are drawn: the default avatar's."""
     return load_body(bundle_folder(DEFAULT) / "body.npz").shape()
 
 
@@ -315,7 +315,7 @@ def _drawn_camera(camera: CameraPath) -> Image.Image:
 
 
 def _thinned(samples: np.ndarray) -> np.ndarray:
-    """Return `samples` (N, ...), or MOST_PATH_POINTS of them, evenly spread with the first and the last."""
+    """Return at most MOST_PATH_POINTS of `samples` (N, ...), evenly spread, with the first and the last."""
     if len(samples) <= MOST_PATH_POINTS:
         return samples
     return np.asarray(samples[np.linspace(0, len(samples) - 1, MOST_PATH_POINTS).round().astype(int)])
@@ -328,7 +328,7 @@ DAMAGED = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
 
 
 def inspect_picture(path: Path) -> Inspection:
-    """Read a picture, or a video if it has several frames. Raises BadInputError when no background can use it."""
+    """Describe a picture, or a video if it has several frames. Raises BadInputError if no background can use it."""
     if not is_picture(path) and _moves(path):
         return inspect_video(path)
     thumb = read_picture(path, THUMB)
@@ -345,7 +345,7 @@ def inspect_picture(path: Path) -> Inspection:
 
 
 def _moves(path: Path) -> bool:
-    """Return whether the picture has several frames."""
+    """Return whether the picture file `path` has several frames."""
     try:
         with Image.open(path) as image:
             return bool(getattr(image, "is_animated", False))
@@ -373,10 +373,10 @@ def _turned(orientation: int) -> str:
 
 
 def inspect_folder(path: Path) -> Inspection:
-    """Read a folder of pictures. Raises BadInputError when one of them is not usable."""
+    """Describe a folder of pictures. Raises BadInputError if a picture is not usable."""
     names, footage = pictures_in(path), survey(path, FOLDER_FPS)
     for name in names:
-        read_picture(name, (8, 8))  # which decodes it to its end
+        read_picture(name, (8, 8))  # decodes the whole file, which shows damage
     sizes = sorted({(facts["width"], facts["height"]) for _, facts in map(picture_facts, names)})
     chosen = [names[k] for k in _spread(len(names))]
     first = f"{sizes[0][0]}x{sizes[0][1]}"
@@ -397,13 +397,13 @@ def inspect_folder(path: Path) -> Inspection:
 
 
 def _folder_rate(footage: Footage) -> str:
-    """Return the rate of the pictures in a scene, and what is missing."""
+    """Return the rate of the pictures in words, with notes. Without times, each frame of the scene has one picture."""
     own = footage.rate if footage.clock_s else ("the scene's, one a frame", *footage.rate[1:])
     return "; ".join(own)
 
 
 def inspect_video(path: Path) -> Inspection:
-    """Read a video. Raises BadInputError when no background can use it."""
+    """Describe a video. Raises BadInputError if no background can use it."""
     footage = survey(path, FOLDER_FPS)
     try:
         with av.open(str(path), metadata_errors="replace") as container:
@@ -430,7 +430,7 @@ def inspect_video(path: Path) -> Inspection:
 
 
 def _counted(path: Path) -> int:
-    """Count the frames of a video whose file does not state their number."""
+    """Return the number of frames of a video, counted in the file, at most MOST_PACKETS."""
     with av.open(str(path), metadata_errors="replace") as container:
         packets = container.demux(container.streams.video[0])
         return sum(packet.size > 0 for packet in itertools.islice(packets, MOST_PACKETS))
@@ -449,7 +449,7 @@ def _video_facts(stream: Any) -> dict[str, Any]:
 
 
 def _rotation(stream: Any) -> int:
-    """Return the degrees by which the file says the first frame is to be turned clockwise."""
+    """Return the clockwise turn of the first frame that the file asks for, degrees; 0 without a frame."""
     for frame in stream.container.decode(stream):
         return 90 * quarters_of(frame)
     return 0
@@ -462,7 +462,7 @@ def _seconds(container: Any, stream: Any) -> float:
 
 
 def _film(path: Path, seconds: float) -> Image.Image:
-    """Return a sheet of frames at evenly spread times."""
+    """Return a sheet with frames of a video at evenly spread times. `seconds`: length of the video."""
     background = open_background(path, THUMB, FOLDER_FPS)
     pictures, captions = [], []
     try:

@@ -1,6 +1,6 @@
 """The process of a trial: `python -m trilane.apps.sweep.child PARENT MODULE WORD...`, started by Trilane alone.
 
-Rule: it runs the module with its words and adds one thing: the kernel asks it to end when its parent is gone.
+Rule: this process runs MODULE with WORDs. It ends, by a signal of the kernel, if its parent, the process PARENT, ends.
 """
 
 from __future__ import annotations

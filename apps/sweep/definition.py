@@ -29,7 +29,7 @@ Options = Mapping[str, Value]
 ID_DIGITS = 16
 MOST_TRIALS = 100_000
 EXPECTED = "a sweep (docs/sweeps.md)"
-#: Key -> the type of its value, and what that is called.
+#: Key -> the type of its value, and a message's words for such a value.
 KEYS: dict[str, tuple[type, str]] = {
     "command": (str, "a command in quotes, such as 'run' or 'bench raster'"),
     "kind": (str, "grid, list or random"),
@@ -53,8 +53,9 @@ class SweepKind(StrEnum):
 class Definition:
     """A sweep to be done.
 
-    `command`: its words. `options`: fixed options. `axes`: option -> its values, at least one. `count`: number of
-    configurations that RANDOM draws. `seed`: seed of RANDOM. `repeats`: trials of every configuration.
+    `command`: words of the command. `options`: fixed options. `axes`: option -> values to try, at least one. `kind`:
+    how axes are combined. `count`: number of configurations that RANDOM draws. `seed`: seed of RANDOM. `repeats`:
+    number of trials of each configuration.
     """
 
     command: tuple[str, ...]
@@ -74,10 +75,10 @@ def _kind_named(where: str, word: str) -> SweepKind:
 
 
 def trials_of(definition: Definition, words: Callable[[Options], Sequence[str]]) -> list[Trial]:
-    """Return the trials. The last axis changes fastest. A repeat of all configurations follows the one before.
+    """Return the trials of a sweep in their order. The last axis changes fastest.
 
-    If the machine slows down, all configurations then slow down.
-    `words`: gives the options of a configuration as a command line has them.
+    All configurations run once before any is repeated: if the machine slows down, all of them slow down.
+    `words`: function that returns options as the words of a command line.
     Raises BadInputError for axes that do not fit each other, for more than `MOST_TRIALS`, and for a trial given twice.
     """
     configurations = [*_configurations(definition)]
@@ -121,7 +122,7 @@ def _check(definition: Definition) -> None:
 
 
 def _count(definition: Definition) -> int:
-    """Return the number of configurations. Raises BadInputError where more are drawn than there are."""
+    """Return the number of configurations. Raises BadInputError if RANDOM draws more than the axes have."""
     if definition.kind is SweepKind.LIST:
         return max((len(values) for values in definition.axes.values()), default=1)
     whole = math.prod(len(values) for values in definition.axes.values())
@@ -134,7 +135,7 @@ def _count(definition: Definition) -> int:
 
 
 def _numbers(definition: Definition) -> Sequence[int]:
-    """Return the numbers of the combinations, as a grid numbers them; drawn ones are in the grid's order."""
+    """Return the numbers of the combinations to try, ascending: all of the grid's or, for RANDOM, a sample of them."""
     whole = math.prod(len(values) for values in definition.axes.values())
     if definition.kind is SweepKind.RANDOM:
         return sorted(random.Random(definition.seed).sample(range(whole), _count(definition)))
@@ -142,7 +143,7 @@ def _numbers(definition: Definition) -> Sequence[int]:
 
 
 def _combination(definition: Definition, number: int) -> list[Value]:
-    """Return combination `number`: it is written with one digit per axis, in the base of that axis's length."""
+    """Return the values of combination `number` of the grid, one for each axis. The last axis changes fastest."""
     digits: list[Value] = []
     for values in reversed(list(definition.axes.values())):
         number, place = divmod(number, len(values))
@@ -151,7 +152,7 @@ def _combination(definition: Definition, number: int) -> list[Value]:
 
 
 class TrialClock(StrEnum):
-    """The clock of a trial. HOST: the trial measures, and has its machine for itself. VIRTUAL: it computes times."""
+    """The clock of a trial. HOST: the trial measures and needs its machine for itself. VIRTUAL: it computes times."""
 
     HOST = "host"
     VIRTUAL = "virtual"
@@ -178,8 +179,8 @@ COMMANDS = {
 class Trial:
     """One configuration of a command, to be run once.
 
-    `command`: its words, such as `bench raster`. `options`: options by name, without dashes. `words`: the options as
-    typed. `repeat`: number of the repeat, from 1.
+    `command`: words of the command, such as `bench raster`. `options`: values by name, without dashes. `words`: options
+    and values as words of a command line. `repeat`: number of the repeat, from 1.
     """
 
     command: tuple[str, ...]
@@ -189,17 +190,17 @@ class Trial:
 
     @cached_property
     def id(self) -> str:
-        """The first 16 digits of the SHA-256 of the canonical configuration."""
+        """The name of the trial: the first 16 hexadecimal digits of the SHA-256 of `canonical`."""
         return hashlib.sha256(canonical(self.command, self.options, self.repeat).encode()).hexdigest()[:ID_DIGITS]
 
     @property
     def arguments(self) -> list[str]:
-        """The words after `trilane` on its command line."""
+        """The words of the trial's command line after `trilane`."""
         return [*self.command, *self.words, "--json"]
 
     @property
     def line(self) -> str:
-        """The command line that does the trial once more, without its run folder."""
+        """The command line that repeats the trial by hand. It names no run folder."""
         return shlex.join(["trilane", *self.arguments])
 
     @property
@@ -210,8 +211,8 @@ class Trial:
 def canonical(command: tuple[str, ...], options: Options, repeat: int = 1) -> str:
     """Return a configuration as JSON without spaces, keys sorted.
 
-    The first repeat is not named, so that more repeats leave its name as it is. Raises ValueError for NaN and
-    infinities.
+    The first repeat has no key `repeat`, so a sweep that gets more repeats keeps the names of its trials. Raises
+    ValueError for NaN and infinities.
     """
     named: dict[str, Any] = {"command": list(command), "options": dict(options)}
     if repeat > 1:
@@ -221,7 +222,7 @@ def canonical(command: tuple[str, ...], options: Options, repeat: int = 1) -> st
 
 @dataclass(frozen=True)
 class SweepFile:
-    """The content of a sweep file."""
+    """The content of a sweep file (docs/sweeps.md). The values of options are not checked."""
 
     command: tuple[str, ...]
     kind: SweepKind = SweepKind.GRID
@@ -233,10 +234,10 @@ class SweepFile:
 
 
 def read_sweep(path: Path) -> SweepFile:
-    """Read the file of a sweep. Raises BadInputError when it cannot be read or is no sweep."""
+    """Read a sweep file. Raises BadInputError if `path` cannot be read or is no sweep."""
     try:
         data = tomllib.loads(read_text(path, EXPECTED))
-    except (ValueError, RecursionError) as error:  # also for numbers and lists that are too long
+    except (ValueError, RecursionError) as error:  # numbers and nested lists may be too long for the reader
         raise BadInputError(path, f"no TOML ({error})", EXPECTED) from error
     for key, value in data.items():
         _check_key(path, key, value)

@@ -1,4 +1,4 @@
-"""How trials are done: one in a process, many on this machine, and many on the machines of a Ray cluster.
+"""Engines of a sweep: they do one trial in a process, and many on this machine or on the machines of a Ray cluster.
 
 Rule: a trial whose process was ended from outside is lost and may be tried again; a trial that ended by itself is
 final. Trials of the host clock run one at a time on a machine, virtual ones on all its cores. No process is left
@@ -37,22 +37,22 @@ from trilane.stages.machine_facts import machine_facts
 
 #: The module that a trial runs; tests replace it.
 PROGRAM = "trilane"
-#: Seconds for a trial to end when asked, before it is killed.
+#: Seconds from SIGTERM, which asks a trial to end, to SIGKILL.
 END_S = 10.0
 #: Times that a run is done again if the machine disturbed it.
 REPEATS = 2
-#: Exit codes of a process that somebody ended: by a signal that its own defects do not cause, or by an interrupt.
+#: Exit codes of a process that was ended from outside: by an interrupt, or by a signal that a defect does not cause.
 ENDED_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT, -signal.SIGHUP, 130)
 host_facts = cache(machine_facts)
-#: Ray's resource that each machine has one of; a trial of the host clock takes it.
+#: Resource in Ray: each machine has 1 of it, and a trial of the host clock takes 1.
 RESOURCE = "trilane_host_clock"
-#: Seconds for the head of a cluster to answer.
+#: Seconds to wait for the answer of a cluster's head.
 ANSWER_S = 5.0
 START_LINE = (
     f"""RAY_worker_niceness=0 ray start --head --resources='{{"{RESOURCE}": 1}}', """
     "on the others with --address=HEAD:6379 in place of --head"
 )
-#: Variables that Ray sets in its workers. A trial gets them as its machine has them.
+#: Environment variables that Ray sets in its workers. A trial gets the values from before Ray.
 SET_BY_RAY = ("OMP_NUM_THREADS", "CUDA_VISIBLE_DEVICES", "PYTHONBREAKPOINT")
 
 
@@ -60,8 +60,8 @@ SET_BY_RAY = ("OMP_NUM_THREADS", "CUDA_VISIBLE_DEVICES", "PYTHONBREAKPOINT")
 class TrialPlace:
     """Where trials are done.
 
-    `folder`: folder of the sweep, which takes their run folders; None for none. `working_folder`, `environment`: those
-    of the trials; None for this process's own. `program`: the module that a trial runs.
+    `folder`: folder of the sweep, for the run folders; None to keep none. `working_folder`, `environment`: working
+    folder and environment of the trials' processes; None for those of this process. `program`: module that trials run.
     """
 
     folder: Path | None
@@ -71,7 +71,7 @@ class TrialPlace:
 
 
 class Children:
-    """The running processes of trials. Several threads start them, and one may end them all."""
+    """The running processes of trials. Several threads start processes, and any thread may end all of them."""
 
     def __init__(self, inherited: tuple[int, ...] = ()) -> None:
         """`inherited`: file descriptors that every process gets."""
@@ -81,7 +81,10 @@ class Children:
         self._over = False
 
     def run(self, command: list[str], stdout: Any, stderr: Any, place: TrialPlace) -> int:
-        """Run `command` and return its exit code; after `end` no process starts and the code is that of SIGTERM."""
+        """Run `command` and return its exit code, negative for a signal. After `end`, only return -SIGTERM.
+
+        `stdout`, `stderr`: files for the output, as for `subprocess.Popen`.
+        """
         with self._lock:
             if self._over:
                 return -signal.SIGTERM
@@ -92,7 +95,7 @@ class Children:
                 stderr=stderr,
                 cwd=place.working_folder,
                 env=place.environment,
-                process_group=0,  # Ctrl-C reaches the sweep alone, which ends its trials itself
+                process_group=0,  # Ctrl-C reaches only the sweep, which then ends its trials
                 pass_fds=self._inherited,
             )
             self._going.add(process)
@@ -126,8 +129,8 @@ def _end(processes: list[subprocess.Popen[bytes]]) -> None:
 def perform(trial: Trial, place: TrialPlace, children: Children) -> Record:
     """Do `trial` and return its line of `trials.jsonl` (docs/sweeps.md has the keys).
 
-    A run that the machine disturbed is done again up to `REPEATS` times, and the one that was disturbed least is kept.
-    What a lost trial left in the folder is removed. `children`: starts the trial's process.
+    A run that the machine disturbed is repeated up to `REPEATS` times, and the least disturbed run is kept. Files of a
+    lost trial are removed. `children`: starts the trial's process.
     """
     began_at, start = machine.here.now().isoformat(timespec="milliseconds"), time.monotonic()
     with tempfile.TemporaryDirectory(prefix="trilane-trial-") as scratch:
@@ -161,7 +164,7 @@ def perform(trial: Trial, place: TrialPlace, children: Children) -> Record:
 
 
 def _once(trial: Trial, own: Path, place: TrialPlace, children: Children) -> Record:
-    """Do `trial` once, with the run folder `own`, and return how it ended."""
+    """Do `trial` once, with the run folder `own`, and return how it ended (`ended_as`)."""
     _remove(own)
     with tempfile.TemporaryFile() as stdout, tempfile.TemporaryFile() as stderr:
         code = children.run(_command(trial, own, place.program), stdout, stderr, place)
@@ -173,20 +176,23 @@ def _once(trial: Trial, own: Path, place: TrialPlace, children: Children) -> Rec
 
 
 def trust_in(ended: Record) -> Trust:
-    """Return whether a trial can be trusted; one that failed, or whose result says nothing of others, is not judged."""
+    """Return whether the times of a trial can be trusted. `ended`: how it ended (`ended_as`).
+
+    A trial that is not done counts as trusted, and so does one whose result lacks the share of other programs.
+    """
     result = ended["result"] or {}
     is_judged = ended["status"] == "done" and "other_programs" in result
     return trust_of(result) if is_judged else Trust(True, ())
 
 
 def disturbance(ended: Record) -> tuple[bool, float]:
-    """Return how much the machine disturbed a trial: first whether it did, then the share of other programs."""
+    """Return a key by which less disturbed trials sort first: whether it is not trusted, share of other programs."""
     others = (ended["result"] or {}).get("other_programs")
     return not trust_in(ended).trusted, 1.0 if others is None else others
 
 
 def about(trial: Trial) -> Record:
-    """Return the facts of a trial before it is done."""
+    """Return the facts of a trial that are known before it is done, as keys of its record."""
     return {
         "schema": 1,
         "id": trial.id,
@@ -198,7 +204,7 @@ def about(trial: Trial) -> Record:
 
 
 def ended_as(code: int, out: str, messages: str) -> Record:
-    """Return how a process ended: status, exit code, its JSON document and, unless it is done, its last message.
+    """Return how a trial's process ended: status, exit code, its JSON document, and the error of a trial not done.
 
     `code`: exit code, negative for a signal, as `subprocess` has it. `out`, `messages`: text of its stdout and stderr.
     """
@@ -219,7 +225,7 @@ def ended_as(code: int, out: str, messages: str) -> Record:
 
 
 def lost(trial: Trial, why: str) -> Record:
-    """Return the record of a trial whose worker ended before it could give one."""
+    """Return the record of a trial whose Ray worker ended without a record. `why`: error."""
     return {
         **about(trial),
         **{"status": "lost", "exit_code": None, "error": why, "result": None, "repeated": 0, "unsure": []},
@@ -246,14 +252,14 @@ def _text(file: Any) -> str:
 
 
 def _remove(own: Path) -> None:
-    """Remove the run folder of a trial, whole or partial."""
+    """Remove the run folder `own` of a trial, complete or partial."""
     shutil.rmtree(own, ignore_errors=True)
     for draft in own.parent.glob(f"{own.name}.*.partial"):
         shutil.rmtree(draft, ignore_errors=True)
 
 
 def at_once(clock: TrialClock) -> int:
-    """Return how many trials run together: one that measures has the machine for itself."""
+    """Return how many trials run at once on this machine: 1 if they measure, otherwise 1 on each core."""
     return 1 if clock is TrialClock.HOST else len(machine.here.cores())
 
 
@@ -276,7 +282,7 @@ def run_here(trials: Sequence[Trial], place: TrialPlace, inherited: tuple[int, .
 def run_inside(trials: Sequence[Trial], call: Callable[[list[str]], tuple[int, str, str]]) -> Generator[Record]:
     """Do `trials` of the virtual clock in this process, one after the other, and yield their records as they end.
 
-    `call`: does the command of the words after `trilane` and returns its exit code, stdout and stderr.
+    `call`: function that takes the words of a command line after `trilane` and returns exit code, stdout and stderr.
     """
     for trial in trials:
         began_at, start = machine.here.now().isoformat(timespec="milliseconds"), time.monotonic()
@@ -291,14 +297,14 @@ def run_inside(trials: Sequence[Trial], call: Callable[[list[str]], tuple[int, s
 
 
 def at_once_on_ray(clock: TrialClock) -> int:
-    """Return how many trials the connected cluster does together, at least 1."""
+    """Return how many trials the connected cluster does at once, at least 1."""
     name = RESOURCE if clock is TrialClock.HOST else "CPU"
     return max(1, int(required_ray().cluster_resources().get(name, 1)))
 
 
 @contextmanager
 def cluster(folder: Path) -> Iterator[Engine]:
-    """Give the engine of a Ray cluster while connected to it; RAY_ADDRESS or this machine says which cluster.
+    """Connect to a Ray cluster, give its engine, and disconnect: the cluster at RAY_ADDRESS, or else of this machine.
 
     `folder`: folder of the sweep; machines of the cluster that see it keep their run folders there.
     Raises MissingPartError without Ray, BadInputError without a cluster.
@@ -316,7 +322,7 @@ def cluster(folder: Path) -> Iterator[Engine]:
 
 
 def _try_address(address: str) -> None:
-    """Raise OSError for HOST:PORT where nobody listens; Ray alone would try it for many minutes."""
+    """Raise OSError if `address` is HOST:PORT and nothing listens there. Ray itself would try for many minutes."""
     host, _, port = address.rpartition(":")
     if host and port.isdecimal() and "/" not in host:
         socket.create_connection((host, int(port)), ANSWER_S).close()
@@ -341,7 +347,7 @@ def _run_on(ray: Any, place: TrialPlace, trials: Sequence[Trial]) -> Generator[R
 
 
 def _resources(ray: Any, clock: TrialClock) -> dict[str, int]:
-    """Return the resources that a trial takes besides a core. Raises BadInputError when no machine has them."""
+    """Return the resources that a trial takes besides a core. Raises BadInputError if no machine has them."""
     if clock is TrialClock.VIRTUAL:
         return {}
     if RESOURCE not in ray.cluster_resources():
@@ -361,11 +367,11 @@ def _record(ray: Any, reference: Any, trial: Trial) -> Record:
 
 
 def perform_there(trial: Trial, folder: str, working_folder: str, program: str) -> Record:
-    """Do `trial` on the machine where Ray has put it.
+    """Do `trial` in a Ray worker, on the machine that Ray chose, and return its record.
 
     `folder`: folder of the sweep on the driver's machine, used if this machine sees it. `working_folder`: the driver's
-    folder, used if it is here. `program`: the module that the trial runs.
-    Raises BadInputError when the trial measures but has a lower priority than other programs.
+    working folder, used if this machine has it. `program`: the module that the trial runs.
+    Raises BadInputError if the trial measures but has a lower priority than other programs.
     """
     worker = psutil.Process()
     parent = worker.parent() or worker
@@ -379,9 +385,9 @@ def perform_there(trial: Trial, folder: str, working_folder: str, program: str) 
 
 
 def restored(worker: Mapping[str, str], parent: Mapping[str, str]) -> dict[str, str]:
-    """Return a Ray worker's environment in which variables that change a measurement are as on its machine.
+    """Return the environment `worker` of a Ray worker, with the variables `SET_BY_RAY` as in `parent`.
 
-    `worker`: environment of the worker. `parent`: environment of its parent process.
+    `parent`: environment of the worker's parent process, which has the machine's own values.
     """
     kept = {name: value for name, value in worker.items() if name not in SET_BY_RAY}
     return kept | {name: parent[name] for name in SET_BY_RAY if name in parent}

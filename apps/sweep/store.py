@@ -1,7 +1,7 @@
 """The folder of a sweep, and the loop that does the trials it lacks: `sweep.json`, `trials.jsonl`, run folders.
 
 Rule: one process at a time adds whole lines, one for every trial that ended. A torn last line is cut off, and its trial
-is done again. Only a lost trial is tried again, `TRIES` times in all.
+is done again. A lost trial is tried up to `TRIES` times, any other trial once.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ SWEEP, TRIALS, LOCK = "sweep.json", "trials.jsonl", ".lock"
 LOCK_S = 15.0
 Record = dict[str, Any]
 TRIES = 3
-#: Does trials and yields their records as they end; closing it ends the trials that still run.
+#: Does trials and yields their records as they end. If its generator is closed, trials that still run are ended.
 Engine = Callable[[Sequence[Trial]], Generator[Record]]
 
 
 def whole_lines(text: bytes, where: str | Path) -> tuple[list[Record], int]:
-    """Return the records of a `trials.jsonl`, and how many bytes of it they take.
+    """Return the records in the `text` of a `trials.jsonl`, and the number of its bytes up to the last record's end.
 
-    Text after the last line feed is no record, and neither is a last line that is no JSON.
-    Raises BadInputError, which names the line, for an earlier line that is no record.
+    Text after the last line feed is left out, and so is a last line that is no record.
+    Raises BadInputError, which names the line, for an earlier line that is no record. `where`: place for its message.
     """
     records: list[Record] = []
     size, lines = 0, text.split(b"\n")[:-1]
@@ -66,7 +66,7 @@ def latest(records: Sequence[Record]) -> dict[str, Record]:
 
 
 def read_trials(folder: Path) -> dict[str, Record]:
-    """Return the `latest` records of a sweep's folder. Raises BadInputError when it is none."""
+    """Return the `latest` records of the sweep in `folder`. Raises BadInputError if it has no or broken trials."""
     path = folder / TRIALS
     try:
         return latest(whole_lines(path.read_bytes(), path)[0])
@@ -77,9 +77,9 @@ def read_trials(folder: Path) -> dict[str, Record]:
 class Store:
     """The folder of a sweep, open for the one process that runs it; a context manager.
 
-    `done`: records by trial, those found and those added since. On entry a new folder is made, or one with the same
-    trials is taken up. Entering raises BadInputError when the folder has other trials, when another process works in
-    it, and when trials are left and `resume` is false.
+    `done`: records by name of the trial, from the folder and from `add`. Entering makes the folder, or opens one with
+    the same trials. Entering raises BadInputError if the folder has other trials, if another process works in it, or
+    if trials are left and `resume` is false.
     """
 
     def __init__(self, folder: Path, trials: Sequence[Trial], about: Mapping[str, Any], *, resume: bool) -> None:
@@ -113,7 +113,7 @@ class Store:
 
     @property
     def lock(self) -> int:
-        """The descriptor of the lock. A child that inherits it keeps others out of the folder until it has ended."""
+        """The file descriptor of the lock. A child process that inherits it holds the lock too, until its end."""
         return self._lock
 
     def add(self, record: Mapping[str, Any]) -> None:
@@ -182,7 +182,7 @@ class Store:
 
 
 def input_digests(trials: Sequence[Trial]) -> dict[str, str]:
-    """Return the SHA-256 of each file that an option of the trials names, by the name that it has there."""
+    """Return the SHA-256 of each file that an option of a trial names, by the name in the option."""
     values = (each for trial in trials for value in trial.options.values() for each in _flat(value))
     files = sorted({each for each in values if isinstance(each, str) and Path(each).is_file()})
     return {name: hashlib.sha256(Path(name).read_bytes()).hexdigest() for name in files}
@@ -193,15 +193,14 @@ def _flat(value: Any) -> Iterable[Any]:
 
 
 def is_ended(record: Mapping[str, Any] | None) -> bool:
-    """Return whether a trial is done, or failed by itself, as it would again; a lost trial is neither."""
+    """Return whether a trial needs no other try: it is done, or it failed by itself. A lost trial needs one."""
     return record is not None and record["status"] in ("done", "failed")
 
 
 def run_sweep(trials: Sequence[Trial], store: Store, engine: Engine, told: Callable[[Record], None]) -> None:
-    """Do those of `trials` that have not ended.
+    """Do all `trials` that have not ended in `store`, the open folder of the sweep.
 
-    `store`: the open folder; trials that ended there are not done again.
-    `told`: called with the record of each trial that ended for good.
+    `told`: called with the record of each trial that is not tried again.
     """
     left = [trial for trial in trials if not is_ended(store.done.get(trial.id))]
     for attempt in range(1, TRIES + 1):
@@ -222,9 +221,9 @@ def _records(engine: Engine, trials: list[Trial]) -> Iterator[Record]:
 
 
 def summary(trials: Sequence[Trial], store: Store, before: set[str]) -> dict[str, Any]:
-    """Return how the trials of a sweep ended, with a row for each.
+    """Return how the trials of a sweep ended: counts, and a row for each trial.
 
-    `before`: names of the trials that were done when it began.
+    `before`: names of the trials that were done before the sweep began; they count as `skipped`.
     """
     rows = [row_of(trial, store.done.get(trial.id)) for trial in trials]
     counts = Counter(row["status"] for row in rows)
@@ -240,7 +239,7 @@ def summary(trials: Sequence[Trial], store: Store, before: set[str]) -> dict[str
 
 
 def row_of(trial: Trial, record: Record | None) -> dict[str, Any]:
-    """Return a trial as a row of a summary: its options and, unless it is planned, how it ended."""
+    """Return a trial as a row of a summary: its options and how it ended. `record`: None for a planned trial."""
     ended = record or {"status": "planned", "exit_code": None, "error": None, "seconds": None}
     return {
         "id": trial.id,

@@ -1,8 +1,8 @@
-"""Tuning: which trials of a sweep's grid to do, so that few of them find the best that keeps what is asked.
+"""Tuning: a search that does few trials of a sweep's grid to find the best configuration within given limits.
 
-Rule: Optuna proposes and this module judges. A trial is the sweep's own, with its name, its engine and its line. The
-same seed, goal and results give the same proposals. A killed search is therefore done again from its start, and the
-trials that ended cost nothing. Nothing here starts a process or writes a file.
+Rule: Optuna proposes and this module judges. Trials have the names, engines and records of a sweep. The same seed, goal
+and results give the same proposals. A killed search is therefore done again from its start, and the trials that ended
+cost nothing. Nothing here starts a process or writes a file.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from trilane.apps.sweep.definition import Definition, Options, SweepKind, Trial,
 from trilane.apps.sweep.store import Record, row_of
 from trilane.errors import BadInputError, MissingPartError, did_you_mean
 
-#: Proposals that the search draws by chance before it learns from results.
+#: Number of random proposals before the search learns from results.
 DRAWN_FIRST = 10
-#: Proposals in a row that are known already; then the search takes an untried configuration itself.
+#: After so many known proposals in a row, the search takes an untried configuration itself.
 MOST_KNOWN = 3
-#: Finished runs before a short one can end a trial.
+#: Number of finished trials before a short run may end a trial.
 RUNS_BEFORE_PRUNING = 4
-#: Finished trials without a figure that was asked for; then the search ends with an error.
+#: If so many trials are done and all lack a figure that was asked for, the search ends with an error.
 MOST_WITHOUT_FIGURE = 3
 #: A value at a strict limit misses it by this share of the limit.
 AT_LIMIT = 1e-9
 FRAMES = "frames"
 KEEP = re.compile(r"\s*([A-Za-z][\w.-]*)\s*(<=|>=|<|>)\s*([-+]?[\d.]+(?:e[-+]?\d+)?)\s*([A-Za-z]*)\s*", re.IGNORECASE)
-#: Does trials, unless they have ended, and returns their records by name.
+#: Function that does those trials that have not ended, and returns the records of all by name.
 Do = Callable[[Sequence[Trial]], Mapping[str, Record]]
 
 
 class GoalMetric(NamedTuple):
-    """A figure of a result. `path`: its keys in the `--json` document, empty for the PSNR, which has several places."""
+    """A figure of a result. `path`: keys that lead to it in the `--json` document; empty for the PSNR (`entry_of`)."""
 
     unit: str
     more_is_better: bool
@@ -56,12 +56,12 @@ METRICS = {
     "psnr": GoalMetric("dB", True, ()),
     "worst-psnr": GoalMetric("dB", True, ("check", "worst_psnr_db")),
 }
-#: Figures that the frontier weighs beside those asked for, where every trial has them.
+#: Figures that the frontier weighs beside those asked for, if every trial has them.
 WEIGHED = ("psnr", "power")
 
 
 class Keep(NamedTuple):
-    """A limit that the answer keeps. `name`: a metric, or the dotted key of a number in the result."""
+    """A limit that the answer keeps. `name`: a key of `METRICS`, or the dotted key of a number in the result."""
 
     name: str
     sign: str
@@ -75,7 +75,7 @@ class Keep(NamedTuple):
         return self.sign.startswith(">")
 
     def miss(self, value: float) -> float:
-        """Return by how much `value` misses the limit, as a share of the limit; 0 or less if it keeps it."""
+        """Return by how much `value` misses the limit, as a share of the limit; 0 or less if the limit is kept."""
         over = (self.limit - value if self.more_is_better else value - self.limit) / (abs(self.limit) or 1.0)
         return max(over, AT_LIMIT) if over == 0 and "=" not in self.sign else over
 
@@ -101,7 +101,10 @@ def keep_of(text: str) -> Keep:
 
 @dataclass(frozen=True)
 class Aim:
-    """What is asked: `goals`, names of `METRICS`, the first of which chooses the answer; and the limits it keeps."""
+    """What a search is asked for.
+
+    `goals`: keys of `METRICS`; the first chooses the answer. `keeps`: limits that the answer keeps.
+    """
 
     goals: tuple[str, ...] = ("fps",)
     keeps: tuple[Keep, ...] = ()
@@ -111,7 +114,7 @@ class Aim:
         return tuple(dict.fromkeys([*self.goals, *(keep.name for keep in self.keeps)]))
 
     def costs(self, figures: Mapping[str, float], names: Sequence[str]) -> tuple[float, ...]:
-        """Return the figures of `names` so that less of each is better."""
+        """Return the figures `names`, negated where more is better, so that less is always better."""
         return tuple(-figures[name] if self.more_is_better(name) else figures[name] for name in names)
 
     def misses(self, figures: Mapping[str, float]) -> list[float]:
@@ -133,7 +136,10 @@ class Aim:
 
 
 def figures_of(record: Record | None, names: Sequence[str] = ()) -> dict[str, float]:
-    """Return the metrics of a trial that is done, and the numbers at the dotted keys among `names`."""
+    """Return the `METRICS` that a trial's result has, and the numbers at the dotted keys among `names`.
+
+    Empty for a trial that is not done.
+    """
     result = (record or {}).get("result")
     if record is None or record["status"] != "done" or not isinstance(result, dict):
         return {}
@@ -146,7 +152,7 @@ def figures_of(record: Record | None, names: Sequence[str] = ()) -> dict[str, fl
 
 
 def _is_no_time(name: str, value: float) -> bool:
-    """Say whether a time is 0, as that of a run in which no frame was in time: it would be the best of all."""
+    """Say whether `name` is a time, but `value` is 0, because the run has no times. 0 would win every comparison."""
     return name in METRICS and METRICS[name].unit == "ms" and value <= 0
 
 
@@ -158,10 +164,10 @@ def _at(found: Any, path: Sequence[str]) -> float | None:
 
 
 class Space:
-    """The configurations of a grid: every one is a trial, which the places of its values on the axes find."""
+    """The configurations of a grid, each a trial. Places, the index of its value on each axis, identify a trial."""
 
     def __init__(self, definition: Definition, words: Callable[[Options], Sequence[str]]) -> None:
-        """`words`: as for `trials_of`. Raises BadInputError for what is no grid, and for a grid without a choice."""
+        """`words`: as for `trials_of`. Raises BadInputError for no grid, repeats, or a single configuration."""
         if definition.kind is not SweepKind.GRID or definition.repeats > 1:
             found = f"kind = '{definition.kind}', repeats = {definition.repeats}"
             raise BadInputError("sweep", found, "a grid without repeats", "tune chooses by itself what to try")
@@ -178,25 +184,28 @@ class Space:
         return self.trials[number]
 
     def places(self, number: int) -> dict[str, int]:
-        """Return the places of trial `number`, which `at` takes."""
+        """Return the places of trial `number`: the inverse of `at`."""
         found: dict[str, int] = {}
         for name, values in reversed(self.axes.items()):
             number, found[name] = divmod(number, len(values))
         return found
 
     def steps(self, one: Mapping[str, int], other: Mapping[str, int]) -> int:
-        """Return how many steps are between two places: neighbours on an ordered axis, any values on another one."""
+        """Return the distance between two trials, given by places, summed over the axes.
+
+        It is the number of steps on an ordered axis. On any other axis it is 1 for different values.
+        """
         apart = {name: abs(one[name] - other[name]) for name in self.axes}
         return sum(steps if name in self.ordered else min(steps, 1) for name, steps in apart.items())
 
     def shortened(self, trial: Trial, frames: int) -> Trial:
-        """Return `trial` with so few frames: a configuration of its own, which is not among `trials`."""
+        """Return `trial` with only `frames` frames. The result is not among `trials`."""
         options = {**trial.options, FRAMES: frames}
         return replace(trial, options=options, words=tuple(self.words(options)))
 
     @cached_property
     def ordered(self) -> set[str]:
-        """The axes whose values are numbers that rise: a value tells something of its neighbours."""
+        """The axes with rising numbers as values: there, neighbours can be expected to give similar results."""
         return {name for name, values in self.axes.items() if _rises(values)}
 
 
@@ -209,7 +218,7 @@ def _rises(values: Sequence[Value]) -> bool:
 
 
 def required_optuna() -> Any:
-    """Return the package `optuna`, which is then silent. Raises MissingPartError without it."""
+    """Return the package `optuna`, with its log set to errors only. Raises MissingPartError without it."""
     try:
         import optuna
     except ImportError as error:
@@ -219,7 +228,10 @@ def required_optuna() -> Any:
 
 
 class Search:
-    """Proposals and what came of them. `tried`: the trials that were proposed and ended, in order."""
+    """Optuna's proposals and their results.
+
+    `tried`: proposed trials that ended, in order, by name. `pruned`: names of trials that a short run ended.
+    """
 
     def __init__(self, space: Space, aim: Aim, seed: int) -> None:
         """Raises MissingPartError without Optuna."""
@@ -239,16 +251,16 @@ class Search:
 
     @property
     def has_learned(self) -> bool:
-        """Whether any trial had all figures that are asked for."""
+        """Whether any trial had all figures that were asked for."""
         return self._best is not None
 
     @property
     def left(self) -> int:
-        """The number of configurations that were not proposed."""
+        """The number of configurations that were not proposed yet."""
         return len(self.space.trials) - len(self._given)
 
     def propose(self) -> tuple[Any, Trial]:
-        """Return Optuna's trial and a configuration that was not proposed before; one must be left."""
+        """Return Optuna's trial and a trial of the space that was not proposed before. Call it only if `left` > 0."""
         for _ in range(MOST_KNOWN):
             asked, trial = self._asked()
             if trial.id not in self._given:
@@ -261,7 +273,7 @@ class Search:
         return asked, trial
 
     def _untried(self) -> dict[str, int]:
-        """Return the places of an untried configuration: in turns the nearest to the best so far, and any by chance."""
+        """Return the places of an untried configuration: alternately the nearest to the best so far, and any."""
         left = [
             self.space.places(number) for number, each in enumerate(self.space.trials) if each.id not in self._given
         ]
@@ -281,7 +293,10 @@ class Search:
         return asked, self.space.at(places)
 
     def is_hopeless(self, asked: Any, trial: Trial, record: Record, frames: int) -> bool:
-        """Return whether the short run of `trial` ends it: it is worse than the median of the others at that length."""
+        """Return whether the short run of `trial` ends the trial: it is worse than the median of other short runs.
+
+        `asked`: Optuna's trial. `record`, `frames`: record and length of the short run.
+        """
         figures = figures_of(record, self.aim.names)
         goal = self.aim.goals[0]
         if goal not in figures:
@@ -295,7 +310,7 @@ class Search:
         return True
 
     def learn(self, asked: Any, trial: Trial, record: Record | None) -> None:
-        """Tell Optuna what came of a trial. One without a figure that is asked for counts as failed."""
+        """Tell Optuna the result of a trial. A trial without a figure that was asked for counts as failed."""
         self.tried[trial.id] = trial
         figures = figures_of(record, self.aim.names)
         if not self.aim.has_all(figures):
@@ -313,8 +328,8 @@ class Search:
 def tune(search: Search, do: Do, budget: int, together: int = 1, short: int | None = None) -> Mapping[str, Record]:
     """Try at most `budget` configurations and return the records of all that were done, by name.
 
-    `together`: configurations that are proposed and done at once. `short`: frames of a run before each run; None for
-    none. Raises BadInputError if no result has a figure that is asked for.
+    `together`: number of configurations that are proposed and done at once. `short`: frames of a short run before each
+    run; None for no short runs. Raises BadInputError if no result has a figure that was asked for.
     """
     records: dict[str, Record] = {}
     while len(search.tried) < budget and search.left:
@@ -351,9 +366,9 @@ def _require_figures(aim: Aim, done: Sequence[Record]) -> None:
 
 
 def answer(search: Search, records: Mapping[str, Record]) -> dict[str, Any]:
-    """Return the answer: `best` or, where none keeps all, `nearest`; `weighed`, `frontier`, `trials`, `not_tried`.
+    """Return the answer: `best` or, if no trial keeps all limits, `nearest`, with the frontier and all trials.
 
-    `records`: every known record of the space, those of an earlier search or sweep among them.
+    `records`: all known records of the space, also from an earlier search or sweep.
     """
     aim, space = search.aim, search.space
     found = [trial for trial in space.trials if trial.id in records and trial.id not in search.tried]
@@ -402,7 +417,7 @@ def _row(search: Search, trial: Trial, record: Record | None, figures: Mapping[s
 
 
 def _frontier(costs: Mapping[str, tuple[float, ...]]) -> set[str]:
-    """Return the names that no other one beats: at least as good in every cost, and better in one."""
+    """Return the names that are not beaten. A name beats another if no cost is higher and at least one is lower."""
 
     def beats(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
         return one != other and all(a <= b for a, b in zip(one, other, strict=True))

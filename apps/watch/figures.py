@@ -1,8 +1,8 @@
-"""The figures of a moment of a run, as the dashboard, `trilane watch` and `/metrics` show them. Rule: plain typed data.
+"""The figures of a run at one moment, as the dashboard, `trilane watch` and `/metrics` show them.
 
-"The window" is the last `window_s` seconds before the moment, "the run" all time since every unit was ready. `sources`
-says where a figure comes from, and `accuracy` the avatar's error: no speed is shown without them. The bounds of a
-histogram never change, so that counts of different runs can be added up.
+Rule: plain typed data. "The window" is the last `window_s` seconds before the moment, "the run" all time since every
+unit was ready. No speed is shown without `sources`, where a figure comes from, and `accuracy`, the avatars' error. The
+bounds of a histogram never change, so that counts of different runs can be added up.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 from trilane.units import NS_PER_S
 
-#: Upper bounds in seconds: a few to each halving of the rate between 200 and 10 frames a second, fewer on both sides.
+#: Upper bounds in seconds: dense for rates from 200 to 10 frames a second, sparse outside.
 BOUNDS_S = (
     *(0.001, 0.002, 0.003, 0.004, 0.005, 0.006, 0.008),
     *(0.01, 0.0125, 0.015, 0.0175, 0.02, 0.025, 0.03, 0.035, 0.04, 0.05, 0.06, 0.075),
@@ -24,7 +24,7 @@ BOUNDS_S = (
 
 @dataclass(frozen=True)
 class Shares:
-    """Shares of a unit's time: `busy`, and `idle` by cause. They add up to 1, or all are 0 where there is no time."""
+    """Shares of a unit's time: `busy`, and `idle` by cause. They add up to 1; all are 0 for a time of length 0."""
 
     busy: float
     idle: Mapping[str, float]
@@ -32,10 +32,10 @@ class Shares:
 
 @dataclass(frozen=True)
 class UnitFigures:
-    """One unit.
+    """The figures of one unit.
 
-    `window`, `run`: shares of its time; a job that still runs counts as busy.
-    `jobs`: number of jobs that it ended in the run.
+    `window`, `run`: shares of its time in the window and in the run; a job that still runs counts as busy.
+    `jobs`: number of ended jobs in the run.
     `restarts`: number of restarts of its process in the run.
     `is_up`: whether its process is there and ready; false once the run is over.
     `stage`, `frame`: stage and frame of its present job, "" and -1 without one.
@@ -60,10 +60,10 @@ class Moved:
 
 @dataclass(frozen=True)
 class StageFigures:
-    """One stage.
+    """The figures of one stage.
 
-    `waiting`: number of frames before it. `service_ms`: mean of the window's jobs, 0 without any. `bytes`: moved bytes
-    by kind.
+    `waiting`: number of frames that wait for the stage. `service_ms`: mean service time of the window's jobs, 0 without
+    jobs. `bytes`: moved bytes by kind.
     """
 
     unit: str
@@ -74,7 +74,7 @@ class StageFigures:
 
 @dataclass(frozen=True)
 class DropCount:
-    """Frames dropped at `edge`, "producer->consumer", for `cause`."""
+    """Number of frames that were dropped at `edge` ("producer->consumer") for `cause`."""
 
     edge: str
     cause: str
@@ -83,7 +83,7 @@ class DropCount:
 
 @dataclass(frozen=True)
 class FrameFigures:
-    """Frames of the run, counted: each requested frame is presented, lost, dropped, in flight, or not begun.
+    """Numbers of frames of the run: each requested frame is presented, lost, dropped, in flight, or not begun.
 
     `lost`: number of lost frames by cause. `skipped`: number of presented frames that took the bypass.
     """
@@ -99,9 +99,9 @@ class FrameFigures:
 
 @dataclass(frozen=True)
 class Histogram:
-    """Times of the whole run. `counts[i]`: number of times of at most `bounds_s[i]` and above the bound before.
+    """A histogram of times of the whole run. `counts[i]`: number of times above `bounds_s[i - 1]`, up to `bounds_s[i]`.
 
-    The last count has no bound: it counts the times above all bounds.
+    The last count has no bound: it counts the times above all bounds. `sum_s`: sum of the times.
     """
 
     bounds_s: tuple[float, ...]
@@ -124,7 +124,7 @@ class Note:
 
 @dataclass(frozen=True)
 class MomentFigures:
-    """Figures at one moment.
+    """All figures at one moment.
 
     `t_ms`: time since the first step. `window_s`, `run_s`: lengths of the window and of the run.
     `clock`: "host" or "virtual". `is_over`: whether the journal has the run's end.
@@ -135,8 +135,9 @@ class MomentFigures:
     `units`, `stages`: figures by name, in the order of the pipeline.
     `temperature_c`, `duty`: last values by place and by unit. `memory_bytes`: memory of the processes, by unit.
     `notes`: the last few messages.
-    `bound`: what bounds the run so far, as in report.json; null before 63 frames, and where it is not looked for.
-    `verdict`: keys of the verdict in report.json, with `lines` for people, for the run so far. Null without times.
+    `bound`: what bounds the run so far, as in report.json; null before 63 frames, and if it is not computed.
+    `verdict`: verdict on the run so far, with the keys of report.json and `lines` for people; null before the second
+    presented frame.
     `frame_times`, `latencies`: times of the whole run.
     `began_at`: UTC, ISO 8601; "" where the journal does not say.
     `accuracy`: by avatar, as in report.json; empty where the journal does not say.
@@ -174,17 +175,17 @@ class MomentFigures:
 
 
 class TimeHistogram:
-    """Counts times, given in ns, by their length."""
+    """A growing `Histogram` of times."""
 
     def __init__(self) -> None:
         self._counts = [0] * (len(BOUNDS_S) + 1)
         self._sum_ns = 0
 
     def add(self, time_ns: int) -> None:
-        """Count a time; one that equals a bound counts below it."""
+        """Count a time. A time equal to a bound counts as below the bound."""
         self._counts[bisect_left(BOUNDS_S, time_ns / NS_PER_S)] += 1
         self._sum_ns += time_ns
 
     def now(self) -> Histogram:
-        """Return the counts so far."""
+        """Return the histogram so far."""
         return Histogram(BOUNDS_S, tuple(self._counts), self._sum_ns / NS_PER_S)

@@ -1,7 +1,7 @@
-"""A run that others follow, during it or after it: the place of its journal, and its state.
+"""A run that is followed while it goes on or afterwards: the place of its journal, and its state.
 
-Rule: a follower changes nothing of the run. A live run writes into `NAME.PID.partial` beside its place (run_folder.py).
-A request for NAME finds that folder, and still follows it after the folder gets its name.
+Rule: following a run does not change it. A live run writes into the partial folder `NAME.PID.partial` (run_folder.py).
+A request for NAME finds the partial folder, and follows the run when the folder is renamed to NAME.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ PARTIAL = re.compile(r"(?P<name>.+)\.(?P<pid>[0-9]{1,9})\.partial")
 class RunState(StrEnum):
     """The state of a run.
 
-    GOES_ON: its process lives. FINISHED: the folder has its name. KILLED: the process left the folder behind. REMOVED:
-    the folder is gone; a run that ends before any frame removes its own.
+    GOES_ON: its process lives. FINISHED: its folder has the final name. KILLED: its process died and left the partial
+    folder. REMOVED: the folder is gone; a run that ends before any frame removes its folder.
     """
 
     GOES_ON = "goes on"
@@ -41,16 +41,16 @@ class RunState(StrEnum):
 
 
 def without_journal(folder: Path) -> str:
-    """Describe what lies where the journal of `folder` should be."""
+    """Return, in words, what is in place of the journal of `folder`, which has none."""
     if (folder / NAME).is_symlink():
         return f"{NAME}, a link to a file that is not there"
     return f"no {NAME}" if folder.is_dir() else "no such folder"
 
 
 class FollowedRun:
-    """The run whose journal is in `folder`. `name`: name that it has, or will have.
+    """The run whose journal is in `folder`. `name`: final name of the run's folder.
 
-    Raises BadInputError where `folder` has no journal.
+    Raises BadInputError if `folder` has no journal.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -77,12 +77,12 @@ class FollowedRun:
 
     @property
     def silent_ns(self) -> int:
-        """Return how long a live run has written nothing; 0 while that time is no longer than usual."""
+        """Return how long a live run has written nothing, ns; 0 up to `SILENCE_NS`, and 0 if the run has ended."""
         silent_ns = time.monotonic_ns() - self._heard_ns
         return silent_ns if silent_ns > SILENCE_NS and self.state is RunState.GOES_ON else 0
 
     def new(self) -> Iterator[Record]:
-        """Yield the records since the last call; none of a run that was removed. Raises BadInputError."""
+        """Yield the records since the last call; none if the run was removed. Raises BadInputError."""
         self._find_again()
         if not self.folder.is_dir():
             return
@@ -92,10 +92,10 @@ class FollowedRun:
                 yield record
         except BadInputError:
             if self._reader.path.exists():
-                raise  # else it was moved this very moment, and the next call finds it
+                raise  # without a file there, the run was moved this very moment, and the next call finds it
 
     def whole(self) -> Iterator[Record]:
-        """Yield all records of a run that was not read yet. Raises BadInputError where the journal has none so far."""
+        """Yield all records of a run that was not read yet. Raises BadInputError if the journal has no record."""
         is_empty = True
         for record in self.new():
             is_empty = False
@@ -104,7 +104,7 @@ class FollowedRun:
             raise BadInputError(self.folder, NO_RECORD, EXPECTED)
 
     def _find_again(self) -> None:
-        """Follow a run that has become complete to the folder with its own name."""
+        """Take the folder with the final name if the run has become complete and its partial folder is gone."""
         target = self.folder.with_name(self.name)
         if not self.folder.exists() and target.is_dir():
             self.folder = target
@@ -112,9 +112,9 @@ class FollowedRun:
 
 
 def follow(given: Path | None, *, wait: bool = False, sleep: Callable[[float], None] = time.sleep) -> FollowedRun:
-    """Find the run that is meant. Raises BadInputError.
+    """Return the run that `given` means. Raises BadInputError.
 
-    `given`: its folder, its journal, or its name below runs/; None for the newest below runs/.
+    `given`: folder or journal of the run, or its name below runs/; None for the newest run below runs/.
     `wait`: whether to wait until the run has begun; otherwise a run that has not begun is an error. `sleep`: function
     that waits for a time in seconds.
     """
@@ -128,7 +128,7 @@ def follow(given: Path | None, *, wait: bool = False, sleep: Callable[[float], N
 
 
 def _is_alive(pid: int) -> bool:
-    """Say whether the process still writes: one that has ended stays until its parent asks for its exit code."""
+    """Say whether the process runs. A zombie, which has ended but was not waited for by its parent, does not."""
     try:
         return bool(psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
     except psutil.NoSuchProcess:
@@ -136,7 +136,10 @@ def _is_alive(pid: int) -> bool:
 
 
 def folder_of(given: Path) -> Path | None:
-    """Return the folder of the run that `given` means (see `follow`), or the place itself if it exists; else None."""
+    """Return the run's folder that `given` means (see `follow`), partial or complete; None if there is none.
+
+    An existing path is returned as it is, whether or not it is a run's folder.
+    """
     if given.name == NAME:
         return given.parent
     places = [given] if given.is_absolute() or len(given.parts) > 1 else [given, RUNS / given]
@@ -149,14 +152,14 @@ def folder_of(given: Path) -> Path | None:
 
 
 def _newest(journals: Iterator[Path], name: str = "") -> Path | None:
-    """Return the folder whose journal was written to last; with `name`, only among those of that run."""
+    """Return the folder whose journal was written to last. `name`: take only partial folders of runs of this name."""
     found = []
     for journal in journals:
         matched = PARTIAL.fullmatch(journal.parent.name)
         if not name or (matched and matched["name"] == name):
             try:
                 found.append((journal.stat().st_mtime_ns, journal.parent))
-            except OSError:  # it was moved this very moment
+            except OSError:  # the run was moved this very moment
                 continue
     return max(found)[1] if found else None
 
@@ -175,6 +178,6 @@ def _missing(given: Path | None) -> BadInputError:
 
 
 def run_name(folder: Path) -> str:
-    """Return the name that the run in `folder` has, or will have."""
+    """Return the final name of the run in `folder`, which may be partial."""
     matched = PARTIAL.fullmatch(folder.name)
     return matched["name"] if matched else folder.name

@@ -1,9 +1,9 @@
-"""Figures of a run at any moment, from its journal as it grows. Rule: pure, and of bounded memory.
+"""Figures of a run at any moment, from its growing journal.
 
-All times of the last `WINDOW_NS` are kept, so that percentiles are exact; the whole run only has sums and counts. A
-unit's time follows the ledger (scheduler/ledger.py): its accounts and jobs are spans. Time in which a job was assigned,
-but neither ran nor was preempted, is overhead. `looks` gives the figures repeatedly until a live run ends, and once for
-a finished run.
+Rule: pure, with bounded memory. All times of the last `WINDOW_NS` are kept, so that percentiles are exact; the whole
+run only has sums and counts. A unit's time follows the ledger (scheduler/ledger.py): its accounts and jobs are spans.
+Time in which a job was assigned, but neither ran nor was preempted, is overhead. `looks` gives the figures repeatedly
+until a live run ends, and once for a finished run.
 """
 
 from __future__ import annotations
@@ -52,10 +52,11 @@ from trilane.units import COMPUTED, MEASURED, NS_PER_MS, NS_PER_S
 
 WINDOW_NS: Final = 5_000_000_000
 MOST_NOTES = 5
-BYTES, LEAST = "bytes_", "least"  # bytes that a stage moved, and those that would have done
+BYTES, LEAST = "bytes_", "least"  # prefix of a stage's metrics of bytes moved; the kind of the least bytes
 LEAST_KEY = f"stages.*.bytes.{LEAST}"
 TEMPERATURE, DUTY, MEMORY = "temperature_c.", "duty.", "memory_bytes."
-SENSOR = "sensor"  # this machine's own, beside those that are modelled
+SENSOR = "sensor"  # place with this machine's measured temperature; those of other places are modelled
+#: Keys that are measured in a run on the host clock, and computed on the virtual clock.
 OF_THE_RUN = (
     "fps",
     "run_fps",
@@ -74,7 +75,7 @@ PARTS = (ASSIGNED, *NAMES.values(), BUSY, PREEMPTED)
 
 
 class LiveFigures:
-    """Takes the records that follow `begun`, in order, and gives the figures of a moment that is not before them.
+    """Collects the figures of a run. `add` takes the records after `begun`, in order; `now` returns the figures.
 
     `finds_bound`: whether to find the bound of the run, which takes three times as long as all else. The end of a
     finished run's journal has the bound already.
@@ -114,7 +115,7 @@ class LiveFigures:
 
     @property
     def last_ns(self) -> int:
-        """Return the time of the last record that has one; 0 before the first."""
+        """Return the time of the last record with a time, ns; 0 before the first such record."""
         return self._last_ns
 
     @property
@@ -123,7 +124,7 @@ class LiveFigures:
         return self._is_over
 
     def add(self, record: Record) -> None:
-        """Take a record of the journal, but for the first."""
+        """Take the next record of the journal; `Begun` is not among them."""
         facts = self._timeline.add(record)
         self._adders[type(record)](record)
         for fact in facts:
@@ -136,10 +137,11 @@ class LiveFigures:
                 self._reckoning.add(fact)
 
     def now(self, now_ns: int | None = None, state: RunState | None = None) -> MomentFigures:
-        """Return the figures at `now_ns` of the run's clock. None or an earlier time means the time of the last record.
+        """Return the figures at the time `now_ns` of the run's clock.
 
-        `state`: state of the run, which the journal of a killed run does not show; None to take it from the journal.
-        After the run's last step the moment stays at that step, because no frames follow.
+        The time of the last record is used instead if `now_ns` is None or earlier. After the run's last step, the time
+        of that step is used. `state`: state of the run, which the journal of a killed run does not show; None to take
+        it from the journal.
         """
         now_ns = min(max(now_ns or 0, self._last_ns), self._finished_ns)
         start_ns = now_ns if self._timeline.start_ns is None else self._timeline.start_ns
@@ -178,7 +180,7 @@ class LiveFigures:
         return replace(figures, verdict=self._verdict(figures) if self._timeline.presented > 1 else None)
 
     def _verdict(self, figures: MomentFigures) -> dict[str, Any]:
-        """Return the verdict of the run so far; of one that is over by the figures of its last record."""
+        """Return the verdict on the run so far. If the run is over, the report in its last record decides."""
         document = self._report or {
             "clock": figures.clock,
             "policy": self._settings.policy,
@@ -291,7 +293,7 @@ class LiveFigures:
         return {name.removeprefix(prefix): value for name, value in self._sampled.items() if name.startswith(prefix)}
 
     def _sources(self, clock: str) -> dict[str, str]:
-        """Return the source by key; the longest key decides."""
+        """Return the source of each key of the figures. If several keys fit a figure, the longest key decides."""
         sources = dict.fromkeys(OF_THE_RUN, COMPUTED if clock == "virtual" else MEASURED)
         sources |= {
             LEAST_KEY: COMPUTED,
@@ -304,25 +306,25 @@ class LiveFigures:
 
 
 class RunLook(NamedTuple):
-    """One look at a run: its name, its state and its figures. `name`: final name of its folder."""
+    """A run at one moment: its state and its figures. `name`: final name of its folder."""
 
     name: str
     state: RunState
     figures: MomentFigures
 
     def as_json(self) -> dict[str, Any]:
-        """Return `run`, and the names of `MomentFigures`."""
+        """Return the fields of `MomentFigures` and the key `run`, the name, in a form for JSON."""
         return {"run": self.name, **self.figures.as_json()}
 
 
 def looks(run: FollowedRun, pause: Callable[[], None]) -> Generator[RunLook]:
-    """Look at `run` now, and after every `pause` until it has ended.
+    """Yield a look at `run` now, and after every `pause` until it has ended.
 
-    Raises BadInputError for a journal without a record.
+    Raises BadInputError if the run has ended and its journal has no record.
     """
     figures: LiveFigures | None = None
     while True:
-        state = run.state  # asked before the journal is read, which has everything then
+        state = run.state  # before the journal is read: the journal of an ended run is complete
         for record in run.new():
             if isinstance(record, Begun):
                 figures = LiveFigures(record, finds_bound=state is not RunState.FINISHED)
@@ -339,14 +341,14 @@ def looks(run: FollowedRun, pause: Callable[[], None]) -> Generator[RunLook]:
 
 
 def _as_reported(figures: MomentFigures, folder: Path) -> MomentFigures:
-    """Return the figures with the verdict of the run's report, which knows more than the journal."""
+    """Return `figures` with the verdict of the report in `folder`, if it has one: it knows more than the journal."""
     if not (folder / "report.json").is_file():
         return figures
     return replace(figures, verdict=verdict_of(read_report(folder), str(folder)).shown())
 
 
 class _Span(NamedTuple):
-    """A piece of time in which `ns` count as `name`; where in it they lie is not known."""
+    """A span of a unit's time. Only `ns` of it count as `name`, one of `PARTS`, at unknown places in the span."""
 
     begin_ns: int
     end_ns: int
@@ -355,7 +357,10 @@ class _Span(NamedTuple):
 
 
 class _UnitTime:
-    """Where the time of one unit goes from `begin_ns` on; spans are kept for `window_ns`."""
+    """Where the time of one unit goes from `begin_ns` on. Spans are kept for `window_ns`, sums for ever.
+
+    `account`: account of the ledger that is charged at the begin.
+    """
 
     def __init__(self, begin_ns: int, window_ns: int, account: int = STARVED) -> None:
         self._begin_ns, self._window_ns = begin_ns, window_ns
@@ -365,7 +370,7 @@ class _UnitTime:
         self._totals = dict.fromkeys(PARTS, 0)
 
     def enter(self, now_ns: int, account: int) -> None:
-        """Charge the unit's time to `account` from `now_ns` on."""
+        """Charge the unit's time from `now_ns` on to `account` of the ledger."""
         self._keep(self._since_ns, now_ns, self._state, now_ns - self._since_ns)
         self._state, self._since_ns = NAMES.get(account, ASSIGNED), now_ns
 
@@ -386,7 +391,7 @@ class _UnitTime:
             self._keep(begin_ns, end_ns, PREEMPTED, min(job.preempted_ns, ran_ns))
 
     def shares(self, now_ns: int, running_since_ns: int | None) -> tuple[Shares, Shares]:
-        """Return the shares of the window and of the run. `running_since_ns`: hand-over of the job it holds, if any."""
+        """Return the shares of the window and of the run. `running_since_ns`: hand-over of the present job, or None."""
         opened = [_Span(self._since_ns, now_ns, self._state, now_ns - self._since_ns)]
         if running_since_ns is not None:
             begin_ns = min(max(running_since_ns, self._last_end_ns, self._since_ns), now_ns)
@@ -414,13 +419,13 @@ def _shares(sums: Mapping[str, int], total_ns: int) -> Shares:
     causes = (*IDLE_CAUSES, JOIN) if sums[JOIN] else IDLE_CAUSES
     if total_ns <= 0:
         return Shares(0.0, dict.fromkeys(causes, 0.0))
-    overhead_ns = max(sums[ASSIGNED] - sums[BUSY] - sums[PREEMPTED], 0)  # parts that were cut are rounded down
+    overhead_ns = max(sums[ASSIGNED] - sums[BUSY] - sums[PREEMPTED], 0)  # rounding of cut spans may make it negative
     idle_ns = {**sums, OVERHEAD: overhead_ns}
     return Shares(sums[BUSY] / total_ns, {cause: idle_ns[cause] / total_ns for cause in causes})
 
 
 class _Work(NamedTuple):
-    """A job of a stage: its end, its duration, and the bytes that it moved by kind."""
+    """A job of a stage: its end, its service time, and the bytes moved, by kind."""
 
     end_ns: int
     service_ns: int
@@ -428,7 +433,7 @@ class _Work(NamedTuple):
 
 
 class _StageBook:
-    """The jobs of a stage in the window, and the bytes of all its jobs."""
+    """The jobs of a stage in the window, and the bytes that all its jobs moved, by kind."""
 
     def __init__(self) -> None:
         self.recent: deque[_Work] = deque()

@@ -1,8 +1,8 @@
 """The metrics of a run: a table of name, unit, meaning, labels and values, written as OpenMetrics text.
 
-Rule: base units; no label names a frame, a job or a process's number, so the rows do not grow with the run. Gauges are
-of the last seconds (`WINDOW_NS` of live_figures.py), histograms and counters of the whole run. Where each metric comes
-from is a metric itself; prometheus_client writes the text. docs/metrics.md has the same table.
+Rule: base units; no label names a frame, a job or a process number, so the rows do not grow with the run. Busy and idle
+shares cover the last seconds (`WINDOW_NS` of live_figures.py), other gauges the moment, histograms and counters the
+whole run. The metric `trilane_source` names the source of each metric. docs/metrics.md has the same table.
 https://prometheus.io/docs/specs/om/open_metrics_spec/
 """
 
@@ -26,13 +26,13 @@ Row = tuple[tuple[str, ...], float]
 
 
 def openmetrics(figures: MomentFigures) -> bytes:
-    """Write `figures` as a document of type `CONTENT_TYPE`, in UTF-8."""
+    """Return `figures` as OpenMetrics text of type `CONTENT_TYPE`, in UTF-8."""
     document: bytes = generate_latest(_Collected(figures))
     return document
 
 
 class _Collected:
-    """Hands a run's metrics to prometheus_client, whose registry holds the metrics of its own process."""
+    """The metrics of a run, in place of prometheus_client's registry, which holds the metrics of this process."""
 
     def __init__(self, figures: MomentFigures) -> None:
         self._figures = figures
@@ -80,16 +80,20 @@ def _sources(figures: MomentFigures) -> families.Metric:
 
 
 def _sources_of(figures: MomentFigures, key: str) -> Iterator[tuple[str, str]]:
-    """Yield "" and the source of `key`, then each place or avatar below it that has a source of its own."""
+    """Yield (part, source) of `key`, and nothing for an empty `key`.
+
+    Part "" is all of `key`. Any other part is a place or an avatar with a source of its own.
+    """
     for name, source in figures.sources.items():
         if key and (name == key or (name.startswith(f"{key}.") and "*" not in name)):
             yield name.removeprefix(key).removeprefix("."), source
 
 
 class Metric(NamedTuple):
-    """A gauge or counter. `labels`: names of its labels. `source`: key of `Figures.sources`; "" where it is no figure.
+    """A gauge or counter.
 
-    `unit` must be the end of `name`, without the `_total` that a counter gets.
+    `unit`: end of `name`, or "" for a plain number. `labels`: names of its labels. `source`: key of
+    `MomentFigures.sources`; "" for none.
     """
 
     name: str
@@ -101,7 +105,7 @@ class Metric(NamedTuple):
 
 
 class Times(NamedTuple):
-    """A histogram of times in seconds."""
+    """A histogram of times in seconds. `times`: function that takes it from the figures. `source`: see `Metric`."""
 
     name: str
     help: str
@@ -130,7 +134,7 @@ def _psnr(figures: MomentFigures) -> Iterator[Row]:
 
 
 class Info(NamedTuple):
-    """A metric that says something in its labels alone."""
+    """A metric whose labels have its content; its value is always 1."""
 
     name: str
     help: str

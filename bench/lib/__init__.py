@@ -1,4 +1,4 @@
-"""Parts that several benches share: fixtures, networks, load patterns and clocks.
+"""Parts that several benches share: fixtures, networks, reference pictures, and processes for variants.
 
-It may use what bench/ may, but no module of bench/ itself.
+This folder may import what bench/ may import, but no module of bench/ itself.
 """

@@ -1,6 +1,6 @@
 """The avatars in a frame: their places, and the layers of the picture that show them, made without the stages.
 
-Rule: motion, camera and media time are the pose stage's, so a picture shows the same moment as the run's frame.
+Rule: motion, camera and media time are as in the pose stage, so a picture shows the same moment as the run's frame.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from trilane.stages.gpu.composite_painters import taps_of
 
 @dataclass(frozen=True)
 class CastView:
-    """One avatar in one frame.
+    """One visible avatar in one frame.
 
     `index`: number of the avatar in the scene. `folder`: folder of its bundle. `pose` (55,3), `translation` (3,),
     `world` (4,4): as in `Mover.sample` and `Mover`. `joints` (55,3,4): skinning matrices, as the pose stage computes
-    them. `box`: pixels of the picture that hold it, clothes included. `depth`: camera z of the pelvis. `view` (4,4):
-    view matrix. `projection` (4,4): projection of the box.
+    them. `box`: pixels of the picture around the avatar and its clothes; it may reach beyond the picture. `depth`:
+    camera z of the pelvis. `view` (4,4): view matrix. `projection` (4,4): projection to the box.
     """
 
     index: int
@@ -56,9 +56,9 @@ class _Actor:
 
 
 class Cast:
-    """The avatars and the camera of a scene.
+    """The avatars and the camera of the scene in `checked`.
 
-    `avatars`: each distinct avatar, by the folder of its bundle.
+    `avatars`: distinct avatars, by the folder of the bundle.
     """
 
     def __init__(self, checked: Checked) -> None:
@@ -78,14 +78,14 @@ class Cast:
         ]
 
     def seen(self, frame: int) -> list[CastView]:
-        """Return the avatars that are on the screen in frame number `frame`."""
+        """Return the visible avatars in frame number `frame`."""
         t_s = frame / self._fps
         view, whole = self._camera.sample(t_s), self.projection(frame)
         found = (self._seen(actor, t_s, view, whole) for actor in self._actors)
         return [seen for seen in found if seen is not None]
 
     def boxes(self, frame: int) -> list[Box]:
-        """Return the parts of the picture that hold avatars in frame number `frame`."""
+        """Return the boxes of the visible avatars in frame number `frame`, clipped to the picture."""
         return [seen.box.on(self._output) for seen in self.seen(frame)]
 
     def projection(self, frame: int) -> F64:
@@ -113,12 +113,12 @@ def _skeleton(data: AvatarData) -> Skeleton:
 
 # Layers of a picture, blended in linear light in float64: a second implementation of the composite.
 #
-# Rule: a layer lies on the pixel grid of the picture and may hang over it. A layer off the grid is read by `placed` at
-# the picture's pixels.
+# Rule: a layer lies on the pixel grid of the picture and may reach beyond its edges. `placed` resamples a picture that
+# is off the grid.
 
 
 class Box(NamedTuple):
-    """Rows `top` to `bottom` and columns `left` to `right` of a picture, in pixels; the last of each are outside."""
+    """A rectangle of a picture, pixels: rows `top` to `bottom` - 1, columns `left` to `right` - 1."""
 
     top: int
     left: int
@@ -135,20 +135,20 @@ class Box(NamedTuple):
         return Rect(self.left * across - 1, 1 - self.bottom * down, self.right * across - 1, 1 - self.top * down)
 
     def within(self, other: Box) -> Rect:
-        """Return the box in normalised device coordinates of a picture that fills `other`."""
+        """Return the box in the normalised device coordinates of a picture with the pixels of `other`."""
         moved = Box(self.top - other.top, self.left - other.left, self.bottom - other.top, self.right - other.left)
         return moved.rect(other.shape)
 
     def on(self, output: Shape) -> Box:
-        """Return the part that lies on a picture of `output` (height, width)."""
+        """Return the part of the box that lies on a picture of `output` (height, width)."""
         return Box(max(self.top, 0), max(self.left, 0), min(self.bottom, output[0]), min(self.right, output[1]))
 
 
 @dataclass(frozen=True)
 class RasterLayer:
-    """A layer of a picture.
+    """A layer of a picture, which covers the pixels of `box`.
 
-    `light` (h,w,4): linear light times alpha, then alpha, 0..1. `depth`: camera z; the least is the farthest.
+    `light` (h,w,4): linear light times alpha, then alpha, 0..1. `depth`: camera z; the farthest layer has the least.
     """
 
     box: Box
@@ -157,14 +157,17 @@ class RasterLayer:
 
 
 def box_around(rect: Rect, output: Shape) -> Box:
-    """Return whole pixels that hold `rect`, with enough around it that both sides are multiples of 32."""
+    """Return the smallest box around `rect` (NDC) on whole pixels, grown until both sides are multiples of 32.
+
+    `output`: (height, width) of the picture.
+    """
     top, bottom = np.floor((1 - rect.y1) / 2 * output[0]), np.ceil((1 - rect.y0) / 2 * output[0])
     left, right = np.floor((1 + rect.x0) / 2 * output[1]), np.ceil((1 + rect.x1) / 2 * output[1])
     return grown(Box(int(top), int(left), int(bottom), int(right)), BUCKET_STEP)
 
 
 def grown(box: Box, step: int) -> Box:
-    """Grow `box` until `step` divides both sides; an odd pixel goes to the bottom or the right."""
+    """Return `box`, grown evenly until `step` divides both sides. An odd pixel goes to the bottom or the right."""
     rows, columns = _grown(box.top, box.bottom, step), _grown(box.left, box.right, step)
     return Box(rows[0], columns[0], rows[1], columns[1])
 
@@ -175,24 +178,24 @@ def _grown(first: int, last: int, step: int) -> tuple[int, int]:
 
 
 def premultiplied(rgba: Floats) -> F64:
-    """Return linear light times alpha, and alpha, (h,w,4), of `rgba` (h,w,4): sRGB with straight alpha, 0..1."""
+    """Return `rgba` (h,w,4), sRGB with straight alpha in 0..1, as linear light times alpha, and alpha (h,w,4)."""
     straight = np.asarray(rgba, np.float64)
     alpha = straight[..., 3:]
     return np.concatenate([to_light(straight[..., :3]) * alpha, alpha], axis=-1)
 
 
 def shrunk(light: F64, factor: int) -> F64:
-    """Return (h,w,C): the means of squares of `factor` x `factor` pixels of `light` (h * factor, w * factor, C)."""
+    """Return `light` (h * factor, w * factor, C), reduced to (h,w,C) by means over `factor` x `factor` pixels."""
     height, width, channels = light.shape
     squares = light.reshape(height // factor, factor, width // factor, factor, channels)
     return np.asarray(squares.mean(axis=(1, 3)))
 
 
 def enlarged(light: F64, factor: int) -> F64:
-    """Return `light` (h,w,C) read bilinearly at the centres of smaller pixels: (h * factor, w * factor, C).
+    """Return `light` (h,w,C), enlarged bilinearly to (h * factor, w * factor, C).
 
-    Each pixel becomes a square of `factor` x `factor`, with the same centre. Beyond the centres of the outermost pixels
-    their values continue.
+    Each pixel becomes a square of `factor` x `factor` pixels. Beyond the centres of the outermost pixels, their values
+    are repeated.
     """
     return _enlarged_down(_enlarged_down(light, factor).swapaxes(0, 1), factor).swapaxes(0, 1)
 
@@ -206,10 +209,11 @@ def _enlarged_down(light: F64, factor: int) -> F64:
 
 
 def placed(light: F64, rect: Rect, output: Shape, depth: float) -> RasterLayer:
-    """Read `light` (h,w,C), which fills `rect` of a picture of `output` (height, width), at the picture's pixels.
+    """Return a layer with `light` (h,w,C), which fills `rect` (NDC), resampled at the pixels of the picture.
 
-    Each pixel whose centre lies in `rect` is the mean of as many bilinear reads as the composite takes, evenly over the
-    pixel. Beyond the centres of the outermost pixels of `light` their values continue.
+    Each pixel whose centre lies in `rect` is the mean of bilinear reads, evenly spread over the pixel, as many as the
+    composite takes. Beyond the centres of the outermost pixels of `light`, their values are repeated. `output`:
+    (height, width) of the picture. `depth`: depth of the layer.
     """
     top, bottom = (1 - rect.y1) / 2 * output[0], (1 - rect.y0) / 2 * output[0]
     left, right = (1 + rect.x0) / 2 * output[1], (1 + rect.x1) / 2 * output[1]
@@ -223,10 +227,11 @@ def placed(light: F64, rect: Rect, output: Shape, depth: float) -> RasterLayer:
 
 
 def _reads(begin: float, end: float, count: int, side: int, taps: int) -> tuple[int, F64]:
-    """Return how the pixels between `begin` and `end` are read along one axis of a picture of `side` pixels.
+    """Return the resampling along one axis: the first pixel of the picture, and weights (n, count) for n pixels.
 
-    They are the number of the first pixel of the picture whose centre lies in [begin, end), and weights (n, count). Row
-    k says how much each of the `count` pixels counts for the first pixel + k.
+    A layer of `count` pixels lies from `begin` to `end` on a picture of `side` pixels. The n pixels of the picture have
+    their centres in [begin, end). Row k of the weights says how much each pixel of the layer counts for the first
+    pixel + k. `taps`: number of reads a pixel.
     """
     first, last = (min(max(int(np.ceil(place - 0.5)), 0), side) for place in (begin, end))
     middles = np.arange(first, last)[:, None] + 0.5
@@ -242,12 +247,12 @@ def _reads(begin: float, end: float, count: int, side: int, taps: int) -> tuple[
 
 
 def blended(background: U8, layers: Iterable[RasterLayer]) -> U8:
-    """Blend `layers` over `background`, both sRGB, (h,w,3) uint8; the farthest layer first."""
+    """Return `layers` blended over `background` (h,w,3) sRGB, the farthest first, as (h,w,3) uint8 sRGB."""
     return np.asarray(np.rint(laid_over(background, layers)[0] * 255), np.uint8)
 
 
 def laid_over(background: U8, layers: Iterable[RasterLayer]) -> tuple[F64, F64]:
-    """Blend as `blended`, without rounding: (h,w,3) in 0..1, and how much of each pixel (h,w) the layers cover."""
+    """Return the result of `blended` before rounding, (h,w,3) in 0..1, and each pixel's share under layers (h,w)."""
     output = (background.shape[0], background.shape[1])
     light, seen_through = to_light(background / 255.0), np.ones(output)
     for layer in sorted(layers, key=lambda layer: layer.depth):
@@ -260,11 +265,11 @@ def laid_over(background: U8, layers: Iterable[RasterLayer]) -> tuple[F64, F64]:
 
 
 def to_light(code: F64) -> F64:
-    """Turn sRGB in 0..1 into linear light, IEC 61966-2-1."""
+    """Return the linear light of sRGB values in 0..1, by IEC 61966-2-1."""
     return np.asarray(np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4))
 
 
 def to_code(light: F64) -> F64:
-    """Turn linear light into sRGB in 0..1, IEC 61966-2-1; light beyond 0..1 is clipped."""
+    """Return the sRGB values in 0..1 of linear light, by IEC 61966-2-1. Light is clipped to 0..1 before."""
     light = np.clip(light, 0.0, 1.0)
     return np.asarray(np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055))

@@ -1,8 +1,8 @@
 """The scene that the GPU benches draw, its reference, and the timing of variants in turns.
 
-Rule: the default body stands as high as a square picture, with the same numbers every time; only size and channels
-vary. Avatars and ground truth are made by the functions of runs and of training. A busy machine affects all variants
-alike. As in a run, no input is the one before, and slots alternate: what repeats is found in caches.
+Rule: the default body fills the height of a square picture, with the same numbers every time; only size and channels
+vary. The functions of runs and of training make avatars and ground truth. A busy machine affects all variants alike. As
+in a run, successive inputs differ and slots alternate, because caches would speed up repetitions.
 """
 
 from __future__ import annotations
@@ -29,22 +29,22 @@ TEXTURE_SIDE = 512
 ENCODING = Quantisation(6 / 255, 128)
 DISTANCE_M, HEIGHT_M, FRAME_M = 3.0, 0.9, 1.9
 ARMS_DOWN_RAD = 1.1
-ARMS_STEP_RAD = 0.07  # by which the arms are higher in each further pose
+ARMS_STEP_RAD = 0.07  # how much higher the arms are in each further pose
 WARM_UP = 5
-#: Number of inputs that take turns, and of slots that they go through. They have no common divisor, so that each input
-#: comes to each slot.
+#: Number of inputs that take turns, and of slots that take turns. They have no common divisor, so that each input comes
+#: to each slot.
 INPUTS, SLOTS = 5, 2
 
 
 @dataclass(frozen=True)
 class Fixture:
-    """The body and how it is seen.
+    """The body of a bench, its texture and its camera.
 
-    `shaped`: body in its shape.
-    `poses`: its joints in each of INPUTS poses.
-    `arrays`: its mesh for the GPU.
+    `shaped`: the body.
+    `poses`: the body's joints in each of INPUTS poses.
+    `arrays`: mesh of the body for the GPU.
     `view`, `projection`: matrices of the camera, (4,4) float64.
-    `texture`: (512,512,C) float64, the same numbers every time.
+    `texture`: neural texture (512,512,C) float64, the same numbers every time.
     """
 
     shaped: ShapedBody
@@ -60,7 +60,7 @@ class Fixture:
 
 
 def standing(channels: int, weights: int = 8) -> Fixture:
-    """Return the body with arms half down, a little higher in each further pose.
+    """Return the fixture: a standing body with its arms half down, a little higher in each further pose.
 
     `channels`: channels of its texture. `weights`: number of skin weights a vertex, 4, 8 or 12.
     """
@@ -104,9 +104,9 @@ def _texture(channels: int) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class Drawable:
-    """An avatar as the GPU draws it, without a run around it.
+    """The parts of an avatar that the GPU draws.
 
-    `texture`: (H,W,C) float32.
+    `texture`: neural texture (H,W,C) float32. `quantisation`: scale and zero point of the network's input.
     """
 
     arrays: MeshArrays
@@ -115,14 +115,14 @@ class Drawable:
 
 
 def load_drawable(name: str) -> Drawable:
-    """Load the avatar `name`. Raises BadInputError."""
+    """Load the parts of the avatar `name` that the GPU draws. Raises BadInputError."""
     avatar = load_avatar(load_bundle(name))
     packed = avatar.bundle.manifest.network.input
     return Drawable(avatar_mesh(avatar.shaped), avatar.texture, Quantisation(packed.scale, packed.zero_point))
 
 
 def ground_truth(bundle: Bundle) -> tuple[Any, Any]:
-    """Return the renderer of the bundle's body, clothed, and the `image_error` of two pictures.
+    """Return the renderer of the bundle's clothed body (`SampleRenderer`), and the function `image_error` of training.
 
     Raises MissingPartError.
     """
@@ -140,10 +140,10 @@ def interleaved_ms(
     repeats: int,
     prepare: Callable[[int], object] = lambda _: None,
 ) -> dict[str, list[float]]:
-    """Return milliseconds of each variant in each of `repeats` rounds, after a warm-up.
+    """Return the times of each variant in `repeats` rounds, ms, after a warm-up.
 
-    A round runs each variant once, with the number of the round, from 0, which selects the input and the slot.
-    `prepare` is called with the same number before each run, and is not timed.
+    Each round runs every variant once. A variant is a function of the round's number, from 0, by which it chooses input
+    and slot. `prepare` is called with this number before each run, and is not timed.
     """
     times: dict[str, list[float]] = {name: [] for name in variants}
     for number in range(WARM_UP + repeats):
@@ -157,7 +157,7 @@ def interleaved_ms(
 
 
 def summary_ms(times_ms: list[float]) -> dict[str, float]:
-    """Return median, minimum and 90th percentile in milliseconds."""
+    """Return the median, the minimum and the 90th percentile of `times_ms`."""
     return {
         "median_ms": float(np.median(times_ms)),
         "min_ms": float(np.min(times_ms)),

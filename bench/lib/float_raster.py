@@ -1,8 +1,9 @@
 """A reference rasteriser in float64 NumPy, with which the GPU stage's pictures are compared.
 
-Rule: it is exact where a driver rounds. Pixel centres are at half-integers; it uses the top-left rule and a less-than
-depth test, and neither snaps vertices nor clips. Triangles are evaluated in homogeneous coordinates (Olano and Greer,
-"Triangle scan conversion using 2D homogeneous coordinates", 1997) and cut by the near and far planes pixel by pixel.
+Rule: coordinates are not rounded, as they are in a driver. Pixel centres are at half-integers. The rasteriser uses the
+top-left rule and a less-than depth test, and does not snap vertices. Triangles are evaluated in homogeneous coordinates
+(Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates", 1997). Near and far planes cut them pixel
+by pixel.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ BATCH_SAMPLES = 4_000_000
 class ReferenceImage:
     """A rasterised image.
 
-    `coverage` (h,w) bool. `triangle` (h,w) int64, -1 outside. `uv` (h,w,2) and `depth` (h,w) float64, 0 outside.
+    `coverage` (h,w): whether a triangle covers the pixel. `triangle` (h,w): number of the nearest triangle, -1 outside.
+    `uv` (h,w,2), `depth` (h,w): texture coordinates and z/w of its point, 0 outside.
     """
 
     coverage: NDArray[np.bool_]
@@ -34,7 +36,7 @@ class ReferenceImage:
 
 
 def skin(arrays: MeshArrays, joints: NDArray[np.floating[Any]]) -> F64:
-    """Return world positions (N,3) of `arrays` under skinning matrices `joints` (55,3,4)."""
+    """Return the skinned vertices (N,3) of `arrays` in the world. `joints`: skinning matrices (55,3,4)."""
     matrices = np.einsum("nk,nkij->nij", arrays.weight.astype(np.float64), joints.astype(np.float64)[arrays.joint])
     return np.asarray(np.einsum("nij,nj->ni", matrices[..., :3], arrays.position.astype(np.float64)) + matrices[..., 3])
 
@@ -47,10 +49,10 @@ def rasterise(
     shape: tuple[int, int],
     cull: bool = False,
 ) -> ReferenceImage:
-    """Draw triangles; row 0 is the top one.
+    """Return the image of triangles. Row 0 is at the top.
 
     `world`: vertices, (N,3) metres.
-    `triangles`: vertices of each triangle, (F,3).
+    `triangles`: indices of each triangle's vertices, (F,3).
     `uv`: texture coordinates of each vertex, (N,2).
     `clip`: projection @ view, (4,4).
     `shape`: (height, width) in pixels.
@@ -73,7 +75,7 @@ def rasterise(
 
 
 def sample(texture: F64, uv: F64) -> F64:
-    """Return bilinear samples (..., C) of `texture` (H,W,C) at `uv` (..., 2), clamped to its edge."""
+    """Return bilinear samples (..., C) of `texture` (H,W,C) at `uv` (..., 2). Texels are clamped to the edge."""
     height, width = texture.shape[:2]
     column, row = uv[..., 0] * width - 0.5, uv[..., 1] * height - 0.5
     left, top = np.floor(column).astype(np.int64), np.floor(row).astype(np.int64)
@@ -88,16 +90,16 @@ def sample(texture: F64, uv: F64) -> F64:
 
 
 def quantise(real: F64, scale: float, zero_point: int) -> NDArray[np.uint8]:
-    """Return q = clamp(round(real / scale) + zero_point, 0, 255), halves to even."""
+    """Return q = clamp(round(real / scale) + zero_point, 0, 255) of real numbers (...). Halves round to even."""
     return np.asarray(np.clip(np.rint(real / scale) + zero_point, 0, 255), np.uint8)
 
 
 def tensor(image: ReferenceImage, texture: F64, scale: float, zero_point: int) -> NDArray[np.uint8]:
-    """Return the network's input (h,w,C) uint8.
+    """Return the tensor (h,w,C) uint8: the quantised texture on the mesh, the zero point outside.
 
     `image`: rasterised mesh.
-    `texture`: (H,W,C).
-    `scale`, `zero_point`: scale and zero point of the bytes; pixels off the mesh have the zero point.
+    `texture`: neural texture (H,W,C).
+    `scale`, `zero_point`: scale and zero point of the tensor.
     """
     q = np.full((*image.coverage.shape, texture.shape[2]), zero_point, np.uint8)
     q[image.coverage] = quantise(sample(texture, image.uv[image.coverage]), scale, zero_point)
@@ -105,7 +107,7 @@ def tensor(image: ReferenceImage, texture: F64, scale: float, zero_point: int) -
 
 
 def _target_corners(world: F64, clip: F64, shape: tuple[int, int]) -> F64:
-    """Return vertices (N,4): homogeneous column, row, clip z, clip w, so that column / w is a position in pixels."""
+    """Return vertices (N,4) as (column, row, z, w): column / w and row / w are pixels, z and w clip coordinates."""
     x, y, z, w = np.moveaxis(np.c_[world, np.ones(len(world))] @ (FLIP_Y @ clip).T, -1, 0)
     return np.stack([(x + w) * shape[1] / 2, (y + w) * shape[0] / 2, z, w], axis=-1)
 
@@ -113,7 +115,10 @@ def _target_corners(world: F64, clip: F64, shape: tuple[int, int]) -> F64:
 def _fragments(
     corners: F64, shape: tuple[int, int], cull: bool
 ) -> tuple[NDArray[np.int64], F64, NDArray[np.int64], F64]:
-    """Return every covered sample of every triangle: pixel index, depth z/w, triangle, shares (P,3) of the corners."""
+    """Return the P pixels that triangles cover, once for each triangle.
+
+    The result is pixel index (P,), depth z/w (P,), triangle (P,), and shares of the triangle's corners (P,3).
+    """
     low, size = _boxes(corners, shape)
     if cull:
         size[_determinant(corners) >= 0] = 0
@@ -131,7 +136,10 @@ def _fragments(
 
 
 def _boxes(corners: F64, shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return a square that holds each triangle: first column and row (F,2), and side (F,), 0 when it is outside."""
+    """Return the square around each triangle: first column and row (F,2), and side (F,).
+
+    The side is 0 for a triangle outside the picture.
+    """
     limit = np.array([shape[1], shape[0]])
     w = corners[..., 3]
     in_front = (w > 0).all(axis=1)
@@ -171,16 +179,13 @@ def _cross(points: F64, first: int, second: int) -> F64:
 
 
 def _determinant(points: F64) -> F64:
-    """Return a determinant (F,) that is positive for triangles that wind clockwise in the picture.
-
-    Rows run downwards.
-    """
+    """Return a determinant (F,), which is positive for triangles that wind clockwise in the picture."""
     return np.asarray((_cross(points, 1, 2) * points[:, 0][:, [0, 1, 3]]).sum(axis=-1))
 
 
 def _top_left(edges: F64) -> NDArray[np.bool_]:
-    """Return which edges (F,3,3) own the samples on them: left edges, and level ones with the inside below.
+    """Return which edges own the samples on them (F,3): left edges, and horizontal edges with the inside below.
 
-    Rows run downwards.
+    `edges` (F,3,3): coefficients of the edge functions, whose values are positive inside.
     """
     return np.asarray((edges[..., 0] > 0) | ((edges[..., 0] == 0) & (edges[..., 1] > 0)))

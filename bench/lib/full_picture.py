@@ -1,15 +1,14 @@
-"""The picture of the plan `full`: everything is modelled, nothing is spared. Other plans are compared with it.
+"""Pictures by the plan `full`, in which everything is modelled, and true pictures. Other plans are compared with both.
 
-Rule: it is a second, slow implementation where that is possible. The body has every weight and every blend shape in
-float64. The neural texture is read at SAMPLES x SAMPLES points of a tensor pixel, whose mean is not rounded. Each
-avatar has a tensor of its own, of about the area that its network is for, where it paints best. The tensor lies on the
-picture's grid: one pixel of either covers a square of pixels of the other. The network is in FP32; its picture is
-blended in linear light, in float64, over the run's own background.
+Rule: the plan `full` is a second, slow implementation where that is possible. The body has every weight and every blend
+shape in float64. The neural texture is read at SAMPLES x SAMPLES points of a tensor pixel, whose mean is not rounded.
+Each avatar has a tensor of its own, of about the size for which its network paints best. The tensor lies on the
+picture's grid: a pixel of the tensor covers a square of pixels of the picture, or the other way round. The network is
+in FP32; its picture is blended in linear light, in float64, over the run's own background.
 
-Beside it stands the picture with the clothed body itself, drawn as training draws its samples. An avatar's network was
-trained to paint that picture, so it shows how good every plan's picture is, including `full`. Only the bundled avatars
-have such a picture. Clothes are put on the skin, not on an avatar's offsets, because the offsets are these clothes
-already.
+A true picture shows the clothed body itself, drawn like a training sample. An avatar's network was trained to paint
+this picture, so it shows how good every plan is, including `full`. Only bundled avatars have true pictures. Clothes are
+put on the skin, not on an avatar's offsets, because the offsets are these clothes already.
 """
 
 from __future__ import annotations
@@ -50,14 +49,14 @@ CLOTHED_SAMPLES = 4
 
 
 class FullBody:
-    """The body in float64 with every blend shape and skin weight, joint by joint as the SMPL-X layout defines it.
+    """The body in float64 with every blend shape and skin weight, computed joint by joint as SMPL-X defines it.
 
-    `rest` (V,3): rest shape, metres.
-    `joints` (55,3): joints of the rest shape, metres.
+    `rest` (V,3): vertices at rest, metres.
+    `joints` (55,3): places of the joints at rest, metres.
     """
 
     def __init__(self, body: Body, betas: Sequence[float] = (), expression: Sequence[float] = ()) -> None:
-        """Return the shape `body` by `betas` and `expression`; missing coefficients are 0."""
+        """Shape `body` by `betas` and `expression`; missing coefficients are 0."""
         self._body = body
         self._weights = body.weights.astype(np.float64)
         self.rest = body.v_template.astype(np.float64)
@@ -83,11 +82,14 @@ class FullBody:
         return np.asarray(np.einsum("vab,vb->va", moved[:, :, :3], rest) + moved[:, :, 3])
 
     def _placed(self, turns: F64, translation: F64, world: F64) -> F64:
-        """Return matrices (55,3,4) from the rest shape to the world, for what each joint moves."""
+        """Return each joint's matrix (55,3,4) from the rest shape to the world.
+
+        `turns`: rotations (55,3,3) of the joints. `translation`, `world`: see `vertices`.
+        """
         placed: dict[int, F64] = {}
 
         def place(joint: int) -> F64:
-            """Return the matrix (4,4) of `joint`: its parent's, a shift to the joint, the turn, and a shift back."""
+            """Return the matrix (4,4) of `joint`: its parent's matrix @ shift to the joint @ turn @ shift back."""
             if joint not in placed:
                 parent = int(self._body.parents[joint])
                 above = world @ _shift(translation) if parent < 0 else place(parent)
@@ -110,7 +112,7 @@ def _shift(by: F64) -> F64:
 class _Avatar:
     """One distinct avatar.
 
-    `area`: pixels of the tensor that its network is for. `network`: source of the network, for people.
+    `paint`: its FP32 network. `area`: pixels of the network's own tensor. `network`: source of the network in words.
     """
 
     body: FullBody
@@ -122,7 +124,7 @@ class _Avatar:
 
 
 class FullPictures:
-    """Makes pictures of a scene's cast by the plan `full`."""
+    """Makes pictures of a cast by the plan `full`."""
 
     def __init__(self, cast: Cast) -> None:
         """Load the networks. Raises BadInputError, MissingPartError."""
@@ -131,7 +133,7 @@ class FullPictures:
 
     @property
     def networks(self) -> list[str]:
-        """Sources of the networks that paint the avatars."""
+        """The sources of the networks that paint the avatars, in words."""
         return sorted({avatar.network for avatar in self._avatars.values()})
 
     def frame(self, number: int, background: U8) -> U8:
@@ -151,14 +153,14 @@ class FullPictures:
 
 
 def fineness(shape: Shape, area: int) -> Fraction:
-    """Return the tensor pixels for each pixel of the picture along a side: ..., 1/3, 1/2, 1, 2, 3, ...
+    """Return the number of tensor pixels per picture pixel, along a side: ..., 1/3, 1/2, 1, 2, 3, ...
 
-    The value brings a box of `shape` (height, width) nearest to `area` pixels, in ratio.
+    The result makes the tensor of a box of `shape` (height, width) as near as possible to `area` pixels, as a ratio.
     """
     own = shape[0] * shape[1]
     larger, smaller = max(own, area), min(own, area)
     times = isqrt(larger // smaller)
-    # The nearer, in ratio, of the two whole numbers about the root is the larger one beyond their geometric mean.
+    # The larger of the two whole numbers around the root is nearer, as a ratio, beyond their geometric mean.
     times += larger > smaller * times * (times + 1)
     return Fraction(times) if area > own else Fraction(1, times)
 
@@ -172,15 +174,15 @@ def _avatar(data: AvatarData) -> _Avatar:
 
 
 def supersampled(vertices: F64, mesh: MeshArrays, clip: F64, shape: Shape, texture: F32, samples: int = SAMPLES) -> F64:
-    """Return the network's input as real numbers, (h,w,C) float64.
+    """Return the tensor of a body in real numbers, (h,w,C) float64.
 
-    Each is the mean of `samples` x `samples` reads, 0 off the mesh.
+    A pixel is the mean of `samples` x `samples` bilinear reads of the texture; reads off the mesh are 0.
 
     `vertices`: vertices (V,3) of the body, in the world, metres.
-    `mesh`: its triangles and texture coordinates.
+    `mesh`: triangles and texture coordinates of the body.
     `clip`: projection of the tensor @ view, (4,4).
     `shape`: (height, width) of the tensor.
-    `texture`: (H,W,C), read bilinearly.
+    `texture`: neural texture (H,W,C).
     """
     fine = (shape[0] * samples, shape[1] * samples)
     image = float_raster.rasterise(vertices[mesh.source], mesh.triangles, mesh.uv, clip, fine, mesh.closed)
@@ -196,13 +198,10 @@ def supersampled(vertices: F64, mesh: MeshArrays, clip: F64, shape: Shape, textu
 
 
 class TruePictures:
-    """Makes pictures of a cast of bundled avatars as the clothed bodies that they were trained on."""
+    """Makes true pictures of a cast of bundled avatars: the clothed bodies that the avatars were trained on."""
 
     def __init__(self, cast: Cast, ctx: Any) -> None:
-        """Prepare the clothed bodies. Everybody in the cast must be a bundled avatar.
-
-        `ctx`: OpenGL context in use.
-        """
+        """Prepare the clothed bodies. `cast`: only bundled avatars. `ctx`: OpenGL context in use."""
         self._cast = cast
         self._clothed = {folder: _clothed(data, ctx) for folder, data in cast.avatars.items()}
 
@@ -211,7 +210,7 @@ class TruePictures:
         return blended(background, self.layers(number))
 
     def layers(self, number: int) -> list[RasterLayer]:
-        """Return the layers of those who are seen in frame `number`, on the picture's grid."""
+        """Return the layers of the visible avatars in frame `number`, on the picture's grid."""
         layers = []
         for seen in self._cast.seen(number):
             rgba = self._clothed[seen.folder].render(seen.joints, seen.view, seen.projection, seen.box.shape) / 255.0
@@ -220,7 +219,7 @@ class TruePictures:
 
 
 def true_pictures(cast: Cast, ctx: Any) -> TruePictures | None:
-    """Return the true pictures of `cast`; None unless everybody in it is a bundled avatar.
+    """Return the true pictures of `cast`; None if an avatar in it is not bundled.
 
     `ctx`: OpenGL context in use.
     """
@@ -236,9 +235,9 @@ def _clothed(data: AvatarData, ctx: Any) -> ClothedBody:
 
 # The FP32 network of an avatar, with which the plan `full` paints.
 #
-# Rule: every picture states its source. The network that the avatar was quantised from is taken where it is known, by
-# its digest in the avatar's manifest. Otherwise the integer network runs with its weights in float32 and without
-# rounding between its layers. The loss by quantising the weights is then in `full` too.
+# Rule: every picture states its source. If the avatar's manifest names the float network that the avatar was quantised
+# from, by its digest, and the file is here, this network is used. Otherwise the integer network runs with its weights
+# in float32, without rounding between its layers. In that case, `full` has the error of quantised weights too.
 
 #: Folder in which Trilane keeps the weights of float networks.
 WEIGHTS = Path(__file__).resolve().parents[2] / "training"
@@ -248,7 +247,7 @@ Paint = Callable[[F64], F32]
 
 
 def float_network(bundle: Bundle) -> tuple[Paint, str]:
-    """Return the FP32 network of `bundle`, and its source, for people. Raises BadInputError, MissingPartError."""
+    """Return the FP32 network of `bundle`, and its source in words. Raises BadInputError, MissingPartError."""
     weights = require_float_network(bundle)
     if weights is None:
         return dequantised(
@@ -258,10 +257,7 @@ def float_network(bundle: Bundle) -> tuple[Paint, str]:
 
 
 def require_float_network(bundle: Bundle) -> Path | None:
-    """Return `float_weights` of `bundle`.
-
-    Raises MissingPartError when they cannot be run here, which is found out before long work.
-    """
+    """Return `float_weights` of `bundle`. Raises MissingPartError if they exist, but PyTorch is missing to run them."""
     weights = float_weights(bundle)
     if weights is not None and not machine.here.has_package("torch"):
         raise MissingPartError("the FP32 network needs torch", extra="train")
@@ -269,10 +265,10 @@ def require_float_network(bundle: Bundle) -> Path | None:
 
 
 def float_weights(bundle: Bundle) -> Path | None:
-    """Return the file of the network that `bundle` was quantised from; None when its manifest names none here.
+    """Return the file of the float network that `bundle` was quantised from; None if no such file is here.
 
-    The manifest names file and digest in the entry of `avatar validate --float-network`, or among the facts about
-    quantising.
+    The manifest must name the file with its digest: in the entry of `avatar validate --float-network`, or among the
+    facts about quantising.
     """
     validation = bundle.manifest.validation
     validated = ((validation.model_extra or {}) if validation is not None else {}).get("float", {}).get("network", "")
@@ -283,12 +279,15 @@ def float_weights(bundle: Bundle) -> Path | None:
 
 
 def weights_name(weights: Path) -> str:
-    """Return the name of a float network's file as a manifest has it."""
+    """Return the name and digest of a float network's file, as a manifest has them."""
     return f"{weights.name}, sha256 {sha256_of([weights])}"
 
 
 def trained(bundle: Bundle, weights: Path) -> Paint:
-    """Return the network of a file that training saved. Raises BadInputError, ImportError without PyTorch."""
+    """Return the float network of `bundle` with the `weights` that training saved.
+
+    Raises BadInputError, ImportError without PyTorch.
+    """
     import torch
 
     from trilane.training.trainable_avatar import float_network_of
@@ -305,7 +304,7 @@ def trained(bundle: Bundle, weights: Path) -> Paint:
 
 
 def dequantised(network: NetworkFile) -> Paint:
-    """Return `network` in FP32 by ONNX Runtime: see `unrounded`."""
+    """Return `network` without rounding (`unrounded`), run by ONNX Runtime in FP32."""
     sessions: dict[Shape, onnxruntime.InferenceSession] = {}
 
     def paint(tensor: F64) -> F32:
@@ -322,10 +321,10 @@ def dequantised(network: NetworkFile) -> Paint:
 
 
 def as_written(network: NetworkFile) -> Paint:
-    """Return the integer network exactly as its file defines it, with every rounding to bytes: the runtimes' reference.
+    """Return the integer network as its file defines it, with every rounding to bytes: the reference of the runtimes.
 
-    ONNX Runtime runs node by node, in FP32, with no optimisation. Its input is real numbers, which need not be those of
-    bytes.
+    ONNX Runtime runs node by node, in FP32, without optimisation. The input may have any real numbers, also numbers
+    that no byte represents.
     """
     settings = onnxruntime.SessionOptions()
     settings.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
@@ -344,10 +343,7 @@ def as_written(network: NetworkFile) -> Paint:
 
 
 def from_real(network: NetworkFile) -> onnx.ModelProto:
-    """Return `network` with an input `IN` of real numbers, (N,H,W,C) float32, in place of its bytes.
-
-    Otherwise it is unchanged.
-    """
+    """Return `network` with an input `IN` of real numbers, (N,H,W,C) float32, instead of bytes."""
     model = onnx.ModelProto()
     model.CopyFrom(network.model)
     graph = model.graph
@@ -362,10 +358,10 @@ def from_real(network: NetworkFile) -> onnx.ModelProto:
 
 
 def unrounded(network: NetworkFile) -> onnx.ModelProto:
-    """Return `network` between real numbers: input `IN` (N,H,W,C), output `OUT` (N,H,W,4), both float32.
+    """Return `network` without rounding: input `IN` (N,H,W,C), output `OUT` (N,H,W,4), both float32.
 
-    Every tensor that was rounded to bytes keeps the range of those bytes, because a range that begins at 0 stands for a
-    rectifier; only the rounding is removed. Weights and biases are the real numbers of the integers.
+    Tensors that were rounded to bytes are still clipped to the range of these bytes, because a range from 0 on is a
+    rectifier. Weights and biases are the real numbers that the integers represent.
     """
     model = onnx.ModelProto()
     model.CopyFrom(network.model)
@@ -404,7 +400,7 @@ def _keep_what_is_read(graph: onnx.GraphProto) -> None:
 
 
 def _range(node: onnx.NodeProto, constants: Mapping[str, onnx.TensorProto]) -> tuple[float, float]:
-    """Return the least and the largest real number that the bytes of a QuantizeLinear stand for."""
+    """Return the least and the largest real number that the output bytes of a QuantizeLinear represent."""
     scale = float(numpy_helper.to_array(constants[node.input[1]]).item())
     zero = numpy_helper.to_array(constants[node.input[2]])
     limits = np.iinfo(zero.dtype)

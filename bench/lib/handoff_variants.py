@@ -1,4 +1,4 @@
-"""The two ends of every hand-over that `bench handoff` compares: where to write, how to announce, how to receive.
+"""The channels that `bench handoff` compares: each has an end that writes and an end that reads.
 
 Rule: `Producer.buffer` is filled before the clock starts; `Consumer.receive` returns when every byte can be read.
 """
@@ -24,48 +24,48 @@ from trilane.transport.messages import JobPipe, JobPipeEnd, RunJob, SocketFolder
 from trilane.transport.packets import RegionLayout, SlotLayout, create_region, header_dtype, map_region
 
 WAIT_MS = 60_000
-SHM = Path("/dev/shm")  # noqa: S108 - what iceoryx2 leaves there under our prefix is removed
+SHM = Path("/dev/shm")  # noqa: S108 - only files with this program's prefix are removed, which iceoryx2 left
 
 
 class Producer(Protocol):
-    """The end that writes."""
+    """The end of a channel that writes."""
 
     def buffer(self) -> U8:
-        """Return the place to write the next bytes."""
+        """Return an array for the next bytes."""
 
     def hand_over(self) -> None:
-        """Announce or send the bytes that were written to `buffer`."""
+        """Announce or send the bytes in the array that `buffer` returned."""
 
 
 class Consumer(Protocol):
-    """The end that reads."""
+    """The end of a channel that reads."""
 
     def receive(self) -> U8:
-        """Wait for the next bytes; they may be read until `release`."""
+        """Wait for the next bytes, and return them. They are valid until `release`."""
 
     def release(self) -> None:
-        """Give the bytes back after reading them."""
+        """Give the bytes back, after they were read."""
 
 
 class Channel(Protocol):
-    """A channel from one process to another: made in the parent, sent to both children, opened there."""
+    """A channel from one process to another. The parent makes it and sends it to both children, which open it."""
 
     def producer(self) -> Producer:
-        """Return the writing end; called in the child that writes."""
+        """Open and return the writing end; called in the child that writes."""
 
     def consumer(self) -> Consumer:
-        """Return the reading end; called in the child that reads."""
+        """Open and return the reading end; called in the child that reads."""
 
     def close(self) -> None:
         """Release the channel; called in the parent when both children have ended."""
 
 
 class SlotChannel:
-    """The pipeline's way: a slot of a sealed memfd region, announced by a message over a `JobPipe`.
+    """Trilane's channel: a slot of a sealed memfd region, announced by a message over a `JobPipe`.
 
-    There is one slot. A run writes the slot that was given back last (transport/slots.py), and here a slot is given
-    back before the next hand-over. iceoryx2 does the same with its samples. Two slots in turns would double the memory
-    that passes through the caches, and the time of reading.
+    There is only one slot. A run reuses the slot that was given back last (transport/slots.py), and here the slot is
+    given back before the next hand-over. iceoryx2 reuses its samples in the same way. Two slots in turns would double
+    the memory that passes through the caches, and the time of reading.
     """
 
     def __init__(self, size: int, _context: SpawnContext) -> None:
@@ -119,11 +119,11 @@ class _SlotEnd:
                 raise EOFError
 
     def release(self) -> None:
-        """Do nothing: the bench's acknowledgement gives the slot back."""
+        """Do nothing: the acknowledgement of the bench gives the slot back."""
 
 
 class _OwnEnd:
-    """An end whose bytes belong to its process, so that none are given back."""
+    """An end of a channel that copies bytes: its array belongs to its own process."""
 
     def __init__(self, size: int) -> None:
         self._own = np.zeros(size, np.uint8)
@@ -136,7 +136,7 @@ class _OwnEnd:
 
 
 class QueueChannel:
-    """A `multiprocessing.Queue`: the array is pickled, copied through a pipe, and made again."""
+    """A `multiprocessing.Queue`: the array is pickled, copied through a pipe, and unpickled."""
 
     def __init__(self, size: int, context: SpawnContext) -> None:
         self._size, self._queue = size, context.Queue()
@@ -197,7 +197,7 @@ class _PipeEnd(_OwnEnd):
 
 
 class ZmqChannel:
-    """The bytes themselves as a ZeroMQ frame, in pyzmq's best form, which copies neither sent nor received bytes."""
+    """The bytes as a ZeroMQ frame. pyzmq itself copies neither sent nor received bytes."""
 
     def __init__(self, size: int, _context: SpawnContext) -> None:
         self._folder = SocketFolder()
@@ -233,10 +233,10 @@ class _ZmqEnd(_OwnEnd):
 class IceoryxChannel:
     """iceoryx2: a loaned sample is written in place and sent, and an event wakes the other end. Nothing is copied.
 
-    Polling instead of the event would be sooner, but would keep a core busy while there is nothing to do.
+    Polling would be faster than the event, but would keep a core busy without work.
 
-    iceoryx2 leaves files for the user's next program. Here they get a folder and a prefix of their own and are removed.
-    Both are short, because the path of a Unix socket must be.
+    iceoryx2 leaves files for the user's next program. Here they get their own folder and prefix, and are removed. Both
+    names are short, because the path of a Unix socket must be short.
     """
 
     def __init__(self, size: int, _context: SpawnContext) -> None:
@@ -253,7 +253,7 @@ class IceoryxChannel:
         return _IceoryxConsumer(self._folder, self._prefix)
 
     def close(self) -> None:
-        """Remove what iceoryx2 left, once the children have ended."""
+        """Remove the files that iceoryx2 left."""
         shutil.rmtree(self._folder, ignore_errors=True)
         for left in SHM.glob(f"{self._prefix}*"):
             left.unlink(missing_ok=True)
@@ -309,8 +309,8 @@ class _IceoryxConsumer:
 
 
 SLOT, BARE = "slot", "slot, 256 KiB of it written"
-#: Channel of each variant. `SLOT` is Trilane's, with one message from process to process. `BARE` writes only part of
-#: the slot, which leaves out the effect of writing on the caches.
+#: Variant -> its channel. `SLOT` is Trilane's, with a message from process to process. `BARE` is the same, but only a
+#: small part of the slot is written, so that writing hardly changes the caches.
 CHANNELS: dict[str, Callable[[int, SpawnContext], Channel]] = {
     SLOT: SlotChannel,
     BARE: SlotChannel,
@@ -319,5 +319,5 @@ CHANNELS: dict[str, Callable[[int, SpawnContext], Channel]] = {
     "pipe": PipeChannel,
     "pickled queue": QueueChannel,
 }
-#: Number of bytes of each slot that are written and read, for variants that do not use all of them.
+#: Variant that uses only part of its slot -> number of bytes that are written and read.
 WRITTEN = {BARE: 256 * 1024}

@@ -1,8 +1,8 @@
 """Variants of inference that run interleaved, each in a process of its own: no variant's threads disturb another's.
 
 Rule: only one process computes at a time; the others wait on a pipe. An answer that is text is an error message. The
-processes end with the block that started them. As in a run, no input is the one before, and slots alternate: what
-repeats is found in caches. An input is put into its slot before the time counts.
+processes end with the block that started them. As in a run, successive inputs differ and slots alternate, because
+caches would speed up repetitions. An input is copied into its slot before the time counts.
 """
 
 from __future__ import annotations
@@ -24,12 +24,15 @@ from trilane.errors import TrilaneError
 
 START_S = 300.0
 WARM_UP = 3
-#: Number of inputs that take turns, and of slots that they go through.
+#: Number of inputs that take turns, and of slots that take turns.
 INPUTS, SLOTS = 5, 2
 
 
 def answer_of(pipe: Connection, name: str, wait_s: float) -> Any:
-    """Return the next answer of the process `name`. Raises TrilaneError when none comes, or it is an error message."""
+    """Return the next answer of the process `name`.
+
+    Raises TrilaneError if no answer comes within `wait_s`, if the process ended, or if the answer is an error message.
+    """
     if not pipe.poll(wait_s):
         raise TrilaneError(f"{name}: no answer in {wait_s:g} s")
     try:
@@ -43,7 +46,10 @@ def answer_of(pipe: Connection, name: str, wait_s: float) -> Any:
 
 @contextmanager
 def asked_processes() -> Iterator[Callable[[Callable[..., None], Any], Connection]]:
-    """Yield a function that starts a process for a given function and its arguments besides the pipe."""
+    """Yield a function that starts processes and returns their pipes. The processes end with the block.
+
+    Its parameters are the function to run in the process, which gets a pipe and a value, and this value.
+    """
     context = multiprocessing.get_context("spawn")
     processes, pipes = [], list[Connection]()
 
@@ -68,7 +74,7 @@ def asked_processes() -> Iterator[Callable[[Callable[..., None], Any], Connectio
 
 @dataclass(frozen=True)
 class ProcessVariant:
-    """One way to infer.
+    """A variant of inference, to be run in a process.
 
     `kind`: key of `KINDS`.
     `network`: ONNX file.
@@ -85,9 +91,9 @@ class ProcessVariant:
 
 
 class Runner:
-    """One variant, as the parent sees it.
+    """The process of a variant, as the parent process sees it.
 
-    `startup_ms`: time until its network was loaded, imports included.
+    `startup_ms`: time to import libraries and load the network.
     """
 
     def __init__(self, pipe: Connection, name: str) -> None:
@@ -95,13 +101,13 @@ class Runner:
         self.startup_ms = float(answer_of(pipe, name, START_S))
 
     def run(self, count: int) -> list[float]:
-        """Return milliseconds of `count` runs in a row."""
+        """Infer `count` times in succession, and return the times, ms."""
         self._pipe.send(count)
         times: list[float] = answer_of(self._pipe, self._name, START_S)
         return times
 
     def run_for(self, seconds: float) -> list[float]:
-        """Return milliseconds of runs in a row for about `seconds`, at least one."""
+        """Infer for about `seconds`, at least once, and return the times, ms."""
         times: list[float] = []
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
@@ -111,16 +117,19 @@ class Runner:
 
 @contextmanager
 def runners(variants: Mapping[str, ProcessVariant]) -> Iterator[dict[str, Runner]]:
-    """Start a waiting process for each variant; they end with the block.
+    """Start a waiting process for each variant. The processes end with the block.
 
-    Raises TrilaneError when one does not start.
+    Raises TrilaneError if a process does not start.
     """
     with asked_processes() as start:
         yield {name: Runner(start(serve, variant), name) for name, variant in variants.items()}
 
 
 def serve(pipe: Connection, variant: ProcessVariant) -> None:
-    """Run the child: load, send the start-up time, then run as often as each message says, until `pipe` closes."""
+    """Run the process: load the network, send the start-up time, then infer as often as each message asks.
+
+    It ends when `pipe` closes.
+    """
     try:
         begin = time.perf_counter()
         runs = KINDS[variant.kind](variant)
@@ -134,7 +143,7 @@ def serve(pipe: Connection, variant: ProcessVariant) -> None:
         pipe.send(f"{type(error).__name__}: {error}")
 
 
-#: A call for each input, which has its slot when the call is taken.
+#: Calls to time, without end. Taking a call from the iterator puts the next input into its slot.
 Runs = Iterator[Callable[[], object]]
 
 
@@ -148,7 +157,7 @@ def _timed(runs: Runs, count: int) -> list[float]:
 
 
 def _runtime(variant: ProcessVariant) -> Runs:
-    """Return calls as Trilane runs a network: the arrays of each slot are bound once."""
+    """Return calls of a Trilane runtime, as in a run: the arrays of each slot are bound once."""
     from trilane.avatars.network_file import read_network
     from trilane.bench.lib.networks import random_tensors
     from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
@@ -168,7 +177,7 @@ def _runtime(variant: ProcessVariant) -> Runs:
 
 
 def _ort_default(variant: ProcessVariant) -> Runs:
-    """Return calls as in ONNX Runtime's first example: a session with defaults, `run` with an array."""
+    """Return calls as in ONNX Runtime's introductory example: a session with defaults, `run` with an array."""
     import onnxruntime
 
     settings = onnxruntime.SessionOptions()
@@ -186,7 +195,7 @@ def _ort_default(variant: ProcessVariant) -> Runs:
 
 
 def _openvino_default(variant: ProcessVariant) -> Runs:
-    """Return calls as in OpenVINO's first example: compile a file, call the model with an array."""
+    """Return calls as in OpenVINO's introductory example: compile a file, call the model with an array."""
     from trilane.stages.dsp.runtime import quiet_openvino
 
     openvino = quiet_openvino()
@@ -197,6 +206,7 @@ def _openvino_default(variant: ProcessVariant) -> Runs:
     return (partial(request.infer, {0: feed}) for feed in cycle(feeds))
 
 
+#: Kind of a variant -> function that makes its calls.
 KINDS: dict[str, Callable[[ProcessVariant], Runs]] = {
     "runtime": _runtime,
     "ort": _ort_default,

@@ -1,6 +1,6 @@
-"""The networks that the inference benches run: untrained, with the shapes and operators of the trained ones.
+"""The networks that the inference benches run: untrained, with the shapes and operators of trained networks.
 
-Rule: weights and inputs are random and the same every time; how long a network takes does not depend on them.
+Rule: weights and inputs are random and the same every time. The time of a network does not depend on them.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from trilane.training.quantising.quantise import quantise
 
 CALIBRATION_SIDE = 64
 CALIBRATION_FRAMES = 5
-#: The paper's network as an avatar: the default avatar's body and texture around untrained weights, made once and kept.
+#: Name of the avatar with the paper's network: the default avatar's body and texture, with untrained weights.
 FULL_WIDTH = "resnet18"
 ENCODER, NORM, WIDTH = "resnet18", "batch", 64
-SIDE = 64  # any side will do: the network is convolutional; a run reshapes it
+SIDE = 64  # any side works, because a run reshapes the network
 
 
 @dataclass(frozen=True)
 class NetworkFixture:
     """A network to be timed.
 
-    `label`: its settings, as in a bench's rows.
-    `integer`: network with bytes in and out.
-    `parameters`, `gmac`: parameters and work of the network as defined, whatever its file adds for layout.
+    `label`: settings of the network, as in a bench's rows.
+    `integer`: quantised network, with bytes as input and output.
+    `parameters`, `gmac`: number of parameters, and 1e9 multiply-accumulates of a frame.
     """
 
     label: dict[str, Any]
@@ -48,10 +48,10 @@ class NetworkFixture:
 def untrained(
     encoder: str, norm: str, width: int, size: tuple[int, int], channels: int = 16, batch: int = 1
 ) -> NetworkFixture:
-    """Return an untrained network, quantised.
+    """Return an untrained, quantised network. Its `gmac` leaves out work that the file adds for layout.
 
     `encoder`, `norm`: see `trilane.training.network.UNet`.
-    `width`: 64 is full; every channel count scales with it.
+    `width`: 64 is the paper's network; every number of channels scales with the width.
     `size`: (height, width) of the tensor in pixels.
     `channels`: channels of the tensor.
     `batch`: number of frames that are inferred at once.
@@ -71,9 +71,9 @@ def untrained(
 
 
 def untrained_float(encoder: str, norm: str, width: int, size: tuple[int, int], channels: int = 16) -> onnx.ModelProto:
-    """Return the network that `untrained` quantises, in float: (1, C, H, W) float32.
+    """Return the float network that `untrained` quantises, with an input (1, C, H, W) float32.
 
-    Parameters and errors are those of `untrained`.
+    Parameters and errors: see `untrained`.
     """
     from trilane.training.network import export_onnx
 
@@ -81,7 +81,7 @@ def untrained_float(encoder: str, norm: str, width: int, size: tuple[int, int], 
 
 
 def fixture_of_file(network: NetworkFile, batch: int = 1) -> NetworkFixture:
-    """Return `network` as a fixture, with the work of the layers in its file.
+    """Return `network` as a fixture. Its `gmac` counts all layers of the file.
 
     `batch`: number of frames that are inferred at once.
     """
@@ -92,7 +92,7 @@ def fixture_of_file(network: NetworkFile, batch: int = 1) -> NetworkFixture:
 
 
 def random_tensors(network: NetworkFile, count: int) -> NDArray[np.uint8]:
-    """Return random bytes (`count`, N, H, W, C), the same every time."""
+    """Return `count` random inputs of `network`, (count, N, H, W, C) uint8, the same every time."""
     return np.random.default_rng(1).integers(0, 256, (count, *network.shape), dtype=np.uint8)
 
 
@@ -108,7 +108,7 @@ def _unet(encoder: str, norm: str, width: int, channels: int) -> tuple[Any, Any]
 
 
 def _defined_macs(network: Any, torch: Any, channels: int) -> float:
-    """Return the multiply-accumulates of the convolutions for one pixel of the tensor."""
+    """Return the multiply-accumulates of the convolutions, divided by the pixels of the tensor."""
     total = 0
 
     def add(module: Any, _inputs: Any, output: Any) -> None:
@@ -124,9 +124,9 @@ def _defined_macs(network: Any, torch: Any, channels: int) -> float:
 
 
 def full_width_bundle() -> Path:
-    """Return the folder of the full-width network's bundle, made when it is missing. Its pictures mean nothing.
+    """Return the folder of the avatar `FULL_WIDTH`, which is made once and cached. Its pictures mean nothing.
 
-    Raises MissingPartError without PyTorch, TrilaneError when no cache folder can be written.
+    Raises MissingPartError without PyTorch, TrilaneError if the cache folder cannot be written.
     """
     home = cache_dir("bench")
     if home is None:

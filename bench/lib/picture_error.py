@@ -1,7 +1,7 @@
-"""How far the frames of one plan are from those of another: PSNR, SSIM and FLIP.
+"""Errors of pictures against reference pictures: PSNR, SSIM and FLIP.
 
-Rule: all pictures count alike, including those with nobody in view; the PSNR follows from the mean square over all
-pictures. Box figures only count the pixels of the boxes, where avatars are.
+Rule: all pictures count alike, also with nobody in view; the PSNR follows from the mean square over all pictures. Box
+figures only count the pixels in the boxes around avatars.
 
 Sources: Wang et al., "Image Quality Assessment", IEEE TIP 13 (2004), by scikit-image; Andersson et al., "FLIP: A
 Difference Evaluator for Alternating Images", HPG 2020, by its authors' flip-evaluator, at 67 pixels a degree.
@@ -19,7 +19,7 @@ from trilane.bench.lib.cast import Box
 from trilane.errors import MissingPartError
 
 MODULES = ("skimage", "flip_evaluator")
-#: Lower bound of the mean square of values in 0..1, which makes 100 dB the highest PSNR.
+#: Lower bound of the mean square of values in 0..1. Therefore the highest PSNR is 100 dB.
 LEAST_SQUARE = 1e-10
 
 
@@ -40,7 +40,10 @@ class PictureErrors:
                 total[part] += values[mask].sum()
 
     def figures(self, plan: str) -> dict[str, float | None]:
-        """Return `psnr_PLAN_db`, `ssim_PLAN`, `flip_PLAN` of the frames, and with `box_` before, None without boxes."""
+        """Return the errors so far: `psnr_PLAN_db`, `ssim_PLAN`, `flip_PLAN`, and the same with `box_` in front.
+
+        `plan`: PLAN in these keys. Box figures are None without boxes.
+        """
         found: dict[str, float | None] = {}
         for part, prefix in enumerate(("", "box_")):
             count = self._pixels[part]
@@ -52,9 +55,10 @@ class PictureErrors:
 
 
 def psnr_of_frames(psnr_db: Sequence[float]) -> dict[str, float]:
-    """Return mean, worst and 1st percentile, linear between ranks, of the PSNR of single frames, at least one.
+    """Return the mean, the worst and the 1st percentile (linear between ranks) of single frames' PSNR.
 
-    A mean hides single bad frames, which people see; the worst of many frames depends on how many there are.
+    A mean hides single bad frames, which people see. The worst frame depends on the number of frames, the percentile
+    hardly does. `psnr_db`: at least one.
     """
     return {
         "psnr_db": float(np.mean(psnr_db)),
@@ -64,20 +68,23 @@ def psnr_of_frames(psnr_db: Sequence[float]) -> dict[str, float]:
 
 
 def require_metrics() -> None:
-    """Raise MissingPartError when a library that computes an error is missing, which is found out before long work."""
+    """Raise MissingPartError if a library for errors is missing. Call it before long work."""
     for module in MODULES:
         if not machine.here.has_package(module):
             raise MissingPartError(f"image errors need {module}", extra="metrics")
 
 
 def error_maps(picture: U8, reference: U8) -> tuple[F64, F64, F64]:
-    """Return for each pixel (h,w): the mean square of the differences, in 0..1; SSIM; FLIP."""
+    """Return, for each pixel (h,w), the mean square difference of values in 0..1, the SSIM and the FLIP.
+
+    `picture`, `reference`: (h,w,3) sRGB.
+    """
     shown, wanted = picture / 255, reference / 255
     return ((shown - wanted) ** 2).mean(axis=2), ssim_map(shown, wanted), flip_map(shown, wanted)
 
 
 def ssim_map(picture: F64, reference: F64) -> F64:
-    """Return SSIM (h,w) of two pictures (h,w,3) in 0..1, mean over the colours, by windows of 7 x 7 pixels."""
+    """Return the SSIM (h,w) of two pictures (h,w,3) in 0..1: windows of 7 x 7 pixels, mean over the colours."""
     from skimage.metrics import structural_similarity
 
     _, similar = structural_similarity(picture, reference, channel_axis=2, data_range=1.0, full=True)
@@ -85,7 +92,7 @@ def ssim_map(picture: F64, reference: F64) -> F64:
 
 
 def flip_map(picture: F64, reference: F64) -> F64:
-    """Return FLIP (h,w) of two pictures (h,w,3), sRGB in 0..1."""
+    """Return the FLIP error (h,w) of two pictures (h,w,3), sRGB in 0..1."""
     import flip_evaluator
 
     real = [np.ascontiguousarray(image, np.float32) for image in (reference, picture)]
@@ -94,7 +101,7 @@ def flip_map(picture: F64, reference: F64) -> F64:
 
 
 def inside(boxes: Sequence[Box], picture: U8) -> Mask:
-    """Return which pixels (h,w) of `picture` lie in one of `boxes`."""
+    """Return a mask (h,w) of the pixels of `picture` that lie in any of `boxes`."""
     mask = np.zeros(picture.shape[:2], bool)
     for box in boxes:
         mask[box.top : box.bottom, box.left : box.right] = True
@@ -102,11 +109,11 @@ def inside(boxes: Sequence[Box], picture: U8) -> Mask:
 
 
 def psnr_db(square: float) -> float:
-    """Return PSNR in dB of values in 0..1 whose differences have the mean square `square`; at most 100."""
+    """Return the PSNR, dB, at most 100. `square`: mean square difference of values in 0..1."""
     return float(-10 * np.log10(max(square, LEAST_SQUARE)))
 
 
 def box_psnr_db(picture: U8, reference: U8, boxes: Sequence[Box]) -> float:
-    """Return PSNR of `picture` against `reference`, both (h,w,3) sRGB, over the pixels in `boxes`, at least one."""
+    """Return the PSNR of `picture` against `reference`, both (h,w,3) sRGB, over the pixels in `boxes`, at least one."""
     mask = inside(boxes, picture)
     return psnr_db(float((((picture[mask] / 255) - reference[mask] / 255) ** 2).mean()))

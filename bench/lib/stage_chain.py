@@ -1,8 +1,8 @@
 """The composited frames of a run, made by its own stages, one after the other in this process.
 
-Rule: the pipeline's factories build the stages, and they are bound as a unit's process binds them, so a frame has the
-bytes that a run presents. Frames come in any order, so none is made from an earlier one's picture. A frame with nobody
-in view takes the pipeline's bypass, as in a run.
+Rule: the pipeline's factories build the stages, and the stages are bound as in a unit's process, so a frame has the
+bytes that a run presents. Frames may be made in any order, so no frame reuses an earlier frame's picture. A frame with
+nobody in view takes the pipeline's bypass, as in a run.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ RASTER = 1
 
 
 def units_of(pipeline: Pipeline, assets: Assets) -> Units:
-    """Return the shared objects of each unit's stages.
+    """Return the context of each unit, which the unit's stages share, such as an OpenGL context.
 
-    Chains that draw in one process must share them too: one OpenGL context.
+    Chains in one process must share these contexts, because a process has one OpenGL context.
     """
     return {name: UnitContext(name, settings, assets) for name, settings in pipeline.units.items()}
 
 
 class StageChain:
-    """All stages of a pipeline but the last, with one slot per edge.
+    """All stages of a pipeline except the last, with one slot per edge.
 
-    `made`: the stages.
+    `made`: the stages in their order. `packets`: slot of each edge.
     """
 
     def __init__(self, pipeline: Pipeline, units: Units) -> None:
@@ -61,29 +61,32 @@ class StageChain:
             self._stages.append(BoundStage(stage.name, made, inputs, [output], 0, unit, stage.name == begin))
 
     def run(self, frame: int, last: int | None = None) -> Packet:
-        """Run frame `frame` up to stage number `last`, or up to the last stage; return the input of the next stage."""
+        """Run frame `frame` from the first stage to stage number `last`; return the output of the last stage that ran.
+
+        `last`: None for all stages of the chain.
+        """
         self._next, self._slot_in = 0, -1
         return self.go_on(frame, last)
 
     def go_on(self, frame: int, last: int | None = None) -> Packet:
-        """Run the stages that an earlier `run` of the frame left out, up to stage `last`; return as `run` does."""
+        """Go on after a `run` of the same frame, up to stage number `last`; return as `run` does."""
         last = len(self._stages) - 1 if last is None else last
         while self._next <= last:
             number = self._next
             metrics = self._stages[number].run(frame, self._slot_in, 0, 0, fresh=True)
-            # Each edge has one slot, so slot 1 at the bypass's end belongs to the edge behind its beginning.
+            # Each edge has one slot, so at the bypass's end, slot 1 is the output of the stage where it begins.
             self._next, self._slot_in = (self._end, 1) if isinstance(metrics, Skip) else (number + 1, 0)
             self._handed = self.packets[number]
         return self._handed
 
 
 class AvatarFrames:
-    """Makes the frames of a scene, as a run presents them."""
+    """Makes the frames of the scene in `checked`, as a run presents them. `units`: contexts of its units, by name."""
 
     def __init__(self, checked: Checked, units: Units | None = None) -> None:
         """Build the stages. Raises BadInputError, MissingPartError.
 
-        `units`: units of other frames that are made in this process.
+        `units`: contexts of another object's units in this process, to be shared; None for new ones.
         """
         pipeline = avatar_pipeline(checked.config, checked.assets)
         self.units = units_of(pipeline, checked.assets) if units is None else units
@@ -94,23 +97,23 @@ class AvatarFrames:
         self._shape = (checked.config.scene.output.height, checked.config.scene.output.width, 3)
 
     def frame(self, number: int) -> U8:
-        """Return frame `number`, composited: (h,w,3) uint8, sRGB."""
+        """Return frame `number` after composite: (h,w,3) uint8, sRGB."""
         return self._picture(self._chain.run(number))
 
     @property
     def gl(self) -> Any:
-        """OpenGL context that the stages draw with."""
+        """The OpenGL context that the stages draw with."""
         return self.units["gpu"].shared(CONTEXT, open_context)
 
     def background(self, number: int) -> U8:
-        """Return the frame without avatars, but with everything under them, also their shadows: (h,w,3) uint8."""
+        """Return frame `number` without its avatars, but with their shadows: (h,w,3) uint8, sRGB."""
         self._chain.run(number, self._composite - 1).payload[:] = 0
         return self._picture(self._chain.go_on(number))
 
     def tensor_of(self, number: int, network: int = 0) -> U8:
-        """Return the tensor (h,w,C) of frame `number`, as its raster stage drew it. Somebody must be seen in it.
+        """Return the tensor (h,w,C) uint8 of frame `number` by the raster stage. The frame must show an avatar.
 
-        `network`: number of the network that reads it.
+        `network`: number of the network that reads the tensor.
         """
         payload = self._chain.run(number, RASTER).payload
         (height, width), channels = self.posed["tensor_shape"].tolist(), self._channels[network]
@@ -119,9 +122,9 @@ class AvatarFrames:
         return tensor
 
     def composited(self, number: int, painted: Mapping[int, U8]) -> U8:
-        """Return frame `number`, (h,w,3) uint8, composited with other pictures in place of the networks' own.
+        """Return frame `number`, (h,w,3) uint8, composited from the given pictures instead of the networks' pictures.
 
-        `painted`: (h,w,4) by the number of the network.
+        `painted`: pictures (h,w,4) uint8 by the number of the network.
         """
         payload = self._chain.run(number, self._composite - 1).payload
         parts = network_parts(payload, len(self._channels), self._buckets, PAINTED_CHANNELS)
@@ -131,18 +134,18 @@ class AvatarFrames:
 
     @property
     def levels(self) -> Mapping[int, int]:
-        """Return the level in `DETAILS` of each avatar, by its number, that the latest frame shows."""
+        """Return the index into `DETAILS` of each visible avatar in the latest frame, by the avatar's number."""
         pose = cast(PoseStage, self._chain.made[0])
         return {index: seen.level for index, seen in pose.plan.seen.items()}
 
     @property
     def posed(self) -> NDArray[np.void]:
-        """Return the pose stage's header of the latest frame, as in `stages/config.py`."""
+        """Return the header that the pose stage wrote for the latest frame (`pose_dtype` of `stages/config.py`)."""
         return self._chain.packets[0].header
 
     @property
     def tensor(self) -> str:
-        """Height x width of the latest frame's tensor; `none` when nobody was seen and none was made."""
+        """The size of the latest frame's tensor as `HxW`; `none` if the frame needed no tensor."""
         height, width = self.posed["tensor_shape"].tolist()
         return f"{height}x{width}" if int(self.posed["work"]) == FrameWork.FULL else "none"
 

@@ -111,11 +111,11 @@ def test_service_times_come_from_a_table_of_the_seed(held: Held) -> None:
         held(name, times)
 
 
-def test_our_ways_present_the_same_frames() -> None:
+def test_trilanes_variants_present_the_same_frames() -> None:
     """At 60 frames a second, five stages of 2 ms: each frame is there 10 ms after its release."""
-    ways = scheduler._trilane_ways(application_graph(), lambda *_: 2_000_000, 5)
-    assert [*ways] == [TRILANE, NO_REPORT, RECORDED]
-    for run in ways.values():
+    variants = scheduler._trilane_variants(application_graph(), lambda *_: 2_000_000, 5)
+    assert [*variants] == [TRILANE, NO_REPORT, RECORDED]
+    for run in variants.values():
         assert run() == [10_000_000 + n * 16_666_667 for n in range(5)]
 
 
