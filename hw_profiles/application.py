@@ -1,8 +1,8 @@
-"""The whole application on a chip: a service time per stage, run through the real scheduler in virtual time.
+"""Predicts the whole application on a chip: service times of its stages, run by the real scheduler in virtual time.
 
-This file computes what a frame costs each stage; the scheduler alone decides which stage waits for which. `REFERENCE`
-describes the reference application. It has one buffer between stages, so a frame is drawn only after the network has
-released that buffer. The GPU is busy during read-back, the network's unit during the hand-over.
+This file computes the time of each stage for a frame; only the scheduler decides which stage waits for which.
+`REFERENCE` describes the reference application. It has one slot between stages, so a frame is drawn only after the
+network has released that slot. The GPU is busy during read-back, and the network's unit during the hand-over.
 """
 
 from __future__ import annotations
@@ -27,19 +27,21 @@ from trilane.units import AFTER_INFER, BEFORE_INFER, INFER, LATENCY_TO, NS_PER_M
 
 NETWORK_UNITS: tuple[UnitName, ...] = ("gpu", "dsp")
 PACKED_BYTES_PER_PIXEL = 16
-#: Frames of a simulated run: for shares of time, for a frame time alone, and where dropped frames vary the intervals.
+#: Frames of a simulated run: for shares of time, for only a frame time, and for runs that drop frames.
 FRAMES, QUICK_FRAMES, FRAMES_WITH_DROPS = 192, 12, 480
-#: Stage, unit and nanoseconds of a job, in data-flow order.
+#: (stage, unit, time of a job in ns) for each stage, in data-flow order.
 StageTimes = tuple[tuple[str, UnitName, int], ...]
 LEAST_FPS, MOST_FPS = 1e-3, 1000.0  # a scene has the same limits
 
 
 class Variant(NamedTuple):
-    """How the stages are joined.
+    """How the stages are connected and scheduled.
 
-    `policy`: policy of the scheduler. `edge`: rule of every edge between stages. `batch`: frames per job, 1 to 64.
-    `fps`: rate of the scene, frames a second; `latest` and `deadline` release frames at it, but no faster than the
-    display shows them.
+    `policy`: policy of the scheduler.
+    `edge`: rule of every edge between stages.
+    `batch`: frames per job, 1 to 64.
+    `fps`: rate of the scene in frames a second; `latest` and `deadline` release frames at this rate, but no faster than
+    the display shows them.
     """
 
     policy: str = "pipelined"
@@ -55,11 +57,15 @@ REFERENCE = Variant()
 class Plan:
     """One application on one chip.
 
-    `network`: network that runs. `unit`: unit that runs it, gpu or dsp. `variant`: how the stages are joined.
-    `gpu_share`: part of the network's products that the GPU does while the DSP does the rest, 0 to below 1. `most_fps`:
-    rate that the application is held to, as by a display; None for the display's own. Policies that release frames at a
-    rate have the rate in their variant. `stretch`: factor on the network's expected time. `avatars`: number of avatars
-    in view; they share one tensor. Raises BadInputError for a value outside its range.
+    `network`: network that runs.
+    `unit`: unit that runs it, gpu or dsp.
+    `variant`: how the stages are connected and scheduled.
+    `gpu_share`: share of the network's products that the GPU does while the DSP does the rest, 0 to below 1.
+    `most_fps`: largest rate of shown frames, as if a display had this rate; None for the display of the profile.
+    `stretch`: factor on the network's expected time.
+    `avatars`: number of avatars in view; they share one tensor.
+
+    Raises BadInputError for a value outside its range.
     """
 
     network: Network
@@ -88,11 +94,11 @@ class Plan:
 
 
 def isolated_job_time(profile: Profile, network: Network, unit: UnitName, corners: Corners) -> JobTime:
-    """Return the time of one frame's job when the network runs continuously and nothing else does, as in a benchmark.
+    """Return the time of a job of one frame when only the network runs, without a pause, as in a benchmark.
 
     `profile`: hardware profile of the chip.
     `network`: network that runs.
-    `unit`: the unit that runs it.
+    `unit`: unit that runs it.
     `corners`: corner of each unit.
     """
     return _job(profile, network.work, unit, corners, contended=False)
@@ -107,7 +113,7 @@ def _job(
     `work`: work of one frame.
     `unit`: unit that does it.
     `corners`: corner of each unit.
-    `contended`: whether the rest of the application uses the memory meanwhile.
+    `contended`: whether the rest of the application uses the memory at the same time.
     `batch`: number of frames in the job.
     """
     clock = profile.units[unit].clock(corners[UNITS.index(unit)])
@@ -115,10 +121,10 @@ def _job(
 
 
 def stage_times_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[str, UnitName], float]:
-    """Return the milliseconds of one job of each (stage, unit), in data-flow order.
+    """Return the time of one job in ms, by (stage, unit), in data-flow order.
 
-    A job has `plan.variant.batch` frames. Joints and vertices count for each avatar in view, pixels for the one tensor
-    that all avatars share.
+    A job has `plan.variant.batch` frames. Joints and vertices count for each avatar in view; pixels count once, for the
+    tensor that all avatars share.
     """
     app, network, batch = profile.application, plan.network, plan.variant.batch
     cpu, gpu = (profile.units[u].clock(corners[UNITS.index(u)]) for u in ("cpu", "gpu"))
@@ -153,7 +159,7 @@ def _network_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[st
 
 
 def split_work(work: Work, share: float) -> tuple[Work, Work]:
-    """Return `work` in two parts, cut after the first operators that together have `share` of the products."""
+    """Return `work` in two parts; the first has the first operators that together do `share` of the products."""
     macs, cut = 0, 0
     for cut, operator in enumerate(work.operators, 1):  # noqa: B007
         macs += operator.macs
@@ -168,13 +174,19 @@ def split_work(work: Work, share: float) -> tuple[Work, Work]:
 
 @dataclass(frozen=True)
 class Steady:
-    """The application once it has settled.
+    """The application in its settled state.
 
-    `latency_ms`: None where no frame is in time. `capped`: whether the display, or a rate, holds the application back.
-    `dropped`: share of the frames that are not shown. `unit_of`: unit of each stage. `stages_ms`: milliseconds of a job
-    of each stage. `busy`: share of the time in which each unit works; `idle`: shares of the rest by cause. `busy` and
-    `idle` sum to 1 for each unit. Where units share a core, `preempted` is the share in which another one of them works
-    on it.
+    `busy` and the causes of `idle` add up to 1 for each unit. If units share a core, `preempted` is the share of time
+    in which another unit works on it.
+
+    `frame_ms`: mean frame time.
+    `latency_ms`: mean latency; None if no frame is presented.
+    `capped`: whether the display, or its rate in the plan, limits the rate.
+    `unit_of`: unit of each stage.
+    `stages_ms`: time of a job of each stage.
+    `busy`: share of the time in which each unit works.
+    `idle`: shares of the rest of the time by cause, for each unit.
+    `dropped`: share of the frames that are not shown.
     """
 
     frame_ms: float
@@ -194,17 +206,17 @@ def application_graph(edge: str = DEFAULT_EDGE, infer: Iterable[tuple[str, str]]
 
 @lru_cache(maxsize=4096)
 def _settled(times: StageTimes, variant: Variant, display_ns: int, quick: bool) -> tuple[Any, bool]:
-    """Return the report of a run, and whether the display limits its rate.
+    """Return (report of a run, whether the display limits its rate).
 
-    `times`: stage, unit and nanoseconds of a job.
-    `variant`: how the stages are joined.
-    `display_ns`: the shortest time between two shown jobs.
-    `quick`: whether to run only QUICK_FRAMES where that is enough, which is with one buffer between stages: with two,
-    the buffers fill first, and meanwhile frames come faster.
+    `times`: time of a job of each stage.
+    `variant`: how the stages are connected and scheduled.
+    `display_ns`: shortest time between two shown jobs.
+    `quick`: whether to run only QUICK_FRAMES if they are enough. They are enough with one slot between stages. With two
+    slots, frames come faster until the slots are full.
     """
     frames = _frames_of(variant, quick)
     report = _simulated(times, variant, settings_of(variant, frames, display_ns)).report
-    # The display holds nothing back that is slower than it, or that has a rate of its own.
+    # The display does not limit a run that is slower than the display, or that has its own rate.
     if POLICIES[variant.policy].paced or report["frame_time_ms"]["mean"] * NS_PER_MS >= display_ns:
         return report, False
     return _simulated(times, variant, settings_of(variant, frames, display_ns, held=True)).report, True
@@ -220,15 +232,17 @@ def _frames_of(variant: Variant, quick: bool) -> int:
 def settings_of(variant: Variant, frames: int, display_ns: int, *, held: bool = False) -> Settings:
     """Return the scheduler's settings of a simulated run.
 
-    `variant`: its policy and the scene's rate. `frames`: number of jobs of each stage. `display_ns`: shortest time
-    between two shown frames. `held`: whether the display holds every policy to its rate.
+    `variant`: policy and rate of the scene.
+    `frames`: number of jobs of each stage.
+    `display_ns`: shortest time between two shown jobs.
+    `held`: whether jobs are released at the display's rate under every policy.
     """
     scene_period_ns = max(display_ns, round(variant.batch * 1e9 / variant.fps))
     return run_settings(variant.policy, frames, scene_period_ns, display_ns if held else 0)
 
 
 def _simulated(times: StageTimes, variant: Variant, settings: Settings, *, keep: bool = False) -> Simulation:
-    """Return a run of jobs that take `times`. Raises BadInputError for an unknown edge."""
+    """Return a simulated run whose jobs take `times`. Raises BadInputError for an unknown edge."""
     service = {name: ns for name, _, ns in times}
     try:
         graph = chain(((name, unit) for name, unit, _ in times), variant.edge, LATENCY_TO)
@@ -239,7 +253,7 @@ def _simulated(times: StageTimes, variant: Variant, settings: Settings, *, keep:
 
 
 def simulated(profile: Profile, plan: Plan, corners: Corners) -> Simulation:
-    """Return the run in virtual time that `steady` takes its figures from, with its recording and its jobs.
+    """Return the run in virtual time from which `steady` takes its figures, with its recording and its jobs.
 
     `profile`, `plan`, `corners`: as in `steady`.
     """
@@ -250,30 +264,30 @@ def simulated(profile: Profile, plan: Plan, corners: Corners) -> Simulation:
 
 
 def _rounded(profile: Profile, plan: Plan, corners: Corners) -> StageTimes:
-    """Return the nanoseconds of a job of each stage, with the units as the scheduler sees them."""
+    """Return the time of a job of each stage in ns, with the units of `workers_of`."""
     worker = workers_of(profile)
     times = stage_times_ms(profile, plan, corners)
     return tuple((name, worker[unit], round(ms * NS_PER_MS)) for (name, unit), ms in times.items())
 
 
 def _display_ms(profile: Profile, plan: Plan) -> float:
-    """Return the shortest time between two shown frames."""
+    """Return the shortest time between two shown frames in ms."""
     return max(profile.application.display_ms.or_else(0), 1e3 / (plan.most_fps or math.inf))
 
 
 def _display_ns(profile: Profile, plan: Plan) -> int:
-    """Return the shortest time between two jobs that are shown."""
+    """Return the shortest time between two shown jobs in ns."""
     return round(plan.variant.batch * _display_ms(profile, plan) * NS_PER_MS)
 
 
 def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = False) -> Steady:
-    """Return frame time, latency and shares of time, by the scheduler in virtual time.
+    """Return frame time, latency and shares of time, from a run of the scheduler in virtual time.
 
     `profile`: hardware profile of the chip.
     `plan`: application that runs on it.
-    `corners`: corner of each unit, the same all the time.
-    `quick`: whether to simulate a short run where that is possible. The frame time of a short run is right to a
-    hundredth; its shares of time include filling and draining.
+    `corners`: constant corner of each unit.
+    `quick`: whether to simulate a short run if that is possible. The frame time of a short run is right to a hundredth;
+    its shares of time include the filling and emptying of the pipeline.
     """
     times, worker = stage_times_ms(profile, plan, corners), workers_of(profile)
     batch, display = plan.variant.batch, _display_ms(profile, plan)
@@ -294,9 +308,9 @@ def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = Fals
 
 
 def workers_of(profile: Profile) -> dict[UnitName, UnitName]:
-    """Map each unit to the unit under whose name the scheduler sees it.
+    """Return the unit that stands for each unit in the scheduler.
 
-    Units on one core work in turns, so the first of them stands for all.
+    Units on one core work in turns, so the first unit of a core stands for all of its units.
     """
     first: dict[str, UnitName] = {}
     return {unit: first.setdefault(profile.units[unit].core or unit, unit) for unit in UNITS}
@@ -308,10 +322,12 @@ def _shares(
     times: Mapping[tuple[str, UnitName], float],
     units: Mapping[str, Any],
 ) -> tuple[float, dict[str, float]]:
-    """Return busy share of `unit` and shares of its idle time by cause.
+    """Return (busy share of `unit`, shares of its idle time by cause).
 
-    `worker`: result of `workers_of`. Units behind one worker divide its busy time in proportion to their jobs.
-    `times`: milliseconds of a job of each stage and unit.
+    Units with the same worker divide its busy time in proportion to the times of their jobs.
+
+    `worker`: result of `workers_of`.
+    `times`: time of a job in ms of each stage and unit.
     `units`: row of each worker in the report of the simulated run.
     """
     own, together = (
@@ -327,9 +343,9 @@ def _shares(
 
 
 def reference_frame_ms(profile: Profile, plan: Plan, corners: Corners) -> float:
-    """Return the mean frame time of the variant `REFERENCE` without a run of the scheduler, for fitting.
+    """Return the mean frame time in ms of the variant `REFERENCE` without a run of the scheduler, for fitting.
 
-    With one buffer between stages, raster, network and composite follow each other, so that their times add up. A test
+    With one slot between stages, raster, network and composite follow each other, so their times add up. A test
     compares the result with the scheduler in virtual time.
     """
     times = stage_times_ms(profile, plan, corners)

@@ -1,11 +1,11 @@
-"""Moves a chip's profile towards a handful of own measurements, and says how well it predicts rows that it did not see.
+"""Fits a chip's profile to a few of the user's measurements, and says how well it predicts rows that it did not see.
 
     rows = read_own_rows(Path("chip.csv"), Path("networks"))
     moved = calibrate("snapdragon-8-gen-2", rows)
     moved.numbers, moved.rows[0].after
 
-The profile's numbers are the prior. What is mostly unknown of another chip is how fast it is as a whole. Therefore the
-prior lets all rates move together by CHIP, and each by itself by less:
+A row is one measurement. The profile's numbers are the prior. For another chip, the main unknown is its speed as a
+whole. Therefore the prior lets all rates move together by CHIP, and each single rate by less:
 
     covariance of two log rates = CHIP^2 + RATE^2 [same rate] + ENGINE^2 [same engine] + OWN^2 [same rate and engine]
 
@@ -14,17 +14,18 @@ The fit minimises, over the deviations d of all log rates from the profile's,
     sum over rows of (NU + 1) log(1 + r^2 / NU) + d' covariance^-1 d,    r = log(predicted / measured) / NOISE,
 
 by Gauss and Newton's method, as `fit_engines.py` does with many rows. A unit without a tensor engine has one factor on
-all its times. Every row is predicted by a fit to the others.
+all its times. Every row is predicted by a fit to the rows of other networks.
 
-The errors of those predictions show whether the profile states too large or too small an error for this chip. The
-misses z, in units of the stated error, are normal with an unknown variance k^2. The stated error itself, k = 1, counts
-as one more row. Therefore k^2 has a scaled inverse chi-square distribution, and the miss of a new row divided by
+The errors of these predictions show whether the profile's stated error is too large or too small for this chip. The
+misses z, in units of the stated error, are assumed to be normal with an unknown variance k^2. The stated error itself,
+k = 1, counts as one more row. Therefore k^2 has a scaled inverse chi-square distribution, and the miss of a new row
+divided by
 
     s = ((1 + sum of z^2) / (1 + n))^(1/2)
 
-is Student's t with 1 + n degrees of freedom (Gelman et al., Bayesian Data Analysis, section 2.6). A unit's
-`error_scale` is s times the 80 % quantile of t divided by that of a normal distribution. With it, an 80 % interval
-holds 80 % again.
+has Student's t distribution with 1 + n degrees of freedom (Gelman et al., Bayesian Data Analysis, section 2.6). A
+unit's `error_scale` is s times the 80 % quantile of t, divided by the same quantile of a normal distribution. With it,
+80 % of new rows lie in their 80 % interval again.
 """
 
 from __future__ import annotations
@@ -62,28 +63,33 @@ from trilane.hw_profiles.unit_times import amounts, join, numbers_of, time_on
 from trilane.student import student_quantile
 from trilane.units import BURST, UNITS, UnitName
 
-#: Spreads of the prior, as standard deviations of logarithms: of a chip's speed, of one rate apart from the others, of
-#: an engine apart from the others, and of a rate of an engine.
+#: Spreads of the prior, as standard deviations of logarithms: of a chip's speed, of one rate relative to other rates,
+#: of one engine relative to other engines, and of one rate of one engine.
 CHIP, RATE, ENGINE, OWN = 1.0, 0.2, 0.2, 0.15
 NOISE, NU = 0.12, 3.0
-#: How many rows what the profile states of its error counts as.
+#: Number of rows that the profile's stated error counts as.
 STATED_ROWS = 1
 STEPS, ENOUGH = 50, 1e-6
-#: How many times as long as the others' scale says a time is worth a word, and may be one of another unit.
+#: Factors by which a row's time differs from the other rows: from the first on there is a note, and from the second on
+#: the time is probably in another unit of time.
 FAR_OFF, A_UNIT = 10.0, 100.0
 LEAST_ROWS, MOST_ROWS = 2, 1000
 LONGEST_MS = 3.6e6
 RATE_OF_TERM = np.array([RATES.index(TERMS[name]) for name in NAMES])
 PRECISIONS: Final = {"int8": "int8", "w8a8": "int8", "fp16": "fp16", "float": "fp16", "fp32": "fp32"}
 RUNTIMES: Final[tuple[EngineRuntime, ...]] = get_args(EngineRuntime)
-#: Numbers of a unit without a tensor engine: those that a slower unit divides, and those that it multiplies.
+#: Times of a unit without a tensor engine, which grow if the unit is slower.
 COSTS: Final = ("job_fixed_ms", "operator_fixed_us", "input_ns_per_element", "permute_fixed_ms")
 MOST_EFFICIENCY: Final = 4.0
 
 
 class OwnRow(NamedTuple):
-    """One own measurement. `place`: file and line. `network`: path as the table has it. `ms`: time of a job.
+    """One of the user's measurements.
 
+    `place`: file and line.
+    `network`: path of the network as the table states it.
+    `work`: work of one frame.
+    `ms`: time of a job.
     `silent`: whether the table states no precision although the network's file has floats.
     """
 
@@ -98,7 +104,11 @@ class OwnRow(NamedTuple):
 
 
 class Checked(NamedTuple):
-    """A row with two predictions of it: by the profile, and by the profile moved towards all other rows."""
+    """A row with two predictions and their 80 % intervals.
+
+    `before_ms`, `before`: by the unchanged profile.
+    `after_ms`, `after`: by the profile after a fit to the rows of all other networks.
+    """
 
     row: OwnRow
     before_ms: float
@@ -117,7 +127,12 @@ class Checked(NamedTuple):
 
 @dataclass(frozen=True)
 class Calibrated:
-    """`numbers`: value and relative spread of each key that moved. `data`: tables of the moved profile."""
+    """The result of a calibration.
+
+    `data`: tables of the calibrated profile.
+    `numbers`: value and relative spread of each changed key.
+    `rows`: rows with predictions before and after.
+    """
 
     data: Mapping[str, Any]
     numbers: Mapping[str, tuple[float, float]]
@@ -125,7 +140,7 @@ class Calibrated:
 
     @property
     def notes(self) -> list[str]:
-        """What a person should know about the rows: which precision was taken, and which times are far from the others.
+        """Sentences about rows whose precision was assumed, and about rows whose time is far from the other rows.
 
         For each row, the measured time is divided by the time predicted before the fit. A row is far from the others if
         this ratio differs from the median ratio of all rows by more than a factor of FAR_OFF.
@@ -148,7 +163,7 @@ class Calibrated:
 
 
 def is_own_table(path: Path) -> bool:
-    """Say whether a table lists networks in files. A table of reference networks has a column of encoders instead."""
+    """Return whether a table lists networks in files; a table of reference networks has a column `encoder` instead."""
     if not path.is_file():
         return False
     lines = [line for line in read_text(path, "a table of measured rows").splitlines() if not line.startswith("#")]
@@ -157,9 +172,11 @@ def is_own_table(path: Path) -> bool:
 
 
 def read_own_rows(path: Path, folder: Path) -> list[OwnRow]:
-    """Read own measurements: columns network, ms, and maybe unit, precision and runtime; others are ignored.
+    """Return the user's rows: columns network, ms, and maybe unit, precision and runtime; other columns are ignored.
 
-    `folder`: folder that the networks' paths are relative to; no path may lead out of it. Raises BadInputError.
+    `folder`: folder that the networks' paths are relative to; no path may lead out of it.
+
+    Raises BadInputError.
     """
     text = read_text(path, "a table of measured rows")
     numbered = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
@@ -193,7 +210,7 @@ def _own_row(place: str, cells: Mapping[str, str], folder: Path) -> OwnRow:
     return OwnRow(place, cells["network"], graph.work, ms, unit, PRECISIONS[precision], runtime, silent)  # type: ignore[arg-type]
 
 
-#: Columns that may be left out: what they may say, and what is meant without them.
+#: (column, allowed words, word that is assumed without it) of the columns that may be left out.
 WORDS: Final[tuple[tuple[str, Sequence[str], str], ...]] = (
     ("unit", UNITS, "dsp"),
     ("precision", tuple(PRECISIONS), "int8"),
@@ -209,7 +226,11 @@ def _word(place: str, cells: Mapping[str, str], column: str, known: Sequence[str
 
 
 def network_file(place: str, name: str, folder: Path, remedy: str = "--networks names another folder") -> Path:
-    """Return the path of a network; `.onnx` may be left out. Raises BadInputError for one outside of `folder`."""
+    """Return the path of a network's file. Raises BadInputError for a path outside of `folder`.
+
+    `place`, `remedy`: place and remedy for the error.
+    `name`: path relative to `folder`; `.onnx` may be left out.
+    """
     inner = PurePosixPath(name)
     if not name or inner.is_absolute() or ".." in inner.parts or "\0" in name or "\\" in name:
         expected = f"a path inside {folder}"
@@ -218,19 +239,19 @@ def network_file(place: str, name: str, folder: Path, remedy: str = "--networks 
 
 
 def on_chip(profile: Profile, row: OwnRow) -> Profile:
-    """Return the profile with the row's unit in its precision and, with a tensor engine, under its runtime."""
+    """Return the profile whose unit runs in the row's precision and, if it has a tensor engine, the row's runtime."""
     chip = in_precision(profile, row.unit, "not said", row.precision)
     return under_runtime(chip, row.unit, row.runtime) if chip.units[row.unit].engines else chip
 
 
 def calibrate(name: str | Path, rows: Sequence[OwnRow]) -> Calibrated:
-    """Move the profile `name` towards `rows`. Raises BadInputError for a row that the profile cannot predict."""
+    """Fit the profile `name` to `rows`. Raises BadInputError for a row that the profile cannot predict."""
     data, path = load_tables(name)
     return calibrate_tables(data, path, rows)
 
 
 def calibrate_tables(data: Mapping[str, Any], path: Path, rows: Sequence[OwnRow]) -> Calibrated:
-    """Move the tables of a profile towards `rows`. `path`: file of the tables, for messages. Raises BadInputError."""
+    """Fit the tables of a profile to `rows`. `path`: file of the tables, for messages. Raises BadInputError."""
     profile = parse_profile(data, path)
     for row in rows:
         try:
@@ -247,12 +268,13 @@ def calibrate_tables(data: Mapping[str, Any], path: Path, rows: Sequence[OwnRow]
 
 
 def misses(left_out: Sequence[Checked], of: Checked | UnitName) -> list[float]:
-    """Return how far off predictions were, as logarithms in units of the stated error: one for each network.
+    """Return the mean miss of each network: log(measured / predicted), in units of the stated error.
 
-    Rows of one network say the same about the fit, and nothing about other networks, so their mean counts.
-    `left_out`: rows beside a prediction by a fit to all other networks, with the interval that the profile states.
-    `of`: a unit, for all its networks; or a row, for all other networks of its unit. Rows of only one network on a unit
-    tell nothing about a fit; the result is empty.
+    The rows of one network count as one miss, because they have their error in common. If the unit has rows of only one
+    network, the result is empty, because no row was predicted by a fit to other rows.
+
+    `left_out`: rows with a prediction by a fit to all other networks, and with the interval that the profile states.
+    `of`: a unit, for all its networks; or a row, for all other networks of its unit.
     """
     unit, own = (of, "") if isinstance(of, str) else (of.row.unit, of.row.network)
     told: dict[str, list[float]] = {}
@@ -264,14 +286,14 @@ def misses(left_out: Sequence[Checked], of: Checked | UnitName) -> list[float]:
 
 
 def error_scale(told: Sequence[float]) -> float:
-    """Return by which factor the stated error must grow or shrink. `told`: misses in units of the stated error."""
+    """Return the factor by which the stated error must grow or shrink. `told`: misses in units of the stated error."""
     freedom = STATED_ROWS + len(told)
     scale = math.sqrt((STATED_ROWS + sum(miss**2 for miss in told)) / freedom)
     return min(scale * student_quantile(freedom, 0.8) / NORMAL_80, MOST_ERROR_SCALE)
 
 
 def _error_scales(profile: Profile, left_out: Sequence[Checked]) -> dict[str, tuple[float, float]]:
-    """Return the `error_scale` of each unit that has rows, on top of that of the profile."""
+    """Return (value, spread) of each unit's `error_scale`, for units with rows; it multiplies the profile's own."""
     numbers = {}
     for unit in dict.fromkeys(each.row.unit for each in left_out):
         told, stated = misses(left_out, unit), profile.units[unit].error_scale
@@ -293,7 +315,7 @@ def _predicted(profile: Profile, row: OwnRow) -> tuple[float, Interval]:
 
 
 def _moved(profile: Profile, rows: Sequence[OwnRow]) -> dict[str, tuple[float, float]]:
-    """Return the value and spread of each key that moves."""
+    """Return the value and spread of each key that a fit to `rows` changes."""
     numbers: dict[str, tuple[float, float]] = {}
     for unit in UNITS:
         of_unit = [row for row in rows if row.unit == unit]
@@ -319,7 +341,7 @@ def with_numbers(data: Mapping[str, Any], numbers: Mapping[str, tuple[float, flo
 
 
 class _EngineRow:
-    """A row on a tensor engine: its time by the deviations of the six rates (6,), and how it grows with each."""
+    """A row on a tensor engine, as a function of the deviations of the six log rates."""
 
     def __init__(self, profile: Profile, row: OwnRow) -> None:
         chip = on_chip(profile, row)
@@ -335,7 +357,10 @@ class _EngineRow:
         self._beside_s = whole - self.predict(np.zeros(len(RATES)))[0] / 1e3
 
     def predict(self, deviations: F64) -> tuple[float, F64]:
-        """Return the time in ms, and the growth of its logarithm with that of each rate's seconds (6,)."""
+        """Return (time in ms, derivative of its logarithm by each deviation (6,)).
+
+        `deviations`: deviations of the logarithms of the seconds per unit of each rate from the profile's (6,).
+        """
         costs = self._costs * np.exp(deviations)[RATE_OF_TERM]
         joined, slopes = join(costs[:-1])
         whole = joined.sum() + costs[-1].sum() + self._beside_s
@@ -350,14 +375,14 @@ def engine_name(unit: Unit) -> EngineName:
 
 
 def prior_covariance(engines: Sequence[EngineName]) -> F64:
-    """Return the covariance of the log rates of `engines`, six of each in turn."""
+    """Return the covariance of the log rates of `engines`, (6 x engines, 6 x engines), six rates of each in turn."""
     same_engine = np.kron(np.eye(len(engines)), np.ones((len(RATES), len(RATES))))
     same_rate = np.kron(np.ones((len(engines), len(engines))), np.eye(len(RATES)))
     return CHIP**2 + RATE**2 * same_rate + ENGINE**2 * same_engine + OWN**2 * same_engine * same_rate
 
 
 def _engine_numbers(profile: Profile, unit: UnitName, rows: Sequence[OwnRow]) -> dict[str, tuple[float, float]]:
-    """Return the moved rates of all engines of the unit, with their spreads."""
+    """Return (value, spread) of the fitted rates of all engines of the unit, by key."""
     engines = list(profile.units[unit].engines)
     deviations, covariance = _solve([_EngineRow(profile, row) for row in rows], engines)
     spreads = np.sqrt(np.diag(covariance))
@@ -373,7 +398,7 @@ def _engine_numbers(profile: Profile, unit: UnitName, rows: Sequence[OwnRow]) ->
 
 
 def _solve(rows: Sequence[_EngineRow], engines: Sequence[EngineName]) -> tuple[F64, F64]:
-    """Return the most probable deviations of the log rates (6 x engines,), and their covariance."""
+    """Return (most probable deviations of the log rates (6 x engines,), their covariance)."""
     precision: F64 = np.linalg.inv(prior_covariance(engines)).astype(np.float64)
     at: F64
     at, places = np.zeros(len(precision)), [len(RATES) * engines.index(row.engine) for row in rows]
@@ -394,7 +419,12 @@ def _solve(rows: Sequence[_EngineRow], engines: Sequence[EngineName]) -> tuple[F
 
 
 def _derivatives(at: F64, rows: Sequence[_EngineRow], places: Sequence[int], precision: F64) -> tuple[float, F64, F64]:
-    """Return the cost, half its gradient, and half its curvature as if the predictions were linear."""
+    """Return (value that the fit minimises, half its gradient, half its curvature as if predictions were linear).
+
+    `at`: deviations of the log rates (6 x engines,).
+    `places`: index of the first rate of each row's engine in `at`.
+    `precision`: inverse of the prior covariance.
+    """
     cost, gradient, curvature = float(at @ precision @ at), precision @ at, precision.copy()
     for row, place in zip(rows, places, strict=True):
         span = slice(place, place + len(RATES))
@@ -408,7 +438,7 @@ def _derivatives(at: F64, rows: Sequence[_EngineRow], places: Sequence[int], pre
 
 
 def _unit_numbers(profile: Profile, unit: UnitName, rows: Sequence[OwnRow]) -> dict[str, tuple[float, float]]:
-    """Return the numbers of a unit without a tensor engine, all moved by one factor on its times."""
+    """Return (value, spread) of the numbers of a unit without a tensor engine: a fit of one factor on its times."""
     own = profile.units[unit]
     noise = max(NOISE, own.model_error_fraction.or_else(0.3))
     misses = np.array([math.log(row.ms / _predicted(profile, row)[0]) for row in rows])
@@ -439,9 +469,9 @@ class NamedRow(NamedTuple):
 
 
 def fit_row(table: Path, network: str | None, unit: str | None, precision: str | None, runtime: str | None) -> NamedRow:
-    """Check the cells of a new row of `table`, and the network's graph. None stands for a column that is missing.
+    """Return the checked cells of a new row of `table`. None stands for a missing column.
 
-    Raises BadInputError.
+    Raises BadInputError, also for a network file that cannot be read.
     """
     if not network:
         raise BadInputError("--network", "nothing", "the network that was measured", "a path beside the table")

@@ -1,8 +1,8 @@
-"""The whole fit of tensor engines: the numbers of every chip, their cross-validation, and how both are shown.
+"""The whole fit of tensor engines: the numbers of every chip, their cross-validation, and tables and pictures of both.
 
-Every stated error comes from rows whose network was left out of the fit. A chip without a row of an engine gets the
-numbers of a related chip, times the ratio of the two chips where both are known. Such numbers are `assumed`. The head
-of a chip's profile is written by hand and stays; everything from MARK on is written here.
+Every stated error comes from rows whose network was left out of the fit. A chip without rows of an engine gets the
+numbers of a related chip, times the ratio of the two chips on another engine that both have. Such numbers are
+`assumed`. The head of a chip's profile is written by hand and stays; this module writes everything from MARK on.
 """
 
 from __future__ import annotations
@@ -37,15 +37,16 @@ from trilane.hw_profiles.operators import NAMES, Layers
 from trilane.hw_profiles.schema import ENGINES, NORMAL_80, EngineName
 from trilane.writing import write_atomically
 
-#: Share of the left-out rows that intervals of 80 % are drawn to cover. It is larger because a stranger is
-#: less like the networks of the fit than these are like each other.
+#: Share of the left-out rows that lie in their 80 % intervals by construction. It is more than 80 % because a user's
+#: network differs more from the networks of the fit than these differ from each other.
 COVERED = 0.87
-#: A chip of which no row is of the engine: its usual rows are minutes, or fell off the engine.
+#: A chip whose published times say nothing about the engine: they are minutes, or layers did not run on the engine.
 LEFT_ASIDE = ("865",)
-#: A chip known by anchors -> the one before it. A chip without rows of an engine -> its closest relative that has them.
+#: The chip of the generation before, for a chip that has only anchors.
 BEFORE = {"8elite5": "8elite"}
+#: The closest relative that has rows of an engine, for a chip without such rows.
 RELATIVE = {"xelite": "8gen2", "qcs6490": "sa8295p", "8elite5": "8elite"}
-#: An engine -> the one in which a chip and its relative are compared in its place.
+#: The engines on which a chip and its relative are compared, by the engine that the chip has no rows of.
 SIBLING: dict[EngineName, tuple[EngineName, ...]] = {
     "int8_tflite": ("int8_qnn_dlc",),
     "int8_qnn_dlc": ("int8_tflite",),
@@ -55,12 +56,13 @@ SIBLING: dict[EngineName, tuple[EngineName, ...]] = {
 ASSUMED_SPREAD = 0.25
 
 BEGIN, END = "<!-- errors: written by `trilane profiles fit-chips` -->", "<!-- end of errors -->"
-#: The engine whose errors are told by family and chip: bytes under the phone's usual runtime.
+#: The engine whose errors are shown by family and chip: INT8 under the phone's usual runtime.
 USUAL: EngineName = "int8_tflite"
 CLOSE = 0.15
 
-#: The profile with the shared factors, and those of chips.
+#: The profile with the shared factors.
 SHARED = "hexagon"
+#: The profile of each chip.
 PROFILE_OF = {
     "8gen1": "snapdragon-8-gen-1",
     "8gen2": "snapdragon-8-gen-2",
@@ -76,16 +78,20 @@ HEXAGON_OF = {"8gen1": "v69", "8gen2": "v73", "8gen3": "v75", "8elite": "v79", "
     "sa8295p": "v68",
     "xelite": "v73",
 }
-#: Chips of the 888's generation: their mean is where a chip without rows begins.
+#: Chips of the 888's generation; their mean is in the shared profile, for chips without rows.
 V68 = ("qcs6490", "sa8295p")
 MARK = "# From here on written by `trilane profiles fit-chips`."
 VTCM = "VTCM of its generation"
-#: Shares of a network's time below it are not written.
+#: Least share of a network's time that is written.
 LEAST_SHARE = 0.001
 
 
 class ChipRate(NamedTuple):
-    """One of a chip's six numbers. `kind`: kind of a profile's number."""
+    """One of a chip's six rates on an engine.
+
+    `spread`: its relative spread.
+    `kind`: kind of the number in a profile.
+    """
 
     value: float
     spread: float
@@ -94,10 +100,11 @@ class ChipRate(NamedTuple):
 
 @dataclass(frozen=True)
 class EngineStudy:
-    """One engine. `left_out`: rows of the cross-validation.
+    """The fit of one engine.
 
-    `error`: error of the model itself for a network that is wholly unlike those of the fit; with it, intervals cover
-    COVERED of the rows.
+    `left_out`: rows of the cross-validation.
+    `error`: relative error of the model itself for a network that is wholly unlike the networks of the fit. With it,
+    intervals cover COVERED of the rows.
     """
 
     fitted: Fitted
@@ -113,7 +120,7 @@ class EngineStudy:
 
 @dataclass(frozen=True)
 class Study:
-    """All engines. `rates`: numbers of each chip and engine, by key."""
+    """The fits of all engines. `rates`: rates of each chip and engine, by key."""
 
     engines: Mapping[EngineName, EngineStudy]
     rates: Mapping[tuple[str, EngineName], Mapping[str, ChipRate]]
@@ -124,19 +131,18 @@ class Study:
 
 
 def misses_of(rows: Sequence[LeftOut]) -> tuple[F64, F64, F64]:
-    """Return the errors of `rows` and what explains them, as three arrays (rows,).
+    """Return three arrays (rows,): misses, errors that the fit's numbers leave, and unlikeness of the networks.
 
-    They are the absolute logarithm of the predicted over the published time, the error that the fit's numbers leave,
-    and how unlike each network is to those of the fit.
+    A miss is the absolute logarithm of predicted / published time. The unlikeness is `LeftOut.unlike`.
     """
     misses = [abs(math.log(row.predicted_ms / row.row.ms)) for row in rows]
     return np.array(misses), np.array([row.unsure for row in rows]), np.array([row.unlike for row in rows])
 
 
 def own_error(rows: Sequence[LeftOut]) -> float:
-    """Return the least error of the model with which intervals around `rows` cover COVERED of them.
+    """Return the least `EngineStudy.error` with which the intervals of `rows` cover COVERED of them.
 
-    It grows in proportion to how unlike a network is to those of the fit.
+    The error of a row is this error times the unlikeness of its network.
     """
     misses, unsure, unlike = misses_of(rows)
     beyond = np.sqrt(np.maximum((misses / NORMAL_80) ** 2 - unsure**2, 0)) / unlike
@@ -175,7 +181,7 @@ def _known(fitted: Fitted, chip: str) -> dict[str, ChipRate]:
 def _assumed(
     rates: Mapping[tuple[str, EngineName], Mapping[str, ChipRate]], engines: Sequence[EngineName]
 ) -> dict[tuple[str, EngineName], dict[str, ChipRate]]:
-    """Return the numbers of chips for engines of which they have no row."""
+    """Return the assumed rates of chips for engines of which they have no row."""
     found = {}
     for chip, relative in RELATIVE.items():
         for engine in engines:
@@ -192,9 +198,9 @@ def _assumed(
 
 
 def middle(chips: Sequence[Mapping[str, ChipRate]]) -> dict[str, Prior]:
-    """Return the geometric mean of chips' numbers.
+    """Return the geometric mean of the rates of `chips`, by key.
 
-    Its spread joins the differences of the chips and the spread of each.
+    Its spread contains the differences between the chips and the spread of each chip.
     """
     result = {}
     for key in chips[0]:
@@ -205,7 +211,11 @@ def middle(chips: Sequence[Mapping[str, ChipRate]]) -> dict[str, Prior]:
 
 
 def errors_of(rows: Sequence[LeftOut]) -> dict[str, float]:
-    """Return `rows`, `median` and `p90` of the absolute errors, `close` (share within 15 %), `bias` (median)."""
+    """Return statistics of the relative errors of `rows`.
+
+    They are the number of `rows`, `median` and `p90` of the absolute errors, `close` (share within 15 %), and `bias`
+    (median with sign).
+    """
     errors = np.array([row.error for row in rows])
     return {
         "rows": len(rows),
@@ -245,7 +255,10 @@ def _median(rows: Sequence[LeftOut]) -> str:
 
 
 def with_table(text: str, table: str, path: Path) -> str:
-    """Return `text`, the content of `path`, with `table` between BEGIN and END. Raises BadInputError without these."""
+    """Return `text` with `table` between the lines BEGIN and END. Raises BadInputError if it has no such lines.
+
+    `path`: file of the text, for the error.
+    """
     before, begin, rest = text.partition(BEGIN)
     _, end, after = rest.partition(END)
     if not (begin and end):
@@ -277,10 +290,10 @@ def plot_errors(study: Study, path: Path) -> None:
 
 
 def profile_texts(study: Study, folder: Path, command: str) -> dict[Path, str]:
-    """Return the new text of each profile of `folder` that has numbers of `study`.
+    """Return the new text of each profile in `folder` that has numbers from `study`, by its path.
 
     `command`: source that each number states.
-    Raises BadInputError for a chip's profile that is not there.
+    Raises BadInputError for a chip's profile that does not exist.
     """
     written = {folder / f"{SHARED}.toml": list(_shared(study, command))}
     for chip in study.chips:
@@ -290,7 +303,7 @@ def profile_texts(study: Study, folder: Path, command: str) -> dict[Path, str]:
 
 
 def head_of(path: Path) -> str:
-    """Return the part of a profile that is written by hand. Raises BadInputError without one."""
+    """Return the part of a profile that is written by hand. Raises BadInputError for a file that cannot be read."""
     return read_text(path, "a chip's profile, its head written by hand").partition(MARK)[0].rstrip() + "\n\n"
 
 

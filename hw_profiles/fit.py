@@ -1,10 +1,10 @@
 """Fits a profile's efficiencies to measured rows.
 
-There are fewer free numbers than measurements, and each has a physical meaning and a prior: the value and the `spread`
-that the profile states before the fit. The fit minimises the sum of squares of log(predicted / measured) / noise and of
-log(number / prior) / spread. This gives the most probable numbers if both are normally distributed. Each of `STEPS`
-starts from the numbers of the earlier steps. The steps of the network come first, unit by unit, then that of the
-application.
+There are fewer free numbers than measurements. Each free number has a physical meaning and a prior: the value and the
+`spread` that the profile states before the fit. The fit minimises the sum of the squares of
+log(predicted / measured) / noise and of log(number / prior) / spread. This gives the most probable numbers if both
+logarithms are normally distributed. Each of `STEPS` starts from the numbers of the earlier steps. The steps of the
+network come first, unit by unit, then the step of the application.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.units import SUSTAINED, UnitName
 
 MEASURED_UNDER = SUSTAINED
-NORMAL_OVER_MEDIAN = 1.4826  # standard deviation of a normal distribution over its median absolute deviation
+NORMAL_OVER_MEDIAN = 1.4826  # standard deviation of a normal distribution, divided by its median absolute deviation
 
-#: Keys of a profile that are multiplied by one factor.
+#: A group of keys of a profile that are multiplied by the same factor.
 Keys = tuple[str, ...]
 
 
@@ -44,7 +44,11 @@ class Measurement(NamedTuple):
 
 @dataclass(frozen=True)
 class Residual:
-    """One measurement beside the fit. `left_out_ms`: prediction by a fit to all other measurements of the step."""
+    """One measurement with its predictions.
+
+    `fitted_ms`: prediction by the fit to all measurements of the step.
+    `left_out_ms`: prediction by a fit to all other measurements of the step.
+    """
 
     step: str
     row: ConfigurationRow
@@ -68,8 +72,10 @@ class Residual:
 class ProfileFit:
     """The result of a fit.
 
-    `data`: tables of the fitted profile. `numbers`: value and relative spread of each fitted key. `residuals`: each
-    measurement beside the fit. `free_count`: how many numbers were free.
+    `data`: tables of the fitted profile.
+    `numbers`: value and relative spread of each fitted key.
+    `residuals`: measurements with their predictions.
+    `free_count`: number of free numbers.
     """
 
     data: Mapping[str, Any]
@@ -85,14 +91,14 @@ class ProfileFit:
     def median_error(self, column: str, *, left_out: bool = False) -> float:
         """Return the median absolute relative error of `column`.
 
-        `left_out`: whether to take the errors of fits that had not seen the measurement.
+        `left_out`: whether each error comes from a fit without its measurement.
         """
         errors = [abs(r.left_out_error if left_out else r.error) for r in self.residuals if r.column == column]
         return median(errors) if errors else 0.0
 
 
 def measurements(rows: Sequence[ConfigurationRow], step: Step) -> list[Measurement]:
-    """Return the measurements of `step` in `rows`. For an application's frame time the middle of its range counts."""
+    """Return the measurements of `step` in `rows`; the frame time of an application is the middle of its range."""
     result = []
     for row in rows:
         for column in step.columns:
@@ -107,7 +113,7 @@ def measurements(rows: Sequence[ConfigurationRow], step: Step) -> list[Measureme
 
 
 def predicted_ms(profile: Profile, measured: Measurement) -> float:
-    """Return the milliseconds that `profile` predicts for `measured`, under the performance profile MEASURED_UNDER."""
+    """Return the time in ms that `profile` predicts for a measurement, under the performance profile MEASURED_UNDER."""
     corners, unit = corners_of(profile, MEASURED_UNDER), UNIT_OF_COLUMN[measured.column]
     network = reference_network(measured.row.spec)
     if measured.column.startswith("bench"):
@@ -128,7 +134,8 @@ def fit(data: Mapping[str, Any], path: Path, rows: Sequence[ConfigurationRow]) -
     `data`: tables of the profile.
     `path`: file of these tables, for messages.
     `rows`: measured rows.
-    Raises BadInputError when there are no more measurements than free numbers, MissingPartError without SciPy.
+
+    Raises BadInputError if there are no more measurements than free numbers, MissingPartError without SciPy.
     """
     fitted: Mapping[str, Any] = data
     numbers: dict[str, tuple[float, float]] = {}
@@ -155,7 +162,10 @@ def fit(data: Mapping[str, Any], path: Path, rows: Sequence[ConfigurationRow]) -
 
 
 def _from_residuals(residuals: Sequence[Residual], rows: Sequence[ConfigurationRow]) -> dict[str, tuple[float, float]]:
-    """Return the model's own error, from left-out measurements, and the spread of frame times, from their ranges."""
+    """Return (value, spread) of the keys for the model's own error and for the range of frame times.
+
+    The model's error comes from predictions of left-out measurements, the range from the measured ranges.
+    """
     numbers = {}
     for unit in ("dsp", "gpu"):
         errors = [abs(r.left_out_error) for r in residuals if r.column == f"bench_{unit}_ms"]
@@ -167,7 +177,7 @@ def _from_residuals(residuals: Sequence[Residual], rows: Sequence[ConfigurationR
 
 
 def _solve(data: Mapping[str, Any], path: Path, step: Step, measured: Sequence[Measurement]) -> tuple[F64, F64]:
-    """Return factors on the priors of `step.free`, and the spread of each after the fit.
+    """Return (factors on the priors of `step.free`, spread of each factor after the fit).
 
     `data`: tables of the profile with the priors.
     `path`: file of these tables, for messages.
@@ -196,7 +206,7 @@ def _least_squares() -> Callable[..., Any]:
 
 
 def with_factors(data: Mapping[str, Any], free: Sequence[Keys], factors: Sequence[float] | F64) -> dict[str, Any]:
-    """Return a copy of the tables `data` with the values of each group of keys multiplied by its factor."""
+    """Return a copy of the tables `data`; the values of each group of keys in `free` are multiplied by its factor."""
     copied = copy.deepcopy(dict(data))
     for keys, factor in zip(free, factors, strict=True):
         for key in keys:
@@ -219,9 +229,9 @@ def as_toml(
     """Return the text of a TOML file with fitted numbers.
 
     `numbers`: value and spread of each key.
-    `head`: `extends`, `name` and `title` of the new profile; the profile that it extends has all other numbers.
+    `head`: keys `extends`, `name` and `title` of the new profile; the profile that it extends has all other numbers.
     `command`: command that made the file; it becomes the source of every number.
-    `measurements`: what the numbers come from, in words.
+    `measurements`: description of the measurements, for the first line.
     """
     lines = [
         f"# Written by `{command}`: {measurements}.",
@@ -244,7 +254,8 @@ def as_toml(
 class Step(NamedTuple):
     """One step of the fit.
 
-    `columns`: measured columns that it fits. `free`: groups of keys; one factor multiplies all keys of a group.
+    `columns`: measured columns that it fits.
+    `free`: groups of keys; one factor multiplies all keys of a group.
     `noise`: relative error of a measurement.
     """
 
@@ -300,7 +311,7 @@ STEPS = (
         0.1,
     ),
 )
-#: Measured column -> the unit that runs the network.
+#: The unit that runs the network, by the measured column.
 UNIT_OF_COLUMN: dict[str, UnitName] = {
     "bench_dsp_ms": "dsp",
     "bench_gpu_ms": "gpu",

@@ -1,19 +1,20 @@
-"""Published latencies of networks on chips: the fit of tensor engines to them, and two networks to check profiles by.
+"""Fits tensor engines to published latencies of networks on chips, and checks profiles with two of these networks.
 
-`read_latencies` decides which rows count, by what the file says of them. The fit has seen both networks among some
-thirty others, so `check_published` says how well it holds; `trilane profiles fit-chips` says how well unseen networks
-are predicted. Source: Qualcomm AI Hub Models, `unet_segmentation` (milesial's U-Net of 31.0 M parameters on
-640x1280x3) and `resnet18`, w8a8, TFLite and QNN runtimes, QAIRT 2.41 (BSD-3-Clause, github.com/quic/ai-hub-models,
-perf.yaml).
+`read_latencies` decides which rows count, by their column `caution`. The fit has seen both networks of the check among
+some thirty others. Therefore `check_published` says only how well the fit holds; `trilane profiles fit-chips` says how
+well unseen networks are predicted. Source: Qualcomm AI Hub Models, `unet_segmentation` (milesial's U-Net of 31.0 M
+parameters on 640x1280x3) and `resnet18`, w8a8, TFLite and QNN runtimes, QAIRT 2.41 (BSD-3-Clause,
+github.com/quic/ai-hub-models, perf.yaml).
 
-The fit gives the shared terms and the six numbers of each chip. Every number has a prior, what is believed before any
-latency is looked at. The fit minimises, over all logarithms,
+The fit finds the factors of the terms, which all chips share, and six rates of each chip. Every number has a prior, its
+value and spread before any latency is known. The fit minimises, over the logarithms of all numbers,
 
     sum over rows of (NU + 1) log(1 + r^2 / NU) + sum over numbers of (log(number / prior) / spread)^2,
     r = log(predicted / published) / NOISE,
 
-by Gauss and Newton's method with Levenberg's damping and the exact derivatives of `unit_times.join`. That gives the
-most probable numbers if errors follow Student's t distribution, so that a row far off counts little.
+by Gauss and Newton's method with Levenberg's damping and the exact derivatives of `unit_times.join`. This gives the
+most probable numbers if errors follow Student's t distribution. With that distribution, a row with a large error counts
+little.
 """
 
 from __future__ import annotations
@@ -43,10 +44,10 @@ Times = Mapping[str, Mapping[EngineRuntime, float]]
 UNET_SIZE = (640, 1280)
 UNET_WIDTHS = (64, 128, 256, 512, 1024)
 
-#: Milliseconds of each network, by the engine's runtime.
+#: Published time of each network in ms, by the engine's runtime.
 _QCS8450: Times = {"unet": {"tflite": 54.07, "qnn_dlc": 57.895}, "resnet18": {"tflite": 0.609, "qnn_dlc": 0.743}}
-#: The times of the 8 Gen 1 were published for the QCS8450, which Qualcomm also takes for the XR2 Gen 2; those of the
-#: 8 Gen 2 for the QCS8550.
+#: Published times of the two networks in ms, by the profile's name. The times of the 8 Gen 1 were published for the
+#: QCS8450, which Qualcomm also uses for the XR2 Gen 2. The times of the 8 Gen 2 were published for the QCS8550.
 PUBLISHED_MS: dict[str, Times] = {
     "qcs6490": {"unet": {"tflite": 267.749, "qnn_dlc": 267.845}, "resnet18": {"tflite": 1.481, "qnn_dlc": 1.811}},
     "sa8295p": {"unet": {"tflite": 63.621, "qnn_dlc": 63.575}, "resnet18": {"tflite": 0.774, "qnn_dlc": 0.957}},
@@ -74,15 +75,15 @@ ENGINE_OF: dict[tuple[str, str], EngineName] = {
     ("float", "tflite"): "fp16_tflite",
     ("float", "qnn_dlc"): "fp16_qnn_dlc",
 }
-#: Rows that say so ran elsewhere, or fell off the engine.
+#: Words in the column `caution` of rows whose network did not run, or not wholly, on the engine.
 NOT_OF_THE_ENGINE = ("layers on", "over 1 s")
 COLUMNS = ("network", "chip", "hexagon", "precision", "runtime", "ms", "caution", "use")
 
 
 class PublishedTime(NamedTuple):
-    """A published time beside the predicted one, both of the same runtime.
+    """A published time and the predicted time, both for the same runtime.
 
-    `independent`: whether no number of the profile comes from this time.
+    `independent`: whether no number of the profile comes from this published time.
     """
 
     profile: str
@@ -121,7 +122,7 @@ def _double(b: GraphBuilder, x: TensorRef, width: int) -> TensorRef:
 
 @lru_cache(maxsize=1)
 def resnet18_work() -> Work:
-    """Return the work of ResNet18 as a classifier of 224x224 pictures, which it normalises, into 1000 classes."""
+    """Return the work of ResNet18: it normalises a 224x224 picture, and classifies it into 1000 classes."""
     b = GraphBuilder("batch")
     picture = b.same("Sub", b.input("image", 3, 224, 224), b.weight((1, 3, 1, 1)))
     x = resnet18(b, b.same("Div", picture, b.weight((1, 3, 1, 1))))[-1]
@@ -133,9 +134,10 @@ WORK = {"unet": unet_work, "resnet18": resnet18_work}
 
 
 def check_published(name: str, profile: Profile) -> list[PublishedTime]:
-    """Return published times of the chip `name` beside those that `profile` predicts under `burst`; empty for none.
+    """Return the published times of the chip `name`, with the times that `profile` predicts under `burst`.
 
-    A runtime for which the profile has no numbers of the tensor engine is left out.
+    A runtime is left out if the profile has no tensor engine for it. The list is empty for a chip without published
+    times.
     """
     unit = profile.units["dsp"]
     clock = unit.clock(corners_of(profile, "burst")[UNITS.index("dsp")])
@@ -150,8 +152,12 @@ def check_published(name: str, profile: Profile) -> list[PublishedTime]:
 
 
 class Latency(NamedTuple):
-    """One published time. `hexagon`: generation of the engine. `anchor`: whether the table marks the
-    row as an anchor: its chip has a few rows only, and begins at the numbers of the chip before it."""
+    """One published time.
+
+    `hexagon`: generation of the engine.
+    `anchor`: whether the table marks the row as an anchor. A chip with anchors has only a few rows; its prior comes
+    from the chip before it.
+    """
 
     network: str
     family: str
@@ -163,7 +169,7 @@ class Latency(NamedTuple):
 
 
 def read_latencies(folder: Path) -> list[Latency]:
-    """Return the rows of `chip_rows.csv` that tell something of the engine. Raises BadInputError."""
+    """Return the rows of `chip_rows.csv` whose networks ran on the engine. Raises BadInputError."""
     families = {row["name"]: row["family"] for row in _table(folder / "networks.csv") if row["split"] != "extra"}
     rows = _table(folder / "chip_rows.csv")
     if not rows or set(COLUMNS) - rows[0].keys():
@@ -193,7 +199,7 @@ def _table(path: Path) -> list[dict[str, str]]:
 
 @lru_cache(maxsize=128)
 def layers_in(folder: Path, network: str) -> Layers:
-    """Return the layers of a network of the folder."""
+    """Return the layers of a network in `folder`/networks."""
     return read_graph(folder / "networks" / f"{network}.onnx").work.layers
 
 
@@ -204,7 +210,7 @@ def layers_of_rows(folder: Path, rows: Sequence[Latency]) -> dict[str, Layers]:
 
 NOISE, NU = 0.08, 3.0
 STEPS, ENOUGH = 60, 1e-5
-#: The only network that pins the peak rate: it is in every fit.
+#: The only network that determines the peak rate; it is in every fit.
 ALWAYS = "unet_segmentation"
 FOLDS = 5
 RATE_OF_TERM = np.array([RATES.index(TERMS[name]) for name in NAMES])
@@ -212,7 +218,11 @@ COSTS = ("operator", "job")
 
 
 class Numbers(NamedTuple):
-    """Logarithms of an engine's numbers. `factors`: (terms,). `rates`: (chips, 6), seconds per unit of each rate."""
+    """Logarithms of an engine's numbers.
+
+    `factors`: factors of the terms (terms,).
+    `rates`: seconds per unit of each rate (chips, 6).
+    """
 
     factors: F64
     rates: F64
@@ -228,9 +238,10 @@ def _from_flat(flat: F64) -> Numbers:
 
 @dataclass(frozen=True)
 class Fitted:
-    """An engine's numbers for `chips`, and the spread that the fit leaves for each.
+    """The numbers of an engine for `chips`.
 
-    `seen`: each network of the fit with the terms' shares in its time (terms,), as the mean over all chips.
+    `spreads`: spread of each number after the fit.
+    `seen`: shares of the terms in the time of each network of the fit (terms,), as the mean over all chips.
     """
 
     engine: EngineName
@@ -240,11 +251,11 @@ class Fitted:
     seen: Mapping[str, F64] = field(default_factory=dict)
 
     def unlike(self, shares: F64) -> float:
-        """Return how far `shares` (terms,) are from those of the nearest network of the fit, 0 to 1."""
+        """Return the distance of `shares` (terms,) from the shares of the nearest network of the fit, 0 to 1."""
         return min((float(np.abs(shares - others).sum()) / 2 for others in self.seen.values()), default=1.0)
 
     def rates_of(self, chip: str) -> dict[str, Prior]:
-        """Return the six numbers of `chip`, as profiles state them, with their spreads."""
+        """Return the six rates of `chip` and their spreads, by the key and in the unit of a profile."""
         row = self.chips.index(chip)
         values, spreads = self.numbers.rates[row], self.spreads.rates[row]
         return {
@@ -254,7 +265,7 @@ class Fitted:
 
 
 def as_stated(engine: EngineName, rate: str, seconds: float) -> float:
-    """Return a rate as profiles state it, from seconds per unit."""
+    """Return a rate in the unit of a profile. `seconds`: seconds per unit of the rate."""
     unit = KEY_OF_RATE[rate][1]
     return seconds / unit if rate in COSTS else _bytes(engine, rate) / (seconds * unit)
 
@@ -269,7 +280,10 @@ def _bytes(engine: EngineName, rate: str) -> int:
 
 
 class _Rows:
-    """Rows as arrays: amounts of each row's layers (equal layers once, with their count), and the chip of each row."""
+    """Rows of one engine as arrays: chip, network and time of each row, and amounts of the rows' layers.
+
+    Equal layers of a row are stored once, with their count.
+    """
 
     def __init__(self, rows: Sequence[Latency], layers: Mapping[str, Layers], chips: Sequence[str]) -> None:
         tables = [_distinct(layers[row.network], _room(row)) for row in rows]
@@ -282,7 +296,7 @@ class _Rows:
         self.row = np.repeat(np.arange(len(rows)), [len(table) for table, _ in tables])
 
     def predict(self, numbers: Numbers) -> tuple[F64, F64]:
-        """Return the milliseconds of each row (rows,), and each term's share in their growth (rows, terms)."""
+        """Return (time of each row in ms (rows,), share of each term in the growth of this time (rows, terms))."""
         seconds = np.exp(numbers.factors + numbers.rates[self.chip][:, RATE_OF_TERM])
         costs = self.table * seconds[self.row]
         joined, slopes = join(costs)
@@ -291,7 +305,11 @@ class _Rows:
         return 1e3 * whole, grown / whole[:, None]
 
     def slopes(self, shares: F64, chips: int) -> F64:
-        """Return how the logarithm of each row's time grows with the logarithm of each number (rows, numbers)."""
+        """Return the derivatives of the logarithm of each row's time by the logarithm of each number (rows, numbers).
+
+        `shares`: second result of `predict`.
+        `chips`: number of chips.
+        """
         by_rate = np.stack([shares[:, rate == RATE_OF_TERM].sum(axis=1) for rate in range(len(RATES))], axis=1)
         of_chips = np.zeros((len(shares), chips, len(RATES)))
         of_chips[np.arange(len(shares)), self.chip] = by_rate
@@ -306,7 +324,7 @@ _tables: dict[tuple[Layers, int], tuple[F64, F64]] = {}
 
 
 def _distinct(layers: Layers, room: int) -> tuple[F64, F64]:
-    """Return the amounts of layers that differ, and how often each of them occurs."""
+    """Return (amounts of each different layer, number of times that it occurs). `room`: as for `amounts`."""
     if (layers, room) not in _tables:
         # Many layers of a network are alike, and every step of the fit prices each kind once.
         table, count = np.unique(amounts(layers, room), axis=0, return_counts=True)
@@ -315,7 +333,7 @@ def _distinct(layers: Layers, room: int) -> tuple[F64, F64]:
 
 
 def priors(engine: EngineName, chips: Sequence[str]) -> tuple[Numbers, Numbers]:
-    """Return the values and spreads before the fit."""
+    """Return (logarithms of the values, spreads) of an engine's numbers before the fit."""
     factors = [factor_prior(engine, name) for name in NAMES]
     rates = [[rate_prior(engine, chip, KEY_OF_RATE[rate][0]) for rate in RATES] for chip in chips]
     values = [[math.log(_seconds(engine, r, p.value)) for r, p in zip(RATES, row, strict=True)] for row in rates]
@@ -326,10 +344,10 @@ def priors(engine: EngineName, chips: Sequence[str]) -> tuple[Numbers, Numbers]:
 
 
 def fit_engine(rows: Sequence[Latency], layers: Mapping[str, Layers], start: Numbers | None = None) -> Fitted:
-    """Fit the numbers of one engine to `rows`, all of that engine.
+    """Return the numbers of one engine, fitted to its `rows`.
 
     `layers`: layers of each network, by name.
-    `start`: numbers to begin at; None for the priors.
+    `start`: numbers at which the search begins; None for the priors.
     """
     engine, chips = rows[0].engine, tuple(sorted({row.chip for row in rows}))
     return solve(engine, chips, _Rows(rows, layers, chips), priors(engine, chips), start)
@@ -342,7 +360,12 @@ def solve(
     prior: tuple[Numbers, Numbers],
     start: Numbers | None = None,
 ) -> Fitted:
-    """Find the most probable numbers. `prior`: their values and spreads before the fit."""
+    """Return the most probable numbers.
+
+    `data`: rows to fit.
+    `prior`: logarithms of the values, and spreads, before the fit.
+    `start`: numbers at which the search begins; None for the prior.
+    """
     mean, spread = (numbers.flat for numbers in prior)
     at, damping = (mean if start is None else start.flat), 1e-2
     cost = _cost(at, data, mean, spread)
@@ -371,20 +394,20 @@ def _cost(at: F64, data: _Rows, mean: F64, spread: F64) -> float:
 
 
 def _derivatives(at: F64, data: _Rows, mean: F64, spread: F64, chips: int) -> tuple[F64, F64]:
-    """Return half the gradient of `_cost`, and half its curvature as if `predict` were linear."""
+    """Return (half the gradient of `_cost`, half its curvature as if `predict` were linear)."""
     ms, shares = data.predict(_from_flat(at))
     misses = np.log(ms / data.ms) / NOISE
-    weights = (NU + 1) / (NU + misses**2)  # rows far off weigh little
+    weights = (NU + 1) / (NU + misses**2)  # rows with a large error count little
     slopes = data.slopes(shares, chips) / NOISE
     gradient = slopes.T @ (weights * misses) + (at - mean) / spread**2
     return gradient, slopes.T @ (weights[:, None] * slopes) + np.diag(1 / spread**2)
 
 
 class LeftOut(NamedTuple):
-    """A row beside the prediction of a fit without its network.
+    """A row with its prediction by a fit that has not seen its network.
 
-    `unsure`: relative error that the fit's numbers leave. `unlike`: how unlike the network is to those of the fit, 0 to
-    1.
+    `unsure`: relative error of the prediction from the spread of the fit's numbers.
+    `unlike`: distance of the network from the nearest network of the fit, 0 to 1 (`Fitted.unlike`).
     """
 
     row: Latency
@@ -398,7 +421,7 @@ class LeftOut(NamedTuple):
 
 
 def folds(networks: Sequence[str], seed: int = 0) -> Iterator[frozenset[str]]:
-    """Yield FOLDS parts of the networks, drawn by `seed`; ALWAYS is in none of them."""
+    """Yield FOLDS disjoint parts of the networks, drawn by `seed`; the network ALWAYS is in none of them."""
     others = sorted(set(networks) - {ALWAYS})
     drawn = np.random.default_rng(seed).permutation(len(others))
     for fold in range(FOLDS):
@@ -408,12 +431,12 @@ def folds(networks: Sequence[str], seed: int = 0) -> Iterator[frozenset[str]]:
 def cross_validate(
     rows: Sequence[Latency], layers: Mapping[str, Layers], start: Numbers, parts: Sequence[frozenset[str]] | None = None
 ) -> list[LeftOut]:
-    """Predict every row by a fit that has seen none of its network's rows.
+    """Return the rows whose network is left out in turn, each with its prediction by a fit without that network.
 
     `rows`: rows of one engine.
     `layers`: layers of each network, by name.
-    `start`: numbers to begin each fit at.
-    `parts`: networks that are left out together; None for those of `folds`.
+    `start`: numbers at which the search of each fit begins.
+    `parts`: networks that are left out together; None for the parts of `folds`.
     """
     result = []
     for out in folds([row.network for row in rows]) if parts is None else parts:
@@ -423,7 +446,7 @@ def cross_validate(
 
 
 def predict_rows(fitted: Fitted, rows: Sequence[Latency], layers: Mapping[str, Layers]) -> list[LeftOut]:
-    """Return each of `rows` beside the prediction of `fitted`."""
+    """Return the rows whose chip `fitted` knows, each with its prediction by `fitted`."""
     known = [row for row in rows if row.chip in fitted.chips]
     data = _Rows(known, layers, fitted.chips)
     ms, shares = data.predict(fitted.numbers)
@@ -434,9 +457,11 @@ def predict_rows(fitted: Fitted, rows: Sequence[Latency], layers: Mapping[str, L
 
 
 def fit_anchors(fitted: Fitted, before: str, rows: Sequence[Latency], layers: Mapping[str, Layers]) -> Fitted:
-    """Fit a chip for which only `rows` are known. Its prior rates are one STEP beyond those of the chip `before` it.
+    """Return the numbers of a chip that has only the anchors `rows`.
 
-    `fitted`: numbers of all other chips; its factors stay.
+    The prior of its rates is one STEP faster than the chip `before` it. The factors of `fitted` stay.
+
+    `fitted`: numbers of all other chips.
     `layers`: layers of each network, by name.
     """
     chip = (rows[0].chip,)
@@ -455,10 +480,11 @@ class Prior(NamedTuple):
     spread: float
 
 
-#: Terms whose factor is 1 by definition: those that the six rates are counted in.
+#: Terms whose factor is 1 by definition, because they define the units of the six rates.
 UNITS_OF_RATES = ("convolution", "moved", "spill", "weights", "operator", "job")
-#: How much dearer a term is than a plain convolution's, in INT8. Depthwise products are the vector unit's; strides
-#: break the blocks in which activations lie; bilinear interpolation reads four elements; bytes cannot be divided.
+#: Prior cost of a term in INT8, relative to the term that defines the unit of its rate. The vector unit does depthwise
+#: products. Strides break the blocks in which activations are stored. Bilinear interpolation reads four elements.
+#: Bytes cannot be divided.
 FACTORS: dict[str, Prior] = {
     "grouped": Prior(1, 0.7),
     "first": Prior(1, 0.7),
@@ -488,10 +514,10 @@ FACTORS: dict[str, Prior] = {
     "input": Prior(2, 1),
     "output": Prior(10, 1),
 }
-#: In FP16 a lone batch normalisation is one multiplication and addition, not several passes with new scales.
+#: In FP16 a batch normalisation of its own is one multiplication and addition, not several passes with new scales.
 FP16_FACTORS = {**FACTORS, "batch_norm": Prior(2, 0.7)}
-#: The six rates of the 8 Gen 2 in INT8: half of the 26 to 35 TOPS that are claimed; a vector unit's 200 GB/s; half and
-#: two thirds of 67 GB/s of memory; and what a call over FastRPC costs.
+#: Prior of the six rates of the 8 Gen 2 in INT8. They are half of the claimed 26 to 35 TOPS, 200 GB/s of a vector unit,
+#: half and two thirds of the memory's 67 GB/s, and the costs of an operator and of a call over FastRPC.
 RATES_OF_8_GEN_2: dict[str, float] = {
     "arithmetic_tmac_s": 17,
     "activation_gb_s": 200,
@@ -500,15 +526,15 @@ RATES_OF_8_GEN_2: dict[str, float] = {
     "operator_us": 1,
     "job_us": 80,
 }
-#: In FP16 a quarter of the products; bytes are counted as bytes, and fixed costs are a little larger.
+#: Rates in FP16, divided by the rates in INT8. Rates of bytes are the same, and fixed costs are a little larger.
 FP16_OVER_INT8 = {"arithmetic_tmac_s": 0.25, "operator_us": 1.5, "job_us": 1.5}
 RATE_SPREAD = 0.5
-#: How many times slower than the 8 Gen 2 a chip is thought to be, by claimed TOPS and memory.
+#: Prior slowness of each chip: how many times slower than the 8 Gen 2 it is, by claimed TOPS and memory.
 SLOWER = {"qcs6490": 4, "sa8295p": 1.8, "8gen1": 1.7, "8gen2": 1, "8gen3": 0.75, "8elite": 0.6, "xelite": 1}
-#: Activations that the engine holds, in MB: the VTCM of its generation.
+#: On-chip memory of the engine for activations, in MB: the VTCM of its generation.
 ON_CHIP_MB = {"v66": 4, "v68": 4, "v69": 4, "v73": 8, "v75": 8, "v79": 8, "v81": 8}
-#: Step from one generation to the next among the other chips. A chip with only a few anchors begins at the numbers of
-#: the chip before it, so many times faster in everything, with this spread.
+#: Speed-up from one generation to the next, as seen in the other chips. The prior of a chip with only a few anchors is
+#: the chip before it, with all rates faster by this factor, and with this spread.
 STEP = Prior(1.25, 0.15)
 
 

@@ -1,14 +1,14 @@
 """Temperatures of a device, the rules that throttle its units, and the application over minutes under these rules.
 
-Each unit's junction (seconds) stands on the device's body (minutes). Each is an RC, T' = (T_below + R P - T) / tau,
-solved exactly over a step of constant power (lumped models of phones: Bhat, Gumussoy and Ogras, 2019). The rules are
-`step_wise` and `power_allocator` of the Linux thermal framework (Documentation/driver-api/thermal): pure functions of
-temperatures and power that move one unit by one corner per call. In a run on this machine a corner is a duty cycle: its
-clock divided by the highest clock.
+The device's body warms in minutes, and each unit's junction warms above the body in seconds. Each is an RC element,
+T' = (T_below + R P - T) / tau, solved exactly over a step of constant power (lumped models of phones: Bhat, Gumussoy
+and Ogras, 2019). The rules are `step_wise` and `power_allocator` of the Linux thermal framework
+(Documentation/driver-api/thermal). They are functions of temperatures and power that move one unit by one corner per
+call. In a run on this machine a corner becomes a duty: its clock divided by the highest clock.
 
 Between two polls of the governor the application stays in the settled state of its corners; nothing else changes the
-power. Reports and the picture of rate and temperature only sum up moments; they model nothing more. Matplotlib is an
-optional dependency; where it is missing, the error names it.
+power. Reports and pictures only summarise the moments. Matplotlib is an optional dependency; if it is missing, the
+error names it.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from trilane.scheduler.state import FULL_DUTY
 from trilane.units import MAX_MINUTES, PERFORMANCE_PROFILES, UNITS, UnitName
 from trilane.writing import write_atomically
 
-#: Performance profiles that ask for a short wake-up of a sleeping unit: idle cores are kept awake.
+#: Performance profiles that request a short wake-up of a sleeping unit, so that idle cores are kept awake.
 PROMPT = PERFORMANCE_PROFILES[:3]
 HOW = "duty cycles; cores and threads of each unit stand with it"  # `caps.how` of report.json
 NS = 1_000_000_000
@@ -36,8 +36,10 @@ NS = 1_000_000_000
 
 @dataclass
 class ThermalState:
-    """Temperatures in degrees Celsius: `device_c` of the device's body, `junction_c` of each unit's junction.
+    """The modelled temperatures of a device, in degrees Celsius.
 
+    `device_c`: temperature of the device's body.
+    `junction_c`: temperature of each unit's junction.
     `rising`: whether the headroom shrank over the last step.
     """
 
@@ -47,12 +49,15 @@ class ThermalState:
 
     @classmethod
     def at_rest(cls, profile: Profile) -> ThermalState:
-        """Return a device that has been off for long: everything is at ambient temperature."""
+        """Return the state of a device that was off for a long time: all temperatures are ambient."""
         ambient = profile.thermal.ambient_c.or_else(25.0)
         return cls(ambient, dict.fromkeys(UNITS, ambient))
 
     def advance(self, profile: Profile, power_w: Mapping[UnitName, float], seconds: float) -> None:
-        """Let `seconds` pass while each unit takes `power_w`, and the rest of the device the profile's base power."""
+        """Let `seconds` pass at constant power.
+
+        `power_w`: power of each unit in watts; the profile's base power is added for the rest of the device.
+        """
         thermal, before = profile.thermal, headroom_k(profile, self)
         device_w = sum(power_w.values()) + thermal.base_power_w.or_else(0.0)
         goal = thermal.ambient_c.or_else(25.0) + thermal.device_k_per_w.or_else(5.0) * device_w
@@ -69,7 +74,7 @@ def _approach(value: float, goal: float, seconds: float, time_constant: float) -
 
 
 def headroom_k(profile: Profile, thermal_state: ThermalState) -> float:
-    """Return the degrees that are left to the nearer of the two limits (skin, junction); negative beyond it."""
+    """Return the kelvins that are left to the nearer of the two limits (skin, junction); negative above the limit."""
     thermal = profile.thermal
     skin = thermal.skin_limit_c.or_else(45.0) - thermal_state.device_c
     return min(skin, thermal.junction_limit_c.or_else(95.0) - max(thermal_state.junction_c.values()))
@@ -77,20 +82,20 @@ def headroom_k(profile: Profile, thermal_state: ThermalState) -> float:
 
 @dataclass
 class Throttle:
-    """How many corners each unit is held below the one that its performance profile requests."""
+    """The throttling of the units. `steps`: number of corners that each unit is below its requested corner."""
 
     steps: dict[UnitName, int] = field(default_factory=lambda: dict.fromkeys(UNITS, 0))
 
     def corner_index(self, unit: UnitName, requested: int) -> int:
-        """Return the index into CORNERS at which `unit` runs when its performance profile requests `requested`."""
+        """Return the index into CORNERS at which `unit` runs. `requested`: index of its requested corner."""
         return min(requested + self.steps[unit], len(CORNERS) - 1)
 
     def lower(self, unit: UnitName, requested: int) -> None:
-        """Take `unit` one corner down, but not below the last one."""
+        """Move `unit` one corner down, but not below the last corner."""
         self.steps[unit] = min(self.steps[unit] + 1, len(CORNERS) - 1 - requested)
 
     def raise_(self, unit: UnitName) -> None:
-        """Take `unit` one corner up, but not above the requested one."""
+        """Move `unit` one corner up, but not above the requested corner."""
         self.steps[unit] = max(self.steps[unit] - 1, 0)
 
 
@@ -101,15 +106,16 @@ def step_wise(
     requested: Mapping[UnitName, int],
     power_w: Mapping[UnitName, float],
 ) -> None:
-    """Lower the unit that takes most power while the device is over a limit and still getting warmer.
+    """Lower a unit if the device is over a limit and still gets warmer, or raise one if it is cool enough.
 
-    Raise the most lowered unit again once the device is below the limits by the hysteresis.
+    The unit with the most power is lowered. The most lowered unit is raised if the device is below the limits by the
+    hysteresis.
 
     `profile`: hardware profile of the chip.
-    `thermal_state`: temperatures now.
+    `thermal_state`: present temperatures.
     `throttle`: steps of each unit; it is changed in place.
-    `requested`: index into CORNERS that the performance profile requests, by unit.
-    `power_w`: watts that each unit takes now.
+    `requested`: index into CORNERS of the requested corner, by unit.
+    `power_w`: present power of each unit in watts.
     """
     headroom = headroom_k(profile, thermal_state)
     if headroom < 0 and thermal_state.rising:
@@ -128,16 +134,16 @@ def power_allocator(
     requested: Mapping[UnitName, int],
     power_w: Mapping[UnitName, float],
 ) -> None:
-    """Grant the units the power that the device can shed, plus a share of the headroom.
+    """Lower a unit if all units together take more than the granted power, or raise one if they take less.
 
-    Lower the unit that takes most power while all units together take more than the grant. Raise the most lowered one
-    again once its additional power fits into the grant.
+    The granted power is the power that the device can shed, plus a share of the headroom. The unit with the most power
+    is lowered. The most lowered unit is raised if its additional power fits into the grant.
 
     `profile`: hardware profile of the chip.
-    `thermal_state`: temperatures now.
+    `thermal_state`: present temperatures.
     `throttle`: steps of each unit; it is changed in place.
-    `requested`: index into CORNERS that the performance profile requests, by unit.
-    `power_w`: watts that each unit takes now.
+    `requested`: index into CORNERS of the requested corner, by unit.
+    `power_w`: present power of each unit in watts.
     """
     thermal = profile.thermal
     resistance = thermal.device_k_per_w.or_else(5.0)
@@ -158,12 +164,12 @@ def power_allocator(
 
 
 def _next_step_w(profile: Profile, throttle: Throttle, name: UnitName, requested: int, power_w: float) -> float:
-    """Return additional watts that the unit `name` would take one corner higher, at the same share of busy time.
+    """Return the additional power in watts of the unit `name` one corner higher, at the same share of busy time.
 
     `profile`: hardware profile of the chip.
-    `throttle`: how far its units are lowered now.
-    `requested`: index into CORNERS that the performance profile requests of the unit.
-    `power_w`: watts that it takes now.
+    `throttle`: present throttling of its units.
+    `requested`: index into CORNERS of the unit's requested corner.
+    `power_w`: present power of the unit in watts.
     """
     unit, index = profile.units[name], throttle.corner_index(name, requested)
     now, then = (unit.power_w(CORNERS[i], 1.0) for i in (index, index - 1))
@@ -171,21 +177,24 @@ def _next_step_w(profile: Profile, throttle: Throttle, name: UnitName, requested
 
 
 Govern = Callable[[Profile, ThermalState, Throttle, Mapping[UnitName, int], Mapping[UnitName, float]], None]
-#: Name of a governor, as in the Linux thermal framework -> its function.
+#: The function of each governor, by its name in the Linux thermal framework.
 GOVERNORS: dict[str, Govern] = {"step_wise": step_wise, "power_allocator": power_allocator}
 
 
 class Governor:
-    """The governor of one run. It learns time and work only from `tick`, so the same ticks give the same events.
+    """The governor of one run. It gets time and work only from `tick`, so equal ticks give equal events.
 
-    `name`: name in GOVERNORS. `due_ns`: time at which `tick` is to be called next.
+    `name`: name in GOVERNORS.
+    `due_ns`: time at which the caller calls `tick` next.
     """
 
     def __init__(self, profile: Profile, performance_profile: str, governor: str | None = None) -> None:
-        """Prepare the governor of a chip's `profile`.
+        """Prepare the governor of a run with the hardware profile `profile`.
 
-        `performance_profile`: name of one of its performance profiles. `governor`: name in GOVERNORS; None for the
-        profile's own. Raises BadInputError for an unknown performance profile or governor.
+        `performance_profile`: name of one of its performance profiles.
+        `governor`: name in GOVERNORS; None for the profile's governor.
+
+        Raises BadInputError for an unknown performance profile or governor.
         """
         self.name = governor or profile.thermal.governor
         if self.name not in GOVERNORS:
@@ -209,13 +218,13 @@ class Governor:
         self.due_ns = 0
 
     def begin(self, now_ns: int) -> list[SetDuty]:
-        """Return the duties that the performance profile requests. `now_ns`: when the run begins."""
+        """Return the duties that the performance profile requests. `now_ns`: time at which the run begins."""
         self._start_ns = self._last_ns = now_ns
         self.due_ns = now_ns + self._poll_ns
         return self._changed()
 
     def tick(self, now_ns: int, busy_ns: Mapping[str, int]) -> list[SetDuty]:
-        """Return the duties that change at `now_ns`. `busy_ns`: time that each unit has worked since the run began."""
+        """Return the duties that change at `now_ns`. `busy_ns`: busy time of each unit since the run began."""
         seconds = (now_ns - self._last_ns) / NS
         power = {unit: self._power_w(unit, busy_ns[unit] - self._busy_ns[unit], now_ns) for unit in UNITS}
         self._joules += seconds * (sum(power.values()) + self._profile.thermal.base_power_w.or_else(0.0))
@@ -228,18 +237,18 @@ class Governor:
 
     @property
     def is_prompt(self) -> bool:
-        """Whether the performance profile prefers a short wake-up to the power that awake cores take."""
+        """Whether the performance profile requests a short wake-up, at the price of the power of awake cores."""
         return self._performance_profile in PROMPT
 
     @property
     def power_w(self) -> float | None:
-        """Mean power of the whole device in watts, modelled from busy time; None before the first tick."""
+        """The mean power of the whole device in watts, modelled from busy time; None before the first tick."""
         seconds = (self._last_ns - self._start_ns) / NS
         return self._joules / seconds if seconds > 0 else None
 
     @property
     def temperatures_c(self) -> dict[str, float]:
-        """Modelled temperatures now: of the device's body (`device`) and of each unit's junction."""
+        """The present modelled temperatures of the device's body (`device`) and of each unit's junction."""
         junctions = {str(unit): celsius for unit, celsius in self._thermal_state.junction_c.items()}
         return {"device": self._thermal_state.device_c, **junctions}
 
@@ -272,9 +281,9 @@ class Governor:
         return CORNERS[self._throttle.corner_index(unit, self._requested[unit])]
 
     def _power_w(self, unit: UnitName, busy_ns: int, now_ns: int) -> float:
-        """Return the mean power of `unit` since the last tick, in watts. `busy_ns`: time that it worked since then.
+        """Return the mean power of `unit` since the last tick, in watts. `busy_ns`: its busy time since then.
 
-        A duty stands for a clock, so the busy share counts only the time in which the duty let the unit work.
+        A duty stands for a lower clock. Therefore the busy share relates to the time in which the duty let it work.
         """
         share = busy_ns / max(now_ns - self._last_ns, 1) * FULL_DUTY / self._duty[unit]
         return self._profile.units[unit].power_w(self._corner(unit), min(1.0, share))
@@ -309,8 +318,11 @@ MOST_SHOWN = 360  # moments in a report
 class Moment:
     """The state at one poll of the governor.
 
-    `device_c`, `junction_c`: temperatures of the device and of the hottest junction, degrees Celsius. `throttled`:
-    whether a unit is below the corner that the performance profile requests. `corners`: corner of each unit.
+    `t_s`: time since the start in seconds.
+    `device_c`, `junction_c`: temperatures of the device's body and of the hottest junction, in degrees Celsius.
+    `power_w`: power of the whole device in watts.
+    `throttled`: whether a unit is below its requested corner.
+    `corners`: corner of each unit.
     """
 
     t_s: float
@@ -323,7 +335,11 @@ class Moment:
 
 
 class Settled(Protocol):
-    """A settled state at constant corners. `frame_ms`: its frame time. `busy`: share of the time, by unit."""
+    """The settled state of a load at constant corners.
+
+    `frame_ms`: mean frame time.
+    `busy`: share of the time in which each unit works.
+    """
 
     @property
     def frame_ms(self) -> float: ...
@@ -335,13 +351,14 @@ class Settled(Protocol):
 def over_time(
     profile: Profile, plan: Plan, performance_profile: str, minutes: float, governor: str | None = None
 ) -> list[Moment]:
-    """Run the application from a cold start and return one moment per poll of the governor.
+    """Return the moments of the application from a cold start, one for each poll of the governor.
 
     `profile`: hardware profile of the chip.
     `plan`: application that runs on it.
-    `performance_profile`: its name, one of PERFORMANCE_PROFILES.
+    `performance_profile`: one of PERFORMANCE_PROFILES.
     `minutes`: virtual time, above 0 to MAX_MINUTES.
-    `governor`: name in GOVERNORS; None for the profile's own.
+    `governor`: name in GOVERNORS; None for the profile's governor.
+
     Raises BadInputError for an unknown name or a time out of range.
     """
     return warm_up(profile, lambda corners: steady(profile, plan, corners), performance_profile, minutes, governor)
@@ -354,9 +371,9 @@ def warm_up(
     minutes: float,
     governor: str | None = None,
 ) -> list[Moment]:
-    """Do the same as `over_time` for any load whose settled state `at` gives.
+    """Return the moments of any load from a cold start, as `over_time` does for an application.
 
-    `at`: returns the settled state at given corners; it is called once for each combination.
+    `at`: function that returns the load's settled state at given corners; it is called once for each combination.
     """
     name = governor or profile.thermal.governor
     if name not in GOVERNORS:
@@ -384,30 +401,30 @@ def warm_up(
 
 
 def unit_power_w(profile: Profile, now: Settled, corners: Corners) -> dict[UnitName, float]:
-    """Return the mean power of each unit in watts in the settled state `now`, with the units at `corners`."""
+    """Return the mean power of each unit in watts, in the settled state `now` at `corners`."""
     return {
         name: profile.units[name].power_w(corner, now.busy[name]) for name, corner in zip(UNITS, corners, strict=True)
     }
 
 
 def last_fifth(moments: Sequence[Moment]) -> Sequence[Moment]:
-    """Return the moments to which a run settles: the last fifth of them, at least one; empty without moments."""
+    """Return the last fifth of the moments, in which the run has settled; at least one if there is any."""
     return moments[-max(1, len(moments) // 5) :]
 
 
 def ends_of(moments: Sequence[Moment]) -> dict[str, float]:
-    """Return frames a second at the start, and those to which it settles: the mean of the last fifth of the time."""
+    """Return frames a second at the start, and in the settled state: from the mean frame time of the last fifth."""
     last = last_fifth(moments)
     return {"fps_start": 1e3 / moments[0].frame_ms, "fps_settled": 1e3 / (sum(m.frame_ms for m in last) / len(last))}
 
 
 def settled_corners(moments: Sequence[Moment]) -> Corners:
-    """Return the corners at which the units mostly are in the last fifth of the time."""
+    """Return the most frequent combination of corners in the last fifth of the time."""
     return Counter(moment.corners for moment in last_fifth(moments)).most_common(1)[0][0]
 
 
 def temperatures_of(moments: Sequence[Moment]) -> dict[str, float]:
-    """Return the degrees Celsius of the device and of its hottest junction; empty without moments."""
+    """Return temperatures of the device and of its hottest junction in degrees Celsius; empty without moments."""
     if not moments:
         return {}
     return {
@@ -418,7 +435,7 @@ def temperatures_of(moments: Sequence[Moment]) -> dict[str, float]:
 
 
 def caps_of(moments: Sequence[Moment]) -> dict[str, Any]:
-    """Return the share of the time in which a unit was lowered for heat, and the first second of it."""
+    """Return the share of the time in which a unit was throttled, and the first such time in seconds."""
     throttled_s = [m.t_s for m in moments if m.throttled]
     return {
         "throttled_share": len(throttled_s) / len(moments) if moments else 0.0,
@@ -427,7 +444,7 @@ def caps_of(moments: Sequence[Moment]) -> dict[str, Any]:
 
 
 def timeline_of(moments: Sequence[Moment]) -> list[dict[str, Any]]:
-    """Return the moments as plain data, thinned."""
+    """Return evenly spaced moments, about MOST_SHOWN at most, as JSON values."""
     return [_shown(m) for m in moments[:: max(1, len(moments) // MOST_SHOWN)]]
 
 
@@ -446,9 +463,11 @@ SUFFIXES = (".png", ".svg", ".pdf")
 
 
 def figure_for(path: Path, inches: tuple[float, float]) -> Any:
-    """Return an empty `matplotlib.figure.Figure`, `inches` wide and high, that can be drawn into the file.
+    """Return an empty `matplotlib.figure.Figure` for a file.
 
     `path`: path of the file; its ending is one of SUFFIXES.
+    `inches`: (width, height) of the figure.
+
     Raises MissingPartError without Matplotlib, BadInputError for another ending.
     """
     if path.suffix not in SUFFIXES:
@@ -463,10 +482,11 @@ def figure_for(path: Path, inches: tuple[float, float]) -> Any:
 def plot_over_time(runs: Mapping[str, Sequence[Moment]], limit_c: float, title: str, path: Path) -> None:
     """Draw frame rates and temperatures into a file.
 
-    `runs`: label of each curve -> its moments.
-    `limit_c`: temperature that is marked.
+    `runs`: moments of each curve, by its label.
+    `limit_c`: temperature that is marked, in degrees Celsius.
     `title`: title of the picture.
     `path`: path of the file; its ending is one of SUFFIXES.
+
     Raises MissingPartError without Matplotlib, BadInputError for another ending or a file that cannot be written.
     """
     figure = figure_for(path, (8, 6))

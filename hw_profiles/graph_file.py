@@ -1,8 +1,8 @@
 """Reads any ONNX graph for its operators and shapes: float, quantised, or without weights.
 
-The file may come from a stranger. Sizes are checked before anything is taken in, and weights are forgotten as soon as
-their shape is known. No other file is opened, because a graph keeps only the values of weights in other files.
-`image_network` turns a graph with one input, a picture, into the network of the application.
+The file may come from a stranger. Sizes are checked before memory is allocated, and the values of weights are dropped
+as soon as their shape is known. No other file is opened: a graph keeps only values of weights in other files.
+`image_network` turns a graph whose only input is a picture into the network of the application.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from trilane.unexpected_value import UnexpectedValue
 
 MAX_BYTES = 512 << 20
 MAX_NODES = 50_000
-#: Files that are remembered, none larger than so many bytes: a graph without weights, or with few.
+#: Number of checked graphs that are cached, and the largest file that is: a graph without weights, or with few.
 REMEMBERED, REMEMBERED_BYTES = 16, 1 << 20
-#: Before it, operators broadcast only where an attribute said so; a graph of that time has other shapes.
+#: In earlier operator sets, operators broadcast only if an attribute says so, which changes shapes.
 OLDEST_OPSET = 7
 #: Operators that have a tensor among their attributes.
 WITH_VALUES = frozenset(["Constant", "ConstantOfShape"])
 
-#: What a file says of its numbers: 8-bit weights and activations, floats, or nothing, as it has no weights.
+#: The number format of a file: 8-bit weights and activations, floats, or not said, because it has no weights.
 NumberFormat = Literal["w8a8", "float", "not said"]
 
 MOST_CHANNELS = 64
@@ -41,8 +41,10 @@ MOST_CHANNELS = 64
 class GraphFile(NamedTuple):
     """A checked graph.
 
-    `model`: the graph with a static shape for every tensor and without the values of weights. An earlier reading may
-    share it, so nobody changes it. `work`: work that it asks of a unit.
+    `model`: graph with a static shape for every tensor, and without the values of weights. Never change it, because
+    earlier results of `read_graph` may share it.
+    `numbers`: number format of its layers.
+    `work`: work of one frame.
     """
 
     path: Path
@@ -52,11 +54,13 @@ class GraphFile(NamedTuple):
 
 
 def read_graph(path: Path, input_shapes: Mapping[str, Shape] | None = None) -> GraphFile:
-    """Read the graph in a file, with static shapes.
+    """Return the checked graph in a file, with static shapes.
 
-    A small file of the same bytes as an earlier one is not checked again.
+    The result for a small file is cached by its bytes.
+
     `path`: path of an ONNX file.
-    `input_shapes`: shapes of inputs by name, which replace those of the file.
+    `input_shapes`: shapes of inputs by name, in place of the file's shapes.
+
     Raises BadInputError that says what is wrong and how to fix it.
     """
     data = _bytes(path)
@@ -70,7 +74,11 @@ def read_graph(path: Path, input_shapes: Mapping[str, Shape] | None = None) -> G
 def _checked(
     data: bytes, folder: Path, given: Sequence[tuple[str, Shape]]
 ) -> tuple[onnx.ModelProto, NumberFormat, Work]:
-    """Check the bytes of a file. `data`: bytes of a file in `folder`. `given`: shapes of inputs by name."""
+    """Return (graph, number format, work) of a file's bytes; raises UnexpectedValue.
+
+    `folder`: folder of the file.
+    `given`: shapes of inputs by name.
+    """
     model = _parse(data)
     _check_version(model)
     _check_names(model)
@@ -130,7 +138,7 @@ def _check_version(model: onnx.ModelProto) -> None:
 
 
 def _check_names(model: onnx.ModelProto) -> None:
-    """Refuse names that are no UTF-8, which protobuf returns as bytes."""
+    """Raise UnexpectedValue for a name that is no UTF-8, which protobuf returns as bytes."""
     graph = model.graph
     names = [entry.name for entry in (*graph.input, *graph.output, *graph.initializer)]
     for node in graph.node:
@@ -150,7 +158,7 @@ def _tensors(model: onnx.ModelProto) -> Iterator[TensorProto]:
 
 
 def _numbers(model: onnx.ModelProto) -> NumberFormat:
-    """Return the graph's number format: integers if its layers are integer ones or read dequantised activations."""
+    """Return the graph's number format: `w8a8` if layers have integer types or read dequantised activations."""
     graph, constants = model.graph, constant_tensors(model.graph)
     dequantised = {
         name
@@ -167,7 +175,7 @@ def _numbers(model: onnx.ModelProto) -> NumberFormat:
 
 
 def fed_inputs(graph: GraphFile) -> list[onnx.ValueInfoProto]:
-    """Return the inputs that a frame feeds: in a graph without weights, those that stand for no weight."""
+    """Return the inputs that a frame feeds: all inputs that do not stand for a weight."""
     weights = constant_tensors(graph.model.graph)
     return [value for value in graph.model.graph.input if value.name not in weights]
 
@@ -175,10 +183,12 @@ def fed_inputs(graph: GraphFile) -> list[onnx.ValueInfoProto]:
 def image_network(graph: GraphFile, layout: str) -> Network:
     """Return the graph as the application's network, with its work and the size of its picture.
 
-    Of the two possible orders of axes, the one with fewer channels is meant.
+    The smaller of the second and the last axis counts as channels.
+
     `graph`: graph of a file.
     `layout`: layout of the raster stage: `packed` or `split`.
-    Raises BadInputError unless the graph has one input, a picture.
+
+    Raises BadInputError if the graph has several inputs, or one that is no picture.
     """
     shapes = [tuple(dim.dim_value for dim in value.type.tensor_type.shape.dim) for value in fed_inputs(graph)]
     if len(shapes) != 1 or len(shapes[0]) != 4 or shapes[0][0] != 1 or min(shapes[0][1], shapes[0][3]) > MOST_CHANNELS:

@@ -1,13 +1,13 @@
-"""Gives every tensor of a graph from a stranger's file a static shape, once its data and connections are checked.
+"""Checks the tensors and connections of a graph from a stranger's file, and gives every tensor a static shape.
 
-A tensor's data must be as long as its shape claims. Only small data is kept (sizes, axes and the like, from which
-shapes follow), and data outside the file is never opened. Every tensor must be made once, before an operator reads it,
-and the operators must form no circle.
+A tensor's data must have the length that its shape states. Only small data is kept, such as sizes and axes, from which
+shapes are inferred. Data outside the file is never opened. Every tensor must be made exactly once, before an operator
+reads it, and the operators must form no circle.
 
-A shape is inferred, or the file states it where ONNX knows no rule. A shape that stays unknown is an error that names
-the first operator behind it. Exporters compute sizes and axes by chains of operators, for a flattening, a repeat or an
-attention, and ONNX's inference does not see through them. `fold` replaces such operators by their values. It checks the
-size of a value before it computes the value.
+A shape is inferred; for an operator that ONNX does not know, the file states it. A shape that stays unknown is an error
+that names the first operator whose result has it. Exporters compute sizes and axes by chains of operators, for a
+flattening, a repeat or an attention. ONNX's inference cannot follow them, so `fold` replaces such operators by their
+values. It checks the size of a value before it computes the value.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from trilane.hw_profiles.operators import CONVOLUTIONS, OF_SHAPES, Shape
 from trilane.unexpected_value import UnexpectedValue
 
 MAX_TENSOR_BYTES = 1 << 30
-#: Elements up to which a tensor keeps its data.
+#: Largest number of elements with which a tensor keeps its data.
 KEPT_ELEMENTS = 1024
 
 _BITS = {
@@ -50,12 +50,12 @@ _KINDS = {"sequence_type": "a sequence", "map_type": "a map", "optional_type": "
 
 
 def type_name(kind: int) -> str:
-    """Return the name of an element type, as ONNX writes it in small letters."""
+    """Return ONNX's name of an element type in small letters, such as `float16`."""
     return str(TensorProto.DataType.Name(kind)).lower() if kind in TensorProto.DataType.values() else f"type {kind}"
 
 
 def bytes_of(shape: tuple[int, ...], kind: int) -> int:
-    """Return bytes of a tensor. Raises UnexpectedValue when its elements are no numbers."""
+    """Return the size of a tensor in bytes. Raises UnexpectedValue if its elements are no numbers."""
     if kind not in _BITS:
         remedy = "leave the part of the graph that handles text to the program"
         raise UnexpectedValue(f"elements of type {type_name(kind)}", "numbers", remedy)
@@ -63,16 +63,16 @@ def bytes_of(shape: tuple[int, ...], kind: int) -> int:
 
 
 def is_ordinary(shape: tuple[int, ...], kind: int) -> bool:
-    """Return whether `check_size` would let a tensor pass: its elements are numbers and it is not too large."""
+    """Return whether a tensor passes `check_size`: its elements are numbers, and it is not too large."""
     return prod(shape) * _BITS.get(kind, 8 * MAX_TENSOR_BYTES + 1) <= 8 * MAX_TENSOR_BYTES
 
 
 def check_size(shape: tuple[int, ...], kind: int, what: str) -> None:
-    """Raise UnexpectedValue when a tensor is too large or its elements are no numbers.
+    """Raise UnexpectedValue if a tensor is too large or its elements are no numbers.
 
     `shape`: shape of the tensor.
-    `kind`: its ONNX element type.
-    `what`: what the message calls it.
+    `kind`: ONNX element type of the tensor.
+    `what`: name of the tensor in the message.
     """
     try:
         size = bytes_of(shape, kind)
@@ -85,11 +85,12 @@ def check_size(shape: tuple[int, ...], kind: int, what: str) -> None:
 
 
 def forget_data(tensor: TensorProto, folder: Path) -> None:
-    """Check a tensor of a file, and drop its data unless it is small.
+    """Check a tensor of a file, and drop its data if it has more than KEPT_ELEMENTS.
 
     `tensor`: tensor of the file; it is changed in place.
     `folder`: folder of the file.
-    Raises UnexpectedValue when the data is not as long as the shape claims, or is kept outside the folder.
+
+    Raises UnexpectedValue if the data has another length than the shape states, or is stored outside the folder.
     """
     what = f"tensor {tensor.name!r}"
     shape = tuple(tensor.dims)
@@ -119,7 +120,10 @@ def _check_length(tensor: TensorProto, claimed: int, what: str) -> None:
 
 
 def _entries(tensor: TensorProto, size: int) -> int:
-    """Return the numbers in the lists of a tensor of `size` bytes: half-bytes share one, complex numbers have two."""
+    """Return the number of list entries of a tensor of `size` bytes.
+
+    Two 4-bit elements share one entry, and a complex number has two.
+    """
     bits = _BITS[tensor.data_type]
     pairs = tensor.data_type in (TensorProto.COMPLEX64, TensorProto.COMPLEX128)
     return size if bits < 8 else prod(tensor.dims) * (2 if pairs else 1)
@@ -137,19 +141,19 @@ def _check_inside(tensor: TensorProto, folder: Path) -> None:
 
 
 def _forget(tensor: TensorProto) -> None:
-    """Leave only name, type and shape."""
+    """Drop everything of a tensor except name, type and shape."""
     bare = TensorProto(name=tensor.name, data_type=tensor.data_type, dims=tensor.dims)
     tensor.CopyFrom(bare)
 
 
 def called(node: onnx.NodeProto) -> str:
-    """Return what messages call an operator."""
+    """Return the name of an operator in messages."""
     kind = f"{node.domain}:{node.op_type}" if node.domain not in ("", "ai.onnx") else node.op_type
     return f"{kind} {node.name!r}" if node.name else f"{kind} that makes {next(iter(node.output), '')!r}"
 
 
 def check_structure(graph: onnx.GraphProto) -> None:
-    """Raise UnexpectedValue for operators that hold graphs, and for tensors that nobody makes or that several make."""
+    """Raise UnexpectedValue for operators with graphs inside, and for tensors that are not made exactly once."""
     _check_kinds(graph)
     made = Counter(_made(graph))
     twice = [name for name, times in made.items() if times > 1]
@@ -180,7 +184,7 @@ def _check_kinds(graph: onnx.GraphProto) -> None:
 
 
 def _made(graph: onnx.GraphProto) -> Iterator[str]:
-    """Return the names of all tensors, each as often as it is made. A weight may be declared as an input too."""
+    """Yield the name of a tensor each time that it is made; an input that declares a weight does not count."""
     weights = [tensor.name for tensor in graph.initializer]
     yield from weights
     yield from (value.name for value in graph.input if value.name not in set(weights))
@@ -188,9 +192,10 @@ def _made(graph: onnx.GraphProto) -> Iterator[str]:
 
 
 def in_order(graph: onnx.GraphProto) -> None:
-    """Sort the operators so that each comes after those that it reads from, and drop those that nobody needs.
+    """Sort the operators so that each comes after the operators that it reads, and drop operators without use.
 
-    `graph`: graph that is changed in place; operators that are in order stay where they are.
+    `graph`: graph that is changed in place; if its operators are in order, their order stays.
+
     Raises UnexpectedValue for a circle.
     """
     maker = {name: index for index, node in enumerate(graph.node) for name in node.output if name}
@@ -216,8 +221,8 @@ def in_order(graph: onnx.GraphProto) -> None:
 
 LONGEST_FOUND = 240
 SIZES_INSIDE = "save it with small tensors inside: onnx.save(..., size_threshold=1024)"
-#: Operators whose result has the shape of their first input, though ONNX does not infer it. They are looked at as
-#: another operator that says the same of shapes and types.
+#: Operators whose result has the shape of their first input, although ONNX does not infer it. For the inference they
+#: are replaced by an operator with the same rule for shapes and types.
 STAND_INS = {
     ("", "GroupNormalization"): "Identity",
     ("com.microsoft", "BiasGelu"): "Identity",
@@ -231,7 +236,7 @@ STAND_INS = {
 
 Values = dict[str, NDArray[np.generic]]
 
-#: Operators whose results are no larger than their inputs together, or than the product of two of them.
+#: Operators whose results are no larger than all their inputs together, or than the product of two inputs.
 _BOUNDED = frozenset(
     (
         *("Add", "Sub", "Mul", "Div", "Mod", "Min", "Max", "Neg", "Abs", "Floor", "Ceil", "Round", "Sqrt", "Pow"),
@@ -240,7 +245,7 @@ _BOUNDED = frozenset(
         *("ReduceProd", "ReduceSum", "ReduceMax", "ReduceMin"),
     )
 )
-#: What a damaged chain makes the evaluator raise.
+#: Exceptions that the evaluator raises for a damaged chain of operators.
 _FAILURES = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
 
 
@@ -248,8 +253,9 @@ def with_shapes(model: onnx.ModelProto, given: Mapping[str, Shape]) -> onnx.Mode
     """Return `model` with the shape of every tensor in its value_info.
 
     `model`: model of the graph; it is changed in place.
-    `given`: shapes of inputs by name, which replace those of the file.
-    Raises UnexpectedValue where a shape is unknown, contradictory or too large.
+    `given`: shapes of inputs by name, in place of the file's shapes.
+
+    Raises UnexpectedValue for a shape that is unknown, contradictory or too large.
     """
     weights = {tensor.name for tensor in model.graph.initializer}
     inputs = [value for value in model.graph.input if value.name not in weights]
@@ -284,7 +290,7 @@ def _known(
 
 
 def _give(graph: onnx.GraphProto, inputs: Sequence[onnx.ValueInfoProto], given: Mapping[str, Shape]) -> None:
-    """Set the shapes of inputs. The file's other shapes may no longer hold then, so they are forgotten."""
+    """Set the shapes of inputs, and drop the file's other shapes, which may then be wrong."""
     changed = [value for value in inputs if value.name in given]
     for value in changed:
         kind = value.type.tensor_type
@@ -310,7 +316,7 @@ def _check_input(value: onnx.ValueInfoProto) -> None:
 
 
 def _inferred(model: onnx.ModelProto) -> dict[str, onnx.ValueInfoProto]:
-    """Return the inferred value of each tensor, by name."""
+    """Return the type and shape that ONNX infers for each tensor, by name."""
     looked_at = model
     if any((node.domain, node.op_type) in STAND_INS for node in model.graph.node):
         looked_at = onnx.ModelProto()
@@ -335,7 +341,7 @@ def _replace(node: onnx.NodeProto, op_type: str) -> None:
 def _check_all(
     graph: onnx.GraphProto, inferred: Mapping[str, onnx.ValueInfoProto], shapes: Mapping[str, Shape]
 ) -> None:
-    """Check that every result has a shape. It may be empty only where it follows from constants."""
+    """Check that every result has a shape; only a result of constants may be empty."""
     constants = constant_tensors(graph)
     for node in graph.node:
         for name in node.output:
@@ -350,7 +356,7 @@ def _check_all(
 
 
 def _check_convolutions(graph: onnx.GraphProto, shapes: Mapping[str, Shape]) -> None:
-    """Check what ONNX does not: whether a weight's channels fit the input and the output of its convolution."""
+    """Check that a weight's channels fit the input and the output of its convolution, which ONNX does not check."""
     for node in graph.node:
         if node.op_type not in CONVOLUTIONS:
             continue
@@ -368,7 +374,8 @@ def _check_convolutions(graph: onnx.GraphProto, shapes: Mapping[str, Shape]) -> 
 def _channels_fit(transposed: bool, source: Shape, weight: Shape, result: Shape, groups: int) -> bool:
     """Return whether the channels of a convolution fit.
 
-    `weight`: (out, in, ...), or (in, out, ...) of a transposed one, by group.
+    `source`, `result`: shapes (batch, channels, ...) of its input and its output.
+    `weight`: shape (out, in / groups, ...); for a transposed convolution (in, out / groups, ...).
     """
     if not (groups > 0 and len(source) == len(weight) == len(result) > 2):
         return False
@@ -391,7 +398,7 @@ def _unknown(
 
 
 def _keeps_sizes_outside(graph: onnx.GraphProto) -> bool:
-    """Return whether another file has the data of a small tensor of integers, such as sizes and axes."""
+    """Return whether a small tensor of integers, such as sizes and axes, has its data in another file."""
     return any(
         tensor.data_type == TensorProto.INT64 and 0 < prod(tensor.dims) <= KEPT_ELEMENTS
         for tensor in graph.initializer
@@ -404,7 +411,7 @@ def _has_schema(node: onnx.NodeProto) -> bool:
 
 
 def _sizes(value: onnx.ValueInfoProto, least: int = 1) -> Shape | None:
-    """Return the static shape of a tensor whose sizes are at least `least`; None when it has none."""
+    """Return the static shape of a tensor; None if it has none, or if a size is below `least`."""
     kind = value.type.tensor_type
     if not kind.HasField("shape"):
         return None
@@ -423,7 +430,7 @@ def _shown(value: onnx.ValueInfoProto) -> str:
 
 
 def fold(model: onnx.ModelProto, shapes: Mapping[str, tuple[int, ...]]) -> bool:
-    """Replace operators that only compute with known numbers by their values. Return whether there were any.
+    """Replace operators whose inputs are all known by their values; return whether there were such operators.
 
     `model`: model of the graph; it is changed in place.
     `shapes`: shape of each tensor that has a known one, by name.
@@ -453,7 +460,7 @@ def _keep(known: Values, names: Sequence[str], values: Sequence[NDArray[np.gener
 
 
 def _read(tensor: onnx.TensorProto) -> list[NDArray[np.generic]]:
-    """Return the values of a small tensor; nothing when they were forgotten or are kept outside the file."""
+    """Return the values of a small tensor as one array; an empty list if they were dropped or are in another file."""
     try:
         return [numpy_helper.to_array(tensor)]
     except _FAILURES:
@@ -466,7 +473,7 @@ def _results(
     shapes: Mapping[str, tuple[int, ...]],
     opsets: Sequence[onnx.OperatorSetIdProto],
 ) -> list[NDArray[np.generic]]:
-    """Return the values that `node` makes; nothing where it must not be evaluated."""
+    """Return the results of `node`; an empty list if an input is unknown, or a result may be too large."""
     if node.domain not in ("", "ai.onnx"):
         return []
     if node.op_type in OF_SHAPES and node.input and node.input[0] in shapes:
@@ -494,7 +501,7 @@ def _of_shape(node: onnx.NodeProto, shape: tuple[int, ...]) -> list[NDArray[np.g
 
 
 def _is_small(node: onnx.NodeProto, values: Sequence[NDArray[np.generic]]) -> bool:
-    """Return whether the result of `node` for `values` is bounded, and small."""
+    """Return whether the result of `node` has a known bound on its size, and is small. `values`: its inputs."""
     if node.op_type == "Constant":
         return all(prod(a.t.dims) <= KEPT_ELEMENTS for a in node.attribute if a.name == "value")
     if node.op_type == "Range" and len(values) == 3 and all(value.size == 1 for value in values):

@@ -1,8 +1,8 @@
-"""This machine: its cores, the units on them, and the numbers of the profile `host` that depend on it.
+"""This machine: its cores, the units on them, and the numbers of the profile `host` that depend on this machine.
 
-The cores are those that this process may use; a quota of the control group lowers their number. Units share cores only
-when there are too few. Nothing is measured here: every number of `host_tables` says in its `source` what it was
-computed from, or on which other machine it was measured. `host_model.py` replaces some of them by measurements of this
+Only cores that this process may use count; a quota of the control group lowers their number. Units share cores only if
+there are too few cores. Nothing is measured here: the `source` of every number in `host_tables` says how it was
+computed, or on which other machine it was measured. `host_model.py` replaces some numbers by measurements of this
 machine, and `trilane.scheduler.placement` places units by measured times.
 """
 
@@ -23,7 +23,7 @@ from trilane.units import NS_PER_MS, UNITS
 
 CORES = "UNIT=LIST, such as dsp=0,1 or dsp=2-5"
 
-#: CPU flag -> INT8 and FP32 multiply-accumulates per cycle and core. The first flag that the machine has is used.
+#: (INT8, FP32) multiply-accumulates per cycle and core, by CPU flag. The first flag that the machine has is used.
 RATES = {
     "avx512_vnni": (128, 32),
     "avx_vnni": (64, 16),
@@ -34,8 +34,8 @@ RATES = {
 FALLBACK_GHZ = 2.5
 ZEN_5 = "ResNet18 of width 64 at 512x512 on four Zen 5 cores"
 ZEN_3 = "ResNet18 of width 64 at 512x512 on four Zen 3 cores, docs/networks.md"
-#: CPU flag -> how many times faster each runtime is than ONNX Runtime in FP32, kind of these numbers, their source.
-#: `cuda` and `qnn` are missing: they run on a device of their own, and neither was measured beside the others.
+#: (speed of each runtime relative to ONNX Runtime in FP32, kind of these numbers, their source), by CPU flag. `cuda`
+#: and `qnn` are missing, because they run on a device of their own and were not measured together with the others.
 RUNTIMES: dict[str, tuple[dict[str, float], str, str]] = {
     "avx512_vnni": ({"openvino": 3.7, "ort": 2.2}, "measured", ZEN_5),
     "avx_vnni": ({"openvino": 3.7, "ort": 2.2}, "assumed", f"like {ZEN_5}"),
@@ -44,24 +44,24 @@ RUNTIMES: dict[str, tuple[dict[str, float], str, str]] = {
     "": ({"openvino": 1.0, "ort": 1.0}, "assumed", "nothing is known of such a CPU"),
 }
 
-SHOWN = 8  # placements, beside the one that was taken
+SHOWN = 8  # number of alternative placements in a report
 
 
 def usable_cores() -> tuple[int, ...]:
-    """Return the usable cores' numbers, ascending: those of the affinity mask, within the control group's quota."""
+    """Return the numbers of the usable cores, ascending: the affinity mask, cut to the control group's quota."""
     cores = machine.here.cores()
     quota = cgroup_quota()
     return cores if quota is None else cores[: max(1, math.ceil(quota))]
 
 
 def cgroup_quota() -> float | None:
-    """Return how many CPUs' time the control group allows; None when it sets no limit."""
+    """Return the number of CPUs whose time the control group allows; None if it sets no limit."""
     root = machine.here.sys / "fs/cgroup"
     try:
         limit, period = (root / "cpu.max").read_text().split()
     except (OSError, ValueError):
         try:
-            # Version 1 of control groups; it states -1 where there is no limit.
+            # Version 1 of control groups; it states -1 for no limit.
             limit = (root / "cpu" / "cpu.cfs_quota_us").read_text().strip()
             period = (root / "cpu" / "cpu.cfs_period_us").read_text().strip()
         except OSError:
@@ -74,9 +74,10 @@ def cgroup_quota() -> float | None:
 
 
 def split_cores(cores: tuple[int, ...]) -> dict[str, tuple[int, ...]]:
-    """Return the cores of each unit: one for the CPU (and the scheduler), one for the GPU, the rest for the DSP.
+    """Return the cores of each unit: one for the CPU (and the scheduler), one for the GPU, all others for the DSP.
 
-    With eight cores or more, the GPU has a quarter of them. With two, CPU and GPU share one; with one, all share it.
+    With eight cores or more, the GPU has a quarter of them. With two cores, CPU and GPU share one. With one core, all
+    units share it.
     """
     if len(cores) == 1:
         return {"cpu": cores, "gpu": cores, "dsp": cores}
@@ -87,7 +88,7 @@ def split_cores(cores: tuple[int, ...]) -> dict[str, tuple[int, ...]]:
 
 
 def rule_placement(cores: tuple[int, ...], asked: Mapping[str, tuple[int, ...]] | None = None) -> Placement:
-    """Return `split_cores` with a thread for each core of a unit. `asked`: cores that the user chose for units."""
+    """Return the placement by `split_cores`, with a thread for each core. `asked`: chosen cores of some units."""
     split = {**split_cores(cores), **(asked or {})}
     return {unit: Place(own, len(own)) for unit, own in split.items()}
 
@@ -95,7 +96,7 @@ def rule_placement(cores: tuple[int, ...], asked: Mapping[str, tuple[int, ...]] 
 def host_units(cores: tuple[int, ...] | None = None) -> dict[str, UnitSettings]:
     """Return the settings of the three units by `split_cores`.
 
-    `cores`: cores of this machine; None for all usable ones.
+    `cores`: numbers of cores; None for all usable cores.
     """
     return settings_of(rule_placement(cores or usable_cores()))
 
@@ -145,13 +146,13 @@ def _listed(text: str, listed: str) -> tuple[int, ...]:
 
 
 def host_cores(numbers: Sequence[int]) -> tuple[CpuCore, ...]:
-    """Return the kernel's facts about the cores with these numbers: which are siblings, and how fast each type is.
+    """Return the cores with these numbers, with their siblings and speeds from the kernel.
 
-    Without such facts, a core counts as a physical one that is as fast as the others.
+    If the kernel does not say so, a core has no siblings and is as fast as the other cores.
     """
     root = machine.here.sys / "devices/system/cpu"
     siblings = {number: _number(root / f"cpu{number}/topology/thread_siblings_list", number) for number in numbers}
-    # cpu_capacity is 1024 for the fastest type of core; kernels without it have the highest clock
+    # cpu_capacity is 1024 for the fastest type of core; kernels without this file have the highest clock
     for file in ("cpu_capacity", "cpufreq/cpuinfo_max_freq"):
         speed = {number: _number(root / f"cpu{number}/{file}", 0) for number in numbers}
         if len(set(speed.values())) > 1 and min(speed.values()) > 0:
@@ -164,7 +165,7 @@ def host_cores(numbers: Sequence[int]) -> tuple[CpuCore, ...]:
 
 
 def _number(file: Path, otherwise: int) -> int:
-    """Return the first number in a file; `otherwise` without one."""
+    """Return the number at the begin of a file; `otherwise` if there is none."""
     try:
         found = re.match(r"\d+", file.read_text())
     except OSError:
@@ -173,7 +174,7 @@ def _number(file: Path, otherwise: int) -> int:
 
 
 def host_tables() -> dict[str, Any]:
-    """Return tables that are laid over those of `host.toml`: title, peak rates of the units, speeds of the runtimes."""
+    """Return the tables that replace parts of `host.toml`: title, peak rates of the units, speeds of the runtimes."""
     cores = len(usable_cores())
     ghz = machine.here.clock_ghz()
     known_ghz = ghz if ghz > 0 else FALLBACK_GHZ
@@ -198,7 +199,7 @@ def host_tables() -> dict[str, Any]:
 
 
 def network_threads() -> int:
-    """Return the number of cores whose rates the DSP unit of the profile `host` has."""
+    """Return the number of threads of the DSP unit in the profile `host`; its peak rates are those of as many cores."""
     return max(1, len(usable_cores()) - 2)
 
 
@@ -219,9 +220,9 @@ def _unit(cores: int, ghz: float, flag: str, clock: str) -> dict[str, Any]:
 
 
 def fastest_runtime(profile: Profile, installed: Sequence[str]) -> tuple[str, str]:
-    """Choose the fastest of the `installed` runtimes by the profile's DSP unit. Return its name and the reason.
+    """Return (name of the fastest of the `installed` runtimes by the profile's DSP unit, reason for the choice).
 
-    Raises MissingPartError when the profile has a number for none of them.
+    Raises MissingPartError if the profile has the speed of none of them.
     """
     known = profile.units["dsp"].runtimes
     speeds = {name: known[name] for name in installed if name in known}
@@ -257,7 +258,12 @@ def placement_of(rows: Mapping[str, Any]) -> Placement:
 
 
 def predictions(best: Ranked, rule: Ranked, found: Sequence[Ranked]) -> dict[str, Any]:
-    """Return a placement's computed keys in a report: frame times in ms of the best, the rule's and the next best."""
+    """Return the predictions of a placement as keys of a report.
+
+    `best`: placement that was chosen.
+    `rule`: placement that suits any run.
+    `found`: all placements, the shortest frame time first.
+    """
     others = [each for each in found if each.placement != best.placement][:SHOWN]
     return {
         "predicted_ms": best.frame_ns / NS_PER_MS,

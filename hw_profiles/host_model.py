@@ -1,10 +1,10 @@
-"""The profile `host` in a prediction: its units placed on cores, and measured times in place of assumed ones.
+"""The profile `host` in a prediction: its units placed on cores, and measured times in place of assumed times.
 
-Units are placed as in a run, but by modelled times. Virtual time knows units with cores of their own, and units that
-take turns on one core. Therefore no unit floats, and no unit with several cores shares one, unless the user asks for
-such cores. A network's measured time, divided by its modelled time, says how much slower its unit is than assumed, for
-each number of threads. Another shape of its tensor takes a time in proportion to its work. What is not measured has no
-interval.
+Units are placed as in a run, but by modelled times. Virtual time can only simulate units with cores of their own, and
+units that take turns on one core. Therefore no unit floats, and no unit with several cores shares a core; only the user
+can choose such cores. A network's measured time, divided by its modelled time, says how much slower its unit is than
+assumed, for each number of threads. If its tensor has another shape, the time changes in proportion to the work. A
+prediction without measurements has no interval.
 """
 
 from __future__ import annotations
@@ -41,10 +41,11 @@ NETWORK: UnitName = "dsp"
 SEQUENTIAL = "sequential"
 PEAKS = ("peak_int8_tmac_s", "peak_fp16_tmac_s", "peak_fp32_tmac_s")
 
-#: Relative error of a prediction from measured times, besides their scatter: the deviation of predicted from measured
-#: frame times, each network left out in turn, as `trilane bench predict` measured it (docs/decisions/this-machine.md).
+#: Relative error of a prediction from measured times, in addition to their scatter. It is the deviation of predicted
+#: from measured frame times, with each network left out in turn, from `trilane bench predict`
+#: (docs/decisions/this-machine.md).
 MODEL_ERROR = 0.108
-#: Keys of intervals of times, and of numbers that stand for one.
+#: Keys of a prediction that are intervals of times, or errors from which intervals follow.
 OF_TIMES = frozenset(
     [
         "low",
@@ -64,10 +65,11 @@ UNMEASURED = "of this machine are cores, clock and instructions; its speeds are 
 
 
 class Placed(NamedTuple):
-    """How the units were placed.
+    """The placement of the units.
 
-    `best`: placement that was taken. `rule`: placement by the rule for any run. `found`: all placements, the least
-    frame time first.
+    `best`: placement that was chosen.
+    `rule`: placement that suits any run.
+    `found`: all placements, the shortest frame time first.
     """
 
     best: Ranked
@@ -76,7 +78,7 @@ class Placed(NamedTuple):
 
     @property
     def facts(self) -> dict[str, Any]:
-        """Key `placement` of a prediction."""
+        """The key `placement` of a prediction."""
         return {"units": unit_rows(self.best.placement), **predictions(self.best, self.rule, self.found)}
 
 
@@ -87,7 +89,9 @@ def place_units(
     cores: Sequence[CpuCore],
     asked: Mapping[str, tuple[int, ...]] | None = None,
 ) -> Placed:
-    """Place the units of `profile` for `plan`, at these `corners`, on `cores`, by the times that the model predicts.
+    """Return the placement of the units of `profile` on `cores`, by the times that the model predicts for `plan`.
+
+    `corners`: corner of each unit.
 
     `asked`: cores that the user chose for units, all of them among `cores`.
     """
@@ -101,7 +105,7 @@ def place_units(
 
 
 def on_cores(profile: Profile, placement: Placement) -> Profile:
-    """Return `profile` with its units on the cores of `placement`; the network's unit has the rates of its threads."""
+    """Return `profile` with its units on the cores of `placement`, and the network's unit with that many threads."""
     units = {}
     for name, unit in profile.units.items():
         place = placement[name]
@@ -119,11 +123,13 @@ def _can_be_simulated(placement: Placement) -> bool:
 
 
 def _times(profile: Profile, plan: Plan, corners: Corners, cores: int, given: Placement) -> Times:
-    """Return the model's times of a frame, by unit and number of threads.
+    """Return the modelled work of a frame, by unit and number of threads.
 
-    The network's unit may have as many threads as there are cores.
+    The network's unit may have any number of threads up to the number of cores. If its times are measured, only the
+    measured numbers of threads count.
+
     `cores`: number of cores.
-    `given`: places that the user chose for units, whose threads are known too.
+    `given`: places that the user chose for units; their numbers of threads are added.
     """
     rule = rule_placement(tuple(range(cores)))
     counts = {unit: {1, rule[unit].threads} for unit in UNITS}
@@ -143,10 +149,7 @@ def _times(profile: Profile, plan: Plan, corners: Corners, cores: int, given: Pl
 
 
 def with_threads(unit: Unit, threads: int) -> Unit:
-    """Return the network's unit with `threads` threads. Each thread has the peak rates of a core.
-
-    A measured unit is slower by the factor that was measured with that number of threads.
-    """
+    """Return the network's unit with `threads` threads; its peak rates are in proportion to them."""
     scale = threads / unit.threads
     rates: dict[str, Quantity] = {name: getattr(unit, name) for name in PEAKS}
     scaled = {name: rate.model_copy(update={"value": rate.or_else(0.0) * scale}) for name, rate in rates.items()}
@@ -154,9 +157,9 @@ def with_threads(unit: Unit, threads: int) -> Unit:
 
 
 def error_of(took: Sequence[float]) -> float:
-    """Return the relative error of figures that follow from measured times, from their scatter and `MODEL_ERROR`.
+    """Return the relative error of a prediction from measured times: their scatter, combined with MODEL_ERROR.
 
-    `took`: measured times, each above 0; a single one has no scatter.
+    `took`: measured times, each above 0; a single time has no scatter.
     """
     scatter = stdev(map(math.log, took)) if len(took) > 1 else 0.0
     return math.hypot(scatter, MODEL_ERROR)
@@ -165,8 +168,10 @@ def error_of(took: Sequence[float]) -> float:
 def with_network(profile: Profile, work: Work, ms: Mapping[int, float], error: float, said: str) -> Profile:
     """Return `profile` with the measured times of a network on the unit for networks.
 
-    `work`: work of the network. `ms`: measured milliseconds, by threads. `error`: result of `error_of`. `said`:
-    sentence that tells how it was measured.
+    `work`: work of the network.
+    `ms`: measured time of a job in ms, by number of threads.
+    `error`: relative error of these times, from `error_of`.
+    `said`: sentence that says how the times were measured.
     """
     fraction = _measured(0.0, "the stages were measured beside each other")
     memory = profile.memory.model_copy(update={"application_use_fraction": fraction})
@@ -183,11 +188,14 @@ def with_network(profile: Profile, work: Work, ms: Mapping[int, float], error: f
 def with_stages(
     profile: Profile, network: Network, took_ns: Mapping[str, Sequence[int]], said: str, avatars: int = 1
 ) -> Profile:
-    """Return `profile` with the measured times of the other stages; the medians over the frames count.
+    """Return `profile` with measured times of the stages other than the network: the medians over the frames.
 
-    `network`: network whose tensor the frames had. `took_ns`: nanoseconds of each stage, frame by frame. `avatars`:
-    number of avatars that were posed. The scheduler works on the cores of the first and the last stage, so half of its
-    time for a frame is added to each.
+    The scheduler works on the cores of the first and the last stage, so half of its time for a frame is added to each.
+
+    `network`: network whose tensor the frames had.
+    `took_ns`: for each stage, its time for each frame in ns.
+    `said`: sentence that says how the times were measured.
+    `avatars`: number of avatars that were posed.
     """
     ms = {name: median(each) / NS_PER_MS for name, each in took_ns.items()}
     scheduler_ms = len(ms) * SCHEDULER_NS / NS_PER_MS / 2
@@ -210,7 +218,7 @@ def _measured(value: float, source: str) -> Quantity:
 
 
 def with_known_intervals(profile: Profile, unit: UnitName, answer: dict[str, Any]) -> dict[str, Any]:
-    """Return `answer`, a prediction for `unit` of this machine, with null for the intervals of unmeasured figures."""
+    """Return `answer`, a prediction for `unit` of this machine, with None for the intervals of unmeasured figures."""
     if profile.units[unit].measured is not None:
         return _without(answer, OF_POWER)
     known = _without(answer, OF_POWER | OF_TIMES)
@@ -220,7 +228,7 @@ def with_known_intervals(profile: Profile, unit: UnitName, answer: dict[str, Any
 
 
 def _without(found: dict[str, Any], keys: frozenset[str]) -> dict[str, Any]:
-    """Return `found` with None under `keys`, in the mappings in it too."""
+    """Return `found` with None under `keys`, also in the mappings inside it."""
     return {
         key: None if key in keys else _without(value, keys) if isinstance(value, dict) else value
         for key, value in found.items()

@@ -1,10 +1,11 @@
-"""The time of one network by itself on one unit: each operator, what bounds it, and how far to trust the sum.
+"""Predicts the time of one network by itself on one unit: the time and bound of each operator, and the interval.
 
     time = price(profile, work, "dsp", corners_of(profile, "burst"))
     time.total_ms, time.operators[0].bound, interval(profile, work, time).why
 
 `job_ms` is the part that belongs to no operator: waking the unit, conversion of the input. An operator that the
-runtime folds into another one is not listed. `predict_network` adds power, rates and minutes; other units are idle.
+runtime folds into another one is not listed. `predict_network` adds power, rates and the course over minutes; other
+units are idle.
 """
 
 from __future__ import annotations
@@ -48,15 +49,15 @@ from trilane.hw_profiles.unit_times import (
 )
 from trilane.units import BURST, HOST, UNITS, UnitName
 
-#: Relative error from which a term is named that alone makes the time so uncertain.
+#: Least relative error of the time with which the term that causes it is named.
 NAMED_FROM = 0.05
 
-#: Reason that is given where the time is only a lower bound.
+#: Reason for a time that is only a lower bound.
 INSIDE = "it holds a compiled network, and only its ends can be seen: price the network that it was made from"
 
 
 class OperatorTime(NamedTuple):
-    """Time of one operator. `op_type`: its ONNX type. `bound`: what the largest part of its time is spent on."""
+    """The time of one operator. `op_type`: its ONNX type. `bound`: resource that takes the largest part of its time."""
 
     name: str
     op_type: str
@@ -66,7 +67,11 @@ class OperatorTime(NamedTuple):
 
 @dataclass(frozen=True)
 class NetworkTime:
-    """Time of one job. `job_ms`: the part that belongs to no operator. `operators`: in the order of the file."""
+    """The time of one job.
+
+    `job_ms`: part that belongs to no operator.
+    `operators`: times of the operators, in the order of the file.
+    """
 
     unit: UnitName
     job_ms: float
@@ -78,7 +83,7 @@ class NetworkTime:
 
 
 class Interval(NamedTuple):
-    """Interval that holds the time with a probability of 80 %, in milliseconds, and `why` in plain sentences."""
+    """An interval that contains the time with a probability of 80 %. `why`: reasons for its width, as sentences."""
 
     low_ms: float
     high_ms: float
@@ -86,7 +91,7 @@ class Interval(NamedTuple):
 
 
 def spread_of(around: Interval) -> float:
-    """Return the standard deviation of the time's logarithm."""
+    """Return the standard deviation of the time's logarithm that an interval stands for."""
     return math.log(around.high_ms / around.low_ms) / 2 / NORMAL_80
 
 
@@ -167,14 +172,14 @@ def interval(profile: Profile, work: Work, time: NetworkTime) -> Interval:
 
 
 def _likeness(job: JobTime) -> str:
-    """Say in words how unlike the network is to the nearest one of the fit."""
+    """Return a sentence about the distance of the network from the nearest network of the fit."""
     if not job.like:
         return "its profile names no network that its numbers were fitted to"
     return f"of those {job.like} is most like it; {job.unlike:.0%} of the time goes into other work"
 
 
 def _ill_known(work: Work, unit: Unit) -> list[tuple[str, float, float]]:
-    """Return the terms that make the time uncertain: name, share of the time, relative spread of their cost."""
+    """Return (term, share of the time, relative spread of its cost) of each term that makes the time uncertain."""
     assert unit.engine is not None
     factors = unit.engine.factors
     shares = engine_time(work.layers, numbers_of(unit.engine)).shares
@@ -183,7 +188,11 @@ def _ill_known(work: Work, unit: Unit) -> list[tuple[str, float, float]]:
 
 
 class _Running(NamedTuple):
-    """A network that runs without pause. `frame_ms`: time between two results. `busy`: share of the time, by unit."""
+    """A network that runs all the time.
+
+    `frame_ms`: time between two results.
+    `busy`: share of the time in which each unit works.
+    """
 
     frame_ms: float
     busy: Mapping[str, float]
@@ -193,9 +202,9 @@ def in_precision(profile: Profile, unit: UnitName, numbers: NumberFormat, asked:
     """Return `profile` with the unit computing in the network's precision.
 
     `unit`: unit that runs the network.
-    `numbers`: what the file says of its numbers. A network of floats runs in FP16 on a unit for integers. Any other one
-    runs in the unit's own precision, because a file without weights says nothing.
-    `asked`: int8, fp16 or fp32 instead.
+    `numbers`: number format of the file. A float network runs in FP16 on a unit for integers. Any other network runs in
+    the unit's own precision, because a file without weights does not say its precision.
+    `asked`: int8, fp16 or fp32, which replaces this choice; None keeps it.
     """
     own = profile.units[unit].precision
     precision = asked or ("fp16" if numbers == "float" and own == "int8" else own)
@@ -204,10 +213,11 @@ def in_precision(profile: Profile, unit: UnitName, numbers: NumberFormat, asked:
 
 
 def under_runtime(profile: Profile, unit: UnitName, runtime: EngineRuntime | None) -> Profile:
-    """Return `profile` with the unit's tensor engine under `runtime`; None keeps the unit's own.
+    """Return `profile` with the unit's tensor engine under `runtime`; None keeps the runtime of the profile.
 
     `unit`: unit that runs the network, in the network's precision.
-    Raises BadInputError where the profile has no numbers for it.
+
+    Raises BadInputError if the profile has no tensor engine for this unit, precision and runtime.
     """
     if runtime is None:
         return profile
@@ -228,21 +238,23 @@ def under_runtime(profile: Profile, unit: UnitName, runtime: EngineRuntime | Non
 
 
 class Computes(NamedTuple):
-    """How a network computes: what its file says of its numbers, and the precision and runtime that were asked for."""
+    """How a network computes: number format of its file, and requested precision and runtime; None: not requested."""
 
     numbers: NumberFormat = "not said"
     precision: str | None = None
     runtime: EngineRuntime | None = None
 
     def on(self, profile: Profile, unit: UnitName) -> Profile:
-        """Return `profile` with `unit` as it runs this network; every prediction prices a network on such a chip.
+        """Return `profile` with `unit` in the precision and under the runtime of this network.
+
+        Every prediction of a network uses such a profile.
 
         Raises BadInputError as `under_runtime`.
         """
         return under_runtime(in_precision(profile, unit, self.numbers, self.precision), unit, self.runtime)
 
 
-#: A network whose file says nothing of its numbers, and of which nothing else was asked.
+#: The default: the number format is not known, and no precision or runtime is requested.
 AS_IT_SAYS: Final = Computes()
 
 
@@ -255,16 +267,17 @@ def predict_network(
     governor: str | None = None,
     wanted: Wanted = NOTHING,
 ) -> dict[str, Any]:
-    """Return everything about one network on one unit, as plain data.
+    """Return the prediction of one network on one unit, as JSON values.
 
     `profile`: hardware profile of the chip, with the unit in the network's precision.
     `graph`: graph of the network, from a file.
-    `unit`: unit that runs it.
-    `performance_profile`: its name; published latencies are taken to be under `burst`.
-    `minutes`: virtual time from a cold start, at the wanted rate or as fast as it can; 0 for none.
-    `governor`: name in GOVERNORS; None for the profile's own.
-    `wanted`: rate to judge, and limit of power. Raises BadInputError for an unknown name, a time out of range, and
-    operators that cannot be counted.
+    `unit`: unit that runs the network.
+    `performance_profile`: its name; published latencies are assumed to be under `burst`.
+    `minutes`: virtual time from a cold start, at the wanted rate or else without pause; 0: no course over minutes.
+    `governor`: name in GOVERNORS; None for the profile's governor.
+    `wanted`: rate to judge, and limit of power.
+
+    Raises BadInputError for an unknown name, a time out of range, and operators that cannot be counted.
     """
     work, corners = graph.work, corners_of(profile, performance_profile)
     time = price(profile, work, unit, corners)
@@ -322,9 +335,9 @@ def _times(time: NetworkTime, around: Interval) -> dict[str, Any]:
 
 
 def operator_rows(work: Work, time: NetworkTime) -> list[dict[str, Any]]:
-    """Return the operators in the order of the file, with what bounds each and its share of the network's time.
+    """Return a row for each operator in the order of the file, with its bound and its share of the network's time.
 
-    An operator that the unit's runtime folds into another one is missing, as it is in `time`.
+    An operator that the unit's runtime folds into another one has no row.
     """
     counts = {operator.name: (operator.macs, operator.moved) for operator in work.operators}
     total_ms = time.total_ms
@@ -343,7 +356,7 @@ def operator_rows(work: Work, time: NetworkTime) -> list[dict[str, Any]]:
 
 
 def without_rule(work: Work) -> list[dict[str, Any]]:
-    """Return the types of operators without a rule: how many there are, and their share of all moved elements."""
+    """Return a row for each type of operators without a rule: their number, and their share of all moved elements."""
     moved = Counter[str]()
     for operator in work.operators:
         if not operator.ruled:

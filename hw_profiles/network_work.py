@@ -1,6 +1,6 @@
 """The work of a network: its ONNX operators, each with its multiply-accumulates and the elements that it moves.
 
-Nothing here knows any hardware; `unit_times.py` turns the counts into time.
+This file knows no hardware; `unit_times.py` turns the counts into times.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from trilane.hw_profiles.operators import (
     product_of,
 )
 
-#: Name of a weight in a graph without weights, where each is an input.
+#: Name of a weight in a graph without weights, in which each weight is an input.
 WEIGHT_INPUT = re.compile(r"w\d+")
-#: First inputs of a batch normalisation, up to the learned ones; mean and variance become part of these.
+#: Number of first inputs of a batch normalisation that count: data, scale and shift, which take in mean and variance.
 SCALE_AND_SHIFT = 3
 #: Least dimensions of a tensor that is convolved: pictures, channels, one side.
 CONVOLVED = 3
@@ -52,10 +52,15 @@ CONVOLVED = 3
 class Operator(NamedTuple):
     """One operator of a network and its counts.
 
-    `op_type`: its ONNX type. `kind`: one of CLASSES. `macs`: multiply-accumulates. `moved`: activation elements read
-    and written. `weights`: elements of its weights. `c_in`, `c_out`: input and output channels per group, 0 for an
-    operator without products. `out`: elements of the result. `live`: elements that later operators still need after it.
-    `ruled`: whether `operators.py` knows the operator; an unknown one counts as the movement of its elements.
+    `op_type`: its ONNX type.
+    `kind`: one of CLASSES.
+    `macs`: multiply-accumulates.
+    `moved`: activation elements that it reads and writes.
+    `weights`: elements of its weights.
+    `c_in`, `c_out`: input and output channels per group; 0 for an operator without products.
+    `out`: elements of its result.
+    `live`: elements that exist after it because later operators read them.
+    `ruled`: whether `operators.py` knows the operator; an unknown operator counts only the movement of its elements.
     """
 
     name: str
@@ -73,10 +78,12 @@ class Operator(NamedTuple):
 
 @dataclass(frozen=True)
 class Work:
-    """The operators of a network, in order, and the sizes of its inputs and outputs in elements.
+    """The work of a network.
 
-    `input_tensors`: number of tensors that its picture comes in, joined by the first operator; 1 for inputs that are
-    not parts of one picture. `layers`: the same work as a tensor engine runs it.
+    `operators`: operators in order.
+    `input_elements`, `output_elements`: elements of its inputs and of its outputs.
+    `input_tensors`: number of tensors that together are its picture, joined by the first operator; 1 for other inputs.
+    `layers`: the same work as layers of a tensor engine.
     """
 
     operators: tuple[Operator, ...]
@@ -87,28 +94,28 @@ class Work:
 
     @cached_property
     def table(self) -> NDArray[np.float64]:
-        """Counts (operators, 5): macs, moved, c_in, c_out, out."""
+        """The counts of the operators (operators, 5): macs, moved, c_in, c_out, out."""
         rows = [(o.macs, o.moved, o.c_in, o.c_out, o.out) for o in self.operators]
         return np.array(rows, dtype=np.float64).reshape(-1, 5)
 
     @cached_property
     def classes(self) -> NDArray[np.int64]:
-        """Index into `CLASSES` of each operator (operators,)."""
+        """The index into `CLASSES` of each operator (operators,)."""
         return np.array([CLASSES.index(o.kind) for o in self.operators], dtype=np.int64)
 
     @cached_property
     def macs(self) -> int:
-        """Multiply-accumulates of the whole network."""
+        """The multiply-accumulates of the whole network."""
         return sum(o.macs for o in self.operators)
 
     @cached_property
     def weights(self) -> int:
-        """Weight elements of the whole network."""
+        """The weight elements of the whole network."""
         return sum(o.weights for o in self.operators)
 
 
 def one_after_the_other(works: Sequence[Work]) -> Work:
-    """Return the work of a job that runs several networks, each on an input of its own; at least one."""
+    """Return the work of a job that runs one or more networks, each on its own input."""
     if len(works) == 1:
         return works[0]
     parts = [work.layers.named(f"{number}/") for number, work in enumerate(works)]
@@ -129,8 +136,10 @@ def one_after_the_other(works: Sequence[Work]) -> Work:
 class Network(NamedTuple):
     """A network with the input that the raster stage draws for it.
 
-    `facts`: what reports call it. `height`, `width`, `channels`: size of its input. `layout`: `packed` (one tensor) or
-    `split` (one tensor per raster pass).
+    `facts`: keys that identify it in reports.
+    `height`, `width`, `channels`: size of its input.
+    `layout`: `packed` (one tensor) or `split` (one tensor per raster pass).
+    `work`: work of one frame.
     """
 
     facts: Mapping[str, str]
@@ -146,10 +155,12 @@ class Network(NamedTuple):
 
 
 def count_work(model: Any) -> Work:
-    """Count the work of `model`, an `onnx.ModelProto` with static shapes, NCHW, in floats or quantised with QDQ.
+    """Return the work of `model`, an `onnx.ModelProto` with static shapes, NCHW, in floats or quantised with QDQ.
 
-    What follows from constants and shapes alone costs nothing. An operator without a rule counts as the movement of its
-    elements, with `ruled` False. Raises BadInputError for a tensor without a static shape.
+    An operator whose results depend only on constants and shapes costs nothing. An operator without a rule counts only
+    the movement of its elements, and has `ruled` False.
+
+    Raises BadInputError for a tensor without a static shape.
     """
     shapes = _shapes(model)
     graph = model.graph
@@ -173,7 +184,7 @@ def count_work(model: Any) -> Work:
 
 
 def _picture_tensors(graph: Any, inputs: list[str]) -> int:
-    """Return the number of tensors of a picture: all inputs, where nothing but one concatenation reads them."""
+    """Return the number of tensors of a picture: all inputs, if only one concatenation reads them; otherwise 1."""
     given, readers = set(inputs), []
     for node in graph.node:
         if given.intersection(node.input):
@@ -187,16 +198,16 @@ def _picture_tensors(graph: Any, inputs: list[str]) -> int:
 def graph_facts(model: Any) -> dict[str, Any]:
     """Return the facts of a network for reports; raises as `count_work` does.
 
-    Keys: `parameters`: number of parameters of the layers, as in the file; `gmac`: products of one pass, in 1e9.
+    `parameters` is the number of weight elements, and `gmac` the number of multiply-accumulates in 1e9.
     """
     work = count_work(model)
     return {"parameters": work.weights, "gmac": work.macs / 1e9}
 
 
 def constant_tensors(graph: Any) -> set[str]:
-    """Return the names of the tensors that do not depend on the network's input: weights, and what follows from them.
+    """Return the names of the tensors that do not depend on the network's input: weights, and results of weights.
 
-    In a graph without weights these are the inputs named `w<n>`, and every input of a layer after its first.
+    In a graph without weights, inputs named `w<n>` count as weights, and every input of a layer after its first.
     """
     names = {i.name for i in graph.initializer} | _weight_inputs(graph) | {""}  # "" is an input that is left out
     for node in graph.node:
@@ -238,7 +249,7 @@ def _size(shapes: Shapes, name: str) -> int:
 
 
 def _lone_normalisations(graph: Any) -> set[str]:
-    """Return the results of batch normalisations that no product before them can absorb."""
+    """Return the names of the results of batch normalisations that cannot be folded into a product before them."""
     maker = {name: node.op_type for node in graph.node for name in node.output}
     reads = Counter(name for node in graph.node for name in node.input)
     return {
@@ -258,7 +269,7 @@ def _costs_nothing(node: Any, constants: set[str]) -> bool:
 
 
 def _live_counts(graph: Any, shapes: Shapes, constants: set[str]) -> list[int]:
-    """Return, after each node, the elements of all results so far that later nodes or the caller still need."""
+    """Return for each node the elements of all results so far that later nodes read or that are outputs."""
     last_use = {name: index for index, node in enumerate(graph.node) for name in node.input if name not in constants}
     last_use |= {output.name: len(graph.node) for output in graph.output}
     freed: dict[int, int] = {}
@@ -275,9 +286,10 @@ def _live_counts(graph: Any, shapes: Shapes, constants: set[str]) -> list[int]:
 
 
 def _operator(node: Any, shapes: Shapes, constants: set[str], read: set[str]) -> Operator:
-    """Return counts of `node`.
+    """Return the counts of `node`.
 
-    `constants`: tensors that do not depend on the input. `read`: tensors that somebody reads.
+    `constants`: names of the tensors that do not depend on the input.
+    `read`: names of the tensors that a node reads, and of the outputs.
     """
     known = has_rule(node.op_type, node.domain)
     weighted = node.op_type in WEIGHTED and known
@@ -298,7 +310,7 @@ def _operator(node: Any, shapes: Shapes, constants: set[str], read: set[str]) ->
 
 
 def _convolution(node: Any, shapes: Shapes, plain: Operator) -> Operator:
-    """Return counts of a convolution. `plain`: counts of its movement and its weights."""
+    """Return the counts of a convolution. `plain`: its counts without products."""
     groups = next((a.i for a in node.attribute if a.name == "group"), 1)
     weight, source, result = (
         shapes[name] for name in (node.input[CONVOLUTIONS[node.op_type]], node.input[0], node.output[0])

@@ -1,9 +1,9 @@
-"""ONNX operators: the kind of work of each, the products of some, and the layers that a tensor engine makes of a graph.
+"""ONNX operators: the class of each, the counts of products, and the layers that a tensor engine makes from a graph.
 
-An operator that no table names is priced by the elements that it moves, and reports name it. The count of a product
-follows from shapes and attributes alone; `network_work.py` counts convolutions.
+The time of an operator that no table names follows from the elements that it moves, and reports name it. The count of a
+product follows only from shapes and attributes; `network_work.py` counts convolutions.
 
-A term is a kind of work with a price of its own (`TERMS`); nothing here knows a chip. Channels are rounded up to the
+A term is a kind of work with its own cost (`TERMS`); this file knows no chip. Channels are rounded up to the
 blocks in which the Hexagon keeps them: a convolution's inputs to 16, its outputs to 32, all other activations to 8.
 The runtime folds a ReLU and a clip into the layer before them, a batch normalisation into the convolution before it,
 and a sum of two tensors into the convolution that makes one of them. A permutation between channels first and
@@ -27,18 +27,18 @@ TRAFFIC = ("normalisation", "resize", "elementwise", "permute")
 CLASSES = ARITHMETIC + TRAFFIC
 
 #: Operators that cost nothing: a runtime folds them into the convolution before them, or they only rename a tensor. A
-#: batch normalisation that stands behind no convolution does cost something.
+#: batch normalisation that follows no convolution has a cost.
 FOLDED = frozenset(
     ("Relu", "Clip", "Sigmoid", "BatchNormalization", "QuantizeLinear", "DequantizeLinear", "Identity")
 ) | frozenset(("Reshape", "Flatten", "Squeeze", "Unsqueeze", "Constant", "Dropout"))
-#: Operators whose result is known once the shapes are: a runtime folds them with all that follows from them alone.
+#: Operators whose result depends only on shapes; a runtime folds them, and all operators that depend only on them.
 OF_SHAPES = frozenset(["Shape", "Size"])
-#: Convolutions, and other products of two tensors. Each -> where its second factor is among its inputs.
+#: Index of the second factor among the inputs, for convolutions and for other products of two tensors.
 CONVOLUTIONS = {"Conv": 1, "ConvTranspose": 1, "ConvInteger": 1, "DeformConv": 1, "FusedConv": 1, "QLinearConv": 3}
 PRODUCTS = {"Gemm": 1, "MatMul": 1, "MatMulInteger": 1, "QLinearMatMul": 3, "FusedMatMul": 1, "Einsum": 1}
-#: Recurrent layers: their inputs 1 and 2 are weights, with each of which every step's vector is multiplied.
+#: Recurrent layers. Every step's vector is multiplied by their inputs 1 and 2, which are weights.
 RECURRENT = frozenset(["LSTM", "GRU", "RNN"])
-#: Normalisations that read their input twice: once for its mean and variance and once to apply them.
+#: Normalisations that read their input twice: for its mean and variance, and to apply them.
 STATISTICS = frozenset(
     (
         *("InstanceNormalization", "GroupNormalization", "LayerNormalization", "MeanVarianceNormalization"),
@@ -87,20 +87,20 @@ _BY_CLASS = {
         *("QLinearAdd", "QLinearMul", "QLinearSigmoid", "QLinearLeakyRelu", "QLinearSoftmax"),
     ),
 }
-#: ONNX operator -> its class, for all but products.
+#: Class of each ONNX operator that is no product.
 KIND_OF = {operator: kind for kind, operators in _BY_CLASS.items() for operator in operators}
-#: Operators whose constant inputs are weights. The others' say where and how much: axes, sizes, indices.
+#: Operators whose constant inputs are weights. Constant inputs of other operators are axes, sizes and indices.
 WEIGHTED = frozenset(
     [*CONVOLUTIONS, *PRODUCTS, *RECURRENT, *STATISTICS, *_BY_CLASS["elementwise"], "BatchNormalization", "Gather"]
 )
-#: Permutations between channels first and channels last. They cost nothing: the units work with channels last, and
-#: these operators are in the file only because its order is the other one.
+#: Permutations between channels first and channels last. They cost nothing: the units always work with channels last,
+#: and a file has these operators only because it has channels first.
 LAYOUT_CHANGES = ((0, 3, 1, 2), (0, 2, 3, 1))
-#: Where operators are defined whose names mean what the tables say: ONNX itself and ONNX Runtime.
+#: Domains whose operators the tables contain: ONNX itself and ONNX Runtime.
 DOMAINS = ("", "ai.onnx", "com.microsoft")
-#: Operators that hold a network which was compiled for a chip: what it computes is not in the file.
+#: Operators that contain a network compiled for a chip; the file does not say what it computes.
 COMPILED = frozenset(["EPContext"])
-#: What an operator without a rule is priced as: it reads its inputs and writes its results.
+#: Class of an operator without a rule: it reads its inputs and writes its results.
 UNKNOWN = "elementwise"
 
 _KNOWN = frozenset([*FOLDED, *OF_SHAPES, *CONVOLUTIONS, *PRODUCTS, *RECURRENT, *KIND_OF])
@@ -114,9 +114,11 @@ def has_rule(op_type: str, domain: str = "") -> bool:
 
 
 class Product(NamedTuple):
-    """Counts of a product.
+    """The counts of a product of tensors.
 
-    `macs`: multiply-accumulates. `c_in`: how many of them each result sums. `c_out`: how many results share a factor.
+    `macs`: multiply-accumulates.
+    `c_in`: number of products that each element of the result sums.
+    `c_out`: number of elements of the result that use the same element of the first factor.
     """
 
     macs: int
@@ -125,7 +127,7 @@ class Product(NamedTuple):
 
 
 def product_of(node: Any, shapes: list[Shape], out: Shape) -> Product | None:
-    """Return what `node` multiplies; None where its shapes do not tell.
+    """Return the counts of the product that `node` computes; None if its shapes do not say.
 
     `node`: operator of PRODUCTS or RECURRENT.
     `shapes`: shape of each input.
@@ -146,9 +148,9 @@ def product_of(node: Any, shapes: list[Shape], out: Shape) -> Product | None:
 
 
 def _recurrent(shapes: list[Shape]) -> Product:
-    """Count every step of every sequence times all weights.
+    """Return the counts of a recurrent layer: every step of every sequence is multiplied by all weights.
 
-    Shapes: X (steps, sequences, size), W and R (directions, gates, size).
+    `shapes`: X (steps, sequences, size), W and R (directions, gates, size).
     """
     steps, weights, recurrence = shapes[0], shapes[1], shapes[2]
     macs = prod(steps[:2]) * (prod(weights) + prod(recurrence))
@@ -156,9 +158,9 @@ def _recurrent(shapes: list[Shape]) -> Product:
 
 
 def _einsum(node: Any, shapes: list[Shape]) -> Product | None:
-    """Count one product for every combination of all indices.
+    """Return the counts of an Einsum: one product for every combination of all indices.
 
-    An equation with an ellipsis is not looked into.
+    Return None for an equation with an ellipsis, or one that does not fit the shapes.
     """
     equation = next((a.s.decode() for a in node.attribute if a.name == "equation"), "").replace(" ", "")
     sources, _, result = equation.partition("->")
@@ -183,7 +185,8 @@ def _einsum(node: Any, shapes: list[Shape]) -> Product | None:
 RateName = Literal["arithmetic", "activation", "spill", "weight", "operator", "job"]
 RATES: tuple[RateName, ...] = ("arithmetic", "activation", "spill", "weight", "operator", "job")
 
-#: Each term -> the rate that its amount is divided by. Amounts are products for the first, elements for the next three.
+#: The rate by which the amount of each term is divided. Amounts of `arithmetic` are products. Amounts of `activation`,
+#: `spill` and `weight` are elements, and amounts of `operator` and `job` are counts.
 TERMS: dict[str, RateName] = {
     "convolution": "arithmetic",
     "grouped": "arithmetic",
@@ -226,16 +229,16 @@ INDEX = {name: index for index, name in enumerate(NAMES)}
 RENAMES = frozenset(
     ("Identity", "Reshape", "Flatten", "Squeeze", "Unsqueeze", "Dropout", "Cast", "QuantizeLinear", "DequantizeLinear")
 )
-#: Activations that disappear in the layer before them.
+#: Activations that a runtime folds into the layer before them.
 FOLDED_ACTIVATIONS = frozenset(["Relu", "Clip"])
-#: Layers that take up such an activation.
+#: Layers into which such an activation is folded.
 NORMALISATIONS = ("BatchNormalization", "InstanceNormalization", "GroupNormalization", "LayerNormalization")
 TAKES = frozenset(
     ("Conv", "ConvTranspose", "Gemm", "MatMul", "Add", "Mul", "Concat", "MaxPool", "Resize", *NORMALISATIONS)
 )
 PLAIN_PRODUCTS = frozenset(["Conv", "ConvTranspose", "Gemm", "MatMul"])
 WITH_PRODUCTS = frozenset([*CONVOLUTIONS, *PRODUCTS, *RECURRENT])
-#: Operators of integers, or with others joined to them -> the operator of floats that does the same work.
+#: The float operator that does the same work, for integer operators and for operators fused with others.
 PLAIN = {
     **{"QLinearConv": "Conv", "ConvInteger": "Conv", "FusedConv": "Conv", "DeformConv": "Conv"},
     **{"QLinearMatMul": "MatMul", "MatMulInteger": "MatMul", "FusedMatMul": "MatMul"},
@@ -259,14 +262,17 @@ _BY_TERM = {
 }
 TERM_OF = {operator: term for term, operators in _BY_TERM.items() for operator in operators}
 INPUT_BLOCK, OUTPUT_BLOCK, ACTIVATION_BLOCK = 16, 32, 8
-#: A convolution of at most so many channels reads a picture.
+#: Most input channels of a convolution that reads a picture.
 PICTURE_CHANNELS = 4
 
 
 class EngineLayer(NamedTuple):
-    """One layer. `amounts`: amount of each term. `reads`, `writes`: names of tensors that are not weights.
+    """One layer of a tensor engine.
 
-    `more`: further results that other layers need, such as those of a split.
+    `amounts`: amount of each term.
+    `reads`: names of the tensors that it reads, without weights.
+    `writes`: name of its result.
+    `more`: further results that other layers read, such as the parts of a split.
     """
 
     name: str
@@ -278,15 +284,16 @@ class EngineLayer(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """Type of the operator of floats that does the same work."""
+        """The type of the float operator that does the same work."""
         return PLAIN.get(self.op_type, self.op_type)
 
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """The layers of a network in order. An object equals only itself.
+    """The layers of a network, in order. An object equals only itself.
 
-    `sizes`: elements of each tensor. `input`, `output`: elements of the network's input and output.
+    `sizes`: elements of each tensor, by name.
+    `input`, `output`: elements of the network's inputs and of its outputs.
     """
 
     layers: tuple[EngineLayer, ...]
@@ -296,7 +303,7 @@ class Layers:
 
     @cached_property
     def table(self) -> NDArray[np.float64]:
-        """Amounts (layers, terms)."""
+        """The amount of each term in each layer (layers, terms)."""
         table = np.zeros((len(self.layers), len(NAMES)))
         for row, layer in zip(table, self.layers, strict=True):
             for term, amount in layer.amounts.items():
@@ -304,7 +311,7 @@ class Layers:
         return table
 
     def since(self, name: str, crossing: int) -> Layers:
-        """Return the layers from the one called `name` on. `crossing`: elements that the layers before it hand over."""
+        """Return the layers from the layer `name` on. `crossing`: elements that they read from the layers before it."""
         first = next((i for i, layer in enumerate(self.layers) if layer.name == name), len(self.layers))
         return Layers(self.layers[first:], self.sizes, crossing, self.output)
 
@@ -332,7 +339,7 @@ Shapes = Mapping[str, Shape]
 
 
 class _Graph:
-    """A graph without renaming operators: original names of tensors, their readers, and inputs apart from weights."""
+    """A graph without operators that only rename a tensor. `reads`: number of readers of each tensor."""
 
     def __init__(self, graph: Any, shapes: Shapes, constants: set[str]) -> None:
         self.shapes, self.constants = shapes, constants
@@ -345,7 +352,7 @@ class _Graph:
         self._ends = {self.name_of(output.name) for output in graph.output}
 
     def rename(self, name: str, original: str) -> None:
-        """Let `name` mean `original` from now on."""
+        """Treat the tensor `name` as the tensor `original` from now on."""
         self._renamed[name] = original
 
     def name_of(self, name: str) -> str:
@@ -359,16 +366,13 @@ class _Graph:
         return tuple(self.name_of(name) for name in node.input if name and name not in self.constants)
 
     def more(self, node: Any) -> tuple[str, ...]:
-        """Return the results of `node` after the first that somebody needs."""
+        """Return the results of `node`, except the first, that are read or are outputs of the graph."""
         others = (name for name in node.output if name and name != first_result(node))
         return tuple(name for name in others if self.reads[name] or name in self._ends)
 
 
 def first_result(node: Any) -> str:
-    """Return the first result that `node` makes.
-
-    A recurrent layer may leave out the first of its results.
-    """
+    """Return the name of the first result that `node` makes; a recurrent layer may leave out its first result."""
     name: str = next(name for name in node.output if name)
     return name
 
@@ -379,7 +383,7 @@ def _kind(node: Any) -> str:
 
 
 def _renames(node: Any) -> bool:
-    """Return whether `node` moves nothing."""
+    """Return whether `node` only renames its input, and moves no data."""
     kind = _kind(node)
     return kind in RENAMES or (kind == "Transpose" and any(tuple(a.ints) in LAYOUT_CHANGES for a in node.attribute))
 
@@ -424,7 +428,7 @@ def _folds(before: EngineLayer, names: _Graph) -> bool:
 
 
 def _takes_up(before: EngineLayer, names: _Graph) -> bool:
-    """Return whether a batch normalisation behind `before` becomes part of its weights."""
+    """Return whether a batch normalisation after the layer `before` becomes part of that layer's weights."""
     return before.kind in PLAIN_PRODUCTS and names.reads[before.writes] == 1
 
 
@@ -454,7 +458,7 @@ def _layer(node: Any, names: _Graph, kind: str, reads: tuple[str, ...]) -> Engin
 
 
 def _movement(node: Any, kind: str, moved: int, names: _Graph) -> Iterator[tuple[str, float]]:
-    """Return the term of a layer without products. `kind`: its type. `moved`: elements that it reads and writes."""
+    """Yield (term, amount) of a layer without products. `kind`: its type. `moved`: elements read and written."""
     if kind == "Resize":
         mode = next((a.s for a in node.attribute if a.name == "mode"), b"nearest")
         yield "nearest" if mode == b"nearest" else "bilinear", moved
@@ -466,7 +470,7 @@ def _movement(node: Any, kind: str, moved: int, names: _Graph) -> Iterator[tuple
 
 
 def _padded(shape: tuple[int, ...], block: int) -> int:
-    """Return elements of a tensor with its channels, the second axis, rounded up to whole blocks."""
+    """Return the number of elements of a tensor whose channels, the second axis, are rounded up to whole blocks."""
     if len(shape) != 4:
         return prod(shape)
     return shape[0] * _up(shape[1], block) * shape[2] * shape[3]
@@ -477,7 +481,7 @@ def _up(count: int, block: int) -> int:
 
 
 def _products(node: Any, shapes: Shapes) -> Iterator[tuple[str, float]]:
-    """Return products, and what is moved for them; nothing for an operator that multiplies no tensors."""
+    """Yield (term, amount) of an operator's products and of the elements moved for them; nothing without products."""
     if node.op_type not in WITH_PRODUCTS:
         return
     source, out = shapes[node.input[0]], shapes[first_result(node)]
@@ -493,12 +497,17 @@ def _products(node: Any, shapes: Shapes) -> Iterator[tuple[str, float]]:
 
 
 def _padding(count: int, block: int) -> float:
-    """Return the number of channels rounded up to whole blocks, over the number of channels."""
+    """Return the number of channels rounded up to whole blocks, divided by the number of channels."""
     return _up(count, block) / count
 
 
 def _convolution(node: Any, source: Shape, weight: Shape, out: Shape, moved: int) -> Iterator[tuple[str, float]]:
-    """Return the terms of a convolution. `moved`: elements that it reads and writes."""
+    """Yield (term, amount) of a convolution.
+
+    `source`, `out`: shapes (batch, channels, ...) of its input and its output.
+    `weight`: shape of its weight.
+    `moved`: elements that it reads and writes.
+    """
     attributes = {a.name: a for a in node.attribute}
     groups = attributes["group"].i if "group" in attributes else 1
     yield "moved_depthwise" if groups == source[1] > 1 else "moved", moved
@@ -517,7 +526,11 @@ def _convolution(node: Any, source: Shape, weight: Shape, out: Shape, moved: int
 
 
 def _grouped(places: int, c_in: int, c_out: int, groups: int, stride: int) -> Iterator[tuple[str, float]]:
-    """Return a convolution in groups. `places`: output positions times the kernel's. `c_in`, `c_out`: of all groups."""
+    """Yield (term, amount) of a convolution in groups.
+
+    `places`: number of output positions times number of kernel positions.
+    `c_in`, `c_out`: input and output channels of all groups together.
+    """
     if c_in > groups:
         yield "grouped", places * _up(c_in // groups, INPUT_BLOCK) * _up(c_out, OUTPUT_BLOCK)
         return

@@ -1,12 +1,12 @@
-"""What a pipeline file does on a chip: a time for each stage, then one run of the scheduler in virtual time.
+"""Predicts a pipeline file on a chip: a time for each stage, then a run of the scheduler in virtual time.
 
 The time of a stage comes from the file, else from a measurement on this machine, else from its network and the hardware
-of its unit. Two kinds of uncertainty are kept apart. Jitter is what differs from frame to frame; the simulated run has
-it. Ignorance is the error of the chip's model, or of measured times; it is the same for all frames, and makes the
-intervals. Like the interval of a network by itself, each holds the true value with a probability of 80 %.
+of its unit. There are two kinds of uncertainty. Jitter differs from frame to frame, and is part of the simulated run.
+Ignorance is the error of the chip's model, or of measured times; it is the same for all frames, and gives the
+intervals. Each interval contains the true value with a probability of 80 %.
 
-Rule: all draws follow from the seed, the stage's name and the frame, so that two variants of a file meet the same
-random numbers.
+Rule: all random numbers follow from the seed, the stage's name and the frame. Therefore two variants of a file get the
+same random numbers.
 """
 
 from __future__ import annotations
@@ -43,21 +43,21 @@ from trilane.scheduler.virtual import Simulation, simulate
 from trilane.transport.slots import edge_rule
 from trilane.units import HOST, NS_PER_MS, UNITS, UnitName
 
-#: Frames that the runs at the ends of the interval show, about.
+#: Approximate number of frames that the runs at the ends of the interval present.
 SIMULATED_FRAMES: Final = 1000
-#: Frames of a run with an always ready source, about; and at most, because nothing holds back a stage of no time before
-#: a `latest` input.
+#: Approximate number of frames of a run whose source is always ready.
 FED_FRAMES: Final = 2000
+#: Largest number of frames of such a run: nothing delays a stage without time that only `latest` inputs read.
 MOST_FED: Final = 2 * FED_FRAMES
-EVEN: Final = (840, 60)  # multiples of all numbers to 8, and to 6
-BLOCK: Final = 4096  # frames whose times are drawn at once
-#: No job hangs in virtual time, however long the file says that it takes.
+EVEN: Final = (840, 60)  # least common multiples of the numbers up to 8, and up to 6
+BLOCK: Final = 4096  # number of frames whose times are drawn at once
+#: In virtual time no job hangs, however long it takes.
 NEVER_HANGS_NS: Final = 1 << 60
-#: Which time of a network counts: the expected one, or an end of its 80 % interval.
+#: Which time of a stage is used: the expected time, or an end of its 80 % interval.
 Ends = Literal["expected", "low", "high"]
 ENDS: Final[tuple[Ends, ...]] = ("expected", "low", "high")
 
-#: (name of a stage, its graph, its unit of hardware) -> the chip that computes as this network does.
+#: (name of a stage, its graph, its unit of hardware) -> the chip in the precision and under the runtime of the network.
 ChipFor = Callable[[str, GraphFile, UnitName], Profile]
 
 
@@ -65,10 +65,12 @@ ChipFor = Callable[[str, GraphFile, UnitName], Profile]
 class StagePrice:
     """The time of a job of a stage.
 
-    `source`: where it comes from. `low_ms`, `high_ms`: 80 % interval of the mean, the mean itself for times that the
-    file gives; None where nobody knows the error. `why`: reasons for the interval's width, or for its absence.
-    `is_modelled`: whether it follows from the network and the chip alone. `is_measured`: whether it is from a run on
-    this machine.
+    `source`: source of the time, in words.
+    `low_ms`, `high_ms`: 80 % interval of the mean. For a time that the file states, both are the mean. None if the
+    error is not known.
+    `why`: reasons for the interval's width, or for its absence.
+    `is_modelled`: whether the time follows only from the network and the chip.
+    `is_measured`: whether the time comes from a run on this machine.
     """
 
     time: StageTime
@@ -85,7 +87,7 @@ class StagePrice:
 
 
 def given_price(file: PipelineFile, name: str) -> StagePrice | None:
-    """Return the price that the file itself states for stage `name`; None where it states none."""
+    """Return the time that the file states for stage `name`; None if it states none."""
     stage = file.stages[name]
     time = stage.own_time
     if time is None:
@@ -95,7 +97,7 @@ def given_price(file: PipelineFile, name: str) -> StagePrice | None:
 
 
 def network_price(chip: Profile, graph: GraphFile, unit: UnitName, corners: Corners) -> StagePrice:
-    """Return the price of a network on `unit` of `chip`, which computes in the network's precision."""
+    """Return the time of a network on `unit` of `chip`, which computes in the network's precision."""
     time = price(chip, graph.work, unit, corners)
     around = interval(chip, graph.work, time)
     source = f"{chip.name}, {unit} in {chip.units[unit].precision}"
@@ -106,10 +108,11 @@ def network_price(chip: Profile, graph: GraphFile, unit: UnitName, corners: Corn
 
 
 class Measured(NamedTuple):
-    """Times of stages in a run of the file on this machine, for the chip that is asked for.
+    """Times of stages that a run of the file on this machine measured.
 
-    `times`: by the stage's name. `run`: folder of the run. `chip`: name of the chip, HOST for this machine; "" where
-    nobody can give a run.
+    `times`: time of a job by the stage's name.
+    `run`: folder of the run.
+    `chip`: name of the predicted chip, HOST for this machine; "" if the command takes no measured run.
     """
 
     times: Mapping[str, StageTime]
@@ -121,9 +124,9 @@ NOTHING_MEASURED: Final = Measured({}, "", "")
 
 
 def measured_price(file: PipelineFile, name: str, measured: Measured) -> StagePrice | None:
-    """Return the price of a stage from its time in a run on this machine.
+    """Return the time of a stage from a run on this machine; None if it was not measured, or has no scale.
 
-    On a chip, the stage's `scale` multiplies the time. None stands for a stage without a time or without a scale.
+    For another chip, the stage's `scale` multiplies the time.
     """
     factor = 1.0 if measured.chip == HOST else file.stages[name].scale.get(measured.chip)
     if name not in measured.times or factor is None:
@@ -135,7 +138,7 @@ def measured_price(file: PipelineFile, name: str, measured: Measured) -> StagePr
 
 
 def stages_without_time(file: PipelineFile, measured: Measured = NOTHING_MEASURED) -> list[str]:
-    """Return the names of the stages whose time nobody knows: no network, not measured, and none in the file."""
+    """Return the names of the stages without a known time: no network, no measured time, and none in the file."""
     return [
         name
         for name, stage in file.stages.items()
@@ -152,11 +155,13 @@ def prices_of(
     corners_of_chip: Callable[[Profile], Corners],
     measured: Measured = NOTHING_MEASURED,
 ) -> dict[str, StagePrice]:
-    """Return the price of every stage: as the file states it, as measured, or from its network.
+    """Return the time of every stage: from the file, from a measured run, or from its network.
 
-    Raises BadInputError naming the stages without one.
+    `graphs`: graphs of the networks, by the stage's name.
+    `chip_for`: function that returns the chip in the precision of a network.
+    `corners_of_chip`: function that returns the corners of a chip's units.
 
-    `graphs`: graphs of the networks, by the stage's name. `corners_of_chip`: corners of a chip's units.
+    Raises BadInputError naming the stages without a time.
     """
     if unknown := stages_without_time(file, measured):
         raise _without_a_time(file, unknown, measured)
@@ -174,7 +179,7 @@ def prices_of(
 
 
 def _without_a_time(file: PipelineFile, names: Sequence[str], measured: Measured) -> BadInputError:
-    """Return the error for stages without a time: it is about the first, and names the others."""
+    """Return the error for stages without a time; its place is the first stage, and it names the others."""
     first = names[0]
     found = f"{file.stages[first].named_kind} without a time"
     if names[1:]:
@@ -193,7 +198,7 @@ def _without_a_time(file: PipelineFile, names: Sequence[str], measured: Measured
 
 
 def factors_at(prices: Mapping[str, StagePrice], end: Ends) -> dict[str, float]:
-    """Return, for each stage, the time at an end of its interval divided by the expected time."""
+    """Return for each stage its time at an end of its interval, divided by its expected time."""
     found = {}
     for name, each in prices.items():
         at = {"expected": None, "low": each.low_ms, "high": each.high_ms}[end]
@@ -209,7 +214,10 @@ def bound_of(file: PipelineFile, prices: Mapping[str, StagePrice]) -> tuple[Grap
 
 
 class Drawn:
-    """The time of each job in ns, as a function for the virtual clock. `factors`: factor on each stage's time."""
+    """A function for the virtual clock that returns the time of each job in ns.
+
+    `factors`: factor on each stage's time; 1 for a stage that is missing.
+    """
 
     def __init__(self, prices: Mapping[str, StagePrice], seed: int, factors: Mapping[str, float] | None = None) -> None:
         self._prices, self._seed, self._factors = prices, seed, factors or {}
@@ -233,7 +241,7 @@ class Drawn:
 
 
 def _draw_ms(time: StageTime, rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw the times of a block of frames, shape (BLOCK,), in ms."""
+    """Return random times of a block of frames in ms (BLOCK,)."""
     if time.samples:
         return rng.choice(np.array(time.samples), BLOCK)
     if time.exponential is not None:
@@ -247,7 +255,7 @@ def predict_file(
 ) -> dict[str, Any]:
     """Return the prediction, with the keys of report.json.
 
-    `frames`: frames of the simulated run; 0: as the file says, or 1000.
+    `frames`: number of frames of the simulated run; 0: the file's number, or 1000 if it has none.
     """
     graph, bound = bound_of(file, prices)
     settings = settings_of(file, frames, seed, hang_ns=NEVER_HANGS_NS)
@@ -277,7 +285,7 @@ def predict_file(
 
 
 def _without_intervals(answer: dict[str, Any]) -> dict[str, Any]:
-    """Return the prediction with null for its intervals, as the error of a stage is unknown."""
+    """Return the prediction with None for its intervals, because the error of a stage is not known."""
     for key in ("needs_ms", "frame_time_ms", "latency_ms"):
         answer[key] = {**answer[key], "low": None, "high": None}
     if rate := answer.get("rate"):
@@ -286,7 +294,7 @@ def _without_intervals(answer: dict[str, Any]) -> dict[str, Any]:
 
 
 def _share(file: PipelineFile) -> str:
-    """Say which share of the frames is shown, where `every` leaves some out."""
+    """Return a sentence about the share of frames that are presented, if `every` leaves some out; otherwise ""."""
     period = file.periods[file.latency_to]
     return f"; {file.latency_to} has one frame of {period}, by every" if period > 1 else ""
 
@@ -302,7 +310,7 @@ def _row(stage: StagePrice) -> dict[str, Any]:
 
 
 def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], seed: int) -> FrameInterval:
-    """Return the time of a frame of the source when frames never wait for it."""
+    """Return the time of a frame if the source is always ready."""
     (graph, settings), skips = always_fed(file), skips_of(file, seed)
 
     def needs_ms(end: Ends) -> float:
@@ -321,15 +329,15 @@ def _is_unsure(prices: Mapping[str, StagePrice]) -> bool:
 
 
 def always_fed(file: PipelineFile) -> tuple[Graph, Settings]:
-    """Return graph and settings of a file whose source is always ready."""
+    """Return (graph, settings) of a file for a run whose source is always ready and in which no frame is dropped."""
     graph = holding_back(replace(graph_of(file, edge_rules(file)), from_release=False))
     return graph, Settings(MOST_FED, hang_ns=NEVER_HANGS_NS, in_flight=in_flight_of(file))
 
 
 def holding_back(graph: Graph) -> Graph:
-    """Return a graph whose streams hold back their writers and never drop a frame.
+    """Return the graph with edges that delay their writers and never drop a frame.
 
-    A rate holds when every frame is shown.
+    Such edges are needed to judge a rate, which holds if every frame is presented.
     """
     rules = ((rule, edge_rule(rule)) for rule in graph.edges)
     edges = (f"fifo:{known.slots}" if known.yields else rule for rule, known in rules)
@@ -337,25 +345,28 @@ def holding_back(graph: Graph) -> Graph:
 
 
 def fed_bound_ms(file: PipelineFile, times_ms: Mapping[str, float]) -> float:
-    """Return the bound on the time of a frame whose source is always ready."""
+    """Return the lower bound on the frame time in ms if the source is always ready.
+
+    `times_ms`: time of a job of each stage.
+    """
     (graph, settings), times = always_fed(file), {name: round(ms * NS_PER_MS) for name, ms in times_ms.items()}
     return float(period_bound(graph, times, settings.in_flight, shares=shares_of(file)).period_ns) / NS_PER_MS
 
 
 def repeats_after(file: PipelineFile) -> int:
-    """Return the number of frames after which frames go through the same stages again."""
+    """Return the number of frames after which the pattern of their stages repeats."""
     return math.lcm(*file.periods.values(), len(file.bypass[1].pattern or ".") if file.bypass else 1)
 
 
 def steady_ms(run: Simulation, stop_ns: int, repeats: int) -> float:
-    """Return the mean time of a frame in the second half of a run. Its source is always ready, and stops at `stop_ns`.
+    """Return the mean frame time in ms, in the second half of a run whose source is always ready until `stop_ns`.
 
-    The first half is left out because slots may fill for hundreds of frames. The time after `stop_ns` is left out
-    because the last frames meet fewer and fewer others.
+    The first half does not count, because slots may fill for hundreds of frames. The time after `stop_ns` does not
+    count, because the pipeline runs empty. The order of the jobs repeats after a multiple of `repeats`, because slots
+    fill in turn. Therefore a multiple of EVEN * `repeats` frames counts, if the run has so many. If fewer than two
+    frames are presented there, the result is the whole time.
 
-    `repeats`: number of frames after which the jobs are the same again. The order of the jobs repeats later, as slots
-    fill in turn. Therefore a whole number of EVEN times as many frames counts, if the run has so many. If the pipeline
-    shows no two frames there, because others never let it, the result is the whole time.
+    `repeats`: result of `repeats_after`.
     """
     shown = {frame: ns for frame, ns in run.shown_ns.items() if ns <= stop_ns}
     last = max(shown, default=0)
@@ -366,13 +377,15 @@ def steady_ms(run: Simulation, stop_ns: int, repeats: int) -> float:
 
 
 def over_ends(ms_at: Callable[[Ends], float], is_unsure: bool = True) -> FrameInterval:
-    """Return a time with its interval. At either end, all stages take as little, or as long, as their intervals say.
+    """Return a time with its interval, from the times if all stages are at the low or at the high end of theirs.
 
-    The errors of all stages count as one, because they come from one model of one chip, or from one run.
-    `ms_at`: the time at an end. `is_unsure`: whether the ends differ.
+    The errors of all stages count as one error, because they come from one model of one chip, or from one run.
+
+    `ms_at`: function that returns the time in ms at an end.
+    `is_unsure`: whether the ends differ from the expected time.
     """
     found = [*map(ms_at, ENDS if is_unsure else ENDS[:1])]
-    return FrameInterval(found[0], min(found), max(found))  # jobs meet otherwise at each end, so the ends may cross
+    return FrameInterval(found[0], min(found), max(found))  # jobs interleave differently, so the ends may cross
 
 
 def _intervals(
@@ -383,9 +396,9 @@ def _intervals(
     needs: FrameInterval,
     seed: int,
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the intervals of the mean frame time and the mean latency by ignorance, from short simulated runs.
+    """Return the intervals of the mean frame time and of the mean latency, from short simulated runs at both ends.
 
-    Where no frame is dropped the frame time is that of the bound, or of the source.
+    If no frame is dropped, the interval of the frame time comes from `needs` and the period of the source.
     """
     frame_ms, latency_ms = report["frame_time_ms"]["mean"], report["latency_ms"]["mean"]
     if not _is_unsure(prices):
@@ -399,7 +412,7 @@ def _intervals(
     }
 
     def around_mean(key: str, mean: float) -> dict[str, float]:
-        """Return the interval by what errors change in short runs, whose own jitter is the same in each."""
+        """Return the interval around `mean`: the relative changes in the short runs, which all have the same jitter."""
         usual = runs["expected"][key]["mean"]
         _, low, high = over_ends(lambda end: mean * runs[end][key]["mean"] / usual if usual else mean)
         return {"low": low, "high": high}

@@ -1,8 +1,8 @@
-"""Predictions for a chip: one configuration over minutes or at a rate, its alternatives, or a table of many.
+"""Predictions for a chip: one configuration over minutes or at a rate, its alternatives, or a table of configurations.
 
-Every number is on the virtual clock and comes with the relative error to expect of it. `confidence` is one minus that
-error, and zero when the error is as large as the number. A rate limits the application as a display of that rate would;
-policies that release frames at a rate use it themselves.
+Every number is on the virtual clock and has an expected relative error. `confidence` is one minus this error, and zero
+if the error is as large as the number. A rate limits the application like a display of that rate. Policies that release
+frames at a rate use the rate itself.
 """
 
 from __future__ import annotations
@@ -47,8 +47,8 @@ from trilane.scheduler.virtual import Simulation
 from trilane.transport.slots import EDGES
 from trilane.units import HOST, NS_PER_MS, SUSTAINED, UNITS, UnitName
 
-#: Rows of `what_if`: name, how the stages are joined, share of the network on the GPU. All release frames as
-#: often as the display can show them, because they are compared with each other.
+#: Rows of `what_if`: name, variant, share of the network on the GPU. All release frames as often as the display can
+#: show them, because they are compared with each other.
 ALTERNATIVES: tuple[tuple[str, Variant, float], ...] = (
     ("reference application", REFERENCE, 0.0),
     ("one frame at a time", Variant("sequential", "single"), 0.0),
@@ -60,7 +60,7 @@ ALTERNATIVES: tuple[tuple[str, Variant, float], ...] = (
     ("pipelined, 5 % of the network on the GPU", Variant("pipelined", "double"), 0.05),
 )
 
-#: Part of a rate that may be missing while the rate still holds: the first frames of a simulated run take longer.
+#: Share by which a rate may be missed and still holds, because the first frames of a simulated run take longer.
 MISSING = 0.002
 
 
@@ -72,14 +72,15 @@ def predict(
     governor: str | None = None,
     wanted: Wanted = NOTHING,
 ) -> dict[str, Any]:
-    """Return everything about one configuration, as plain data with the keys of report.json and more.
+    """Return the prediction of one configuration, as JSON values with the keys of report.json and further keys.
 
     `profile`: hardware profile of the chip.
     `plan`: application that runs on it.
-    `performance_profile`: its name, one of PERFORMANCE_PROFILES.
+    `performance_profile`: one of PERFORMANCE_PROFILES.
     `minutes`: virtual time from a cold start; 0 for the settled application at constant temperature.
-    `governor`: name in GOVERNORS; None for the profile's own.
-    `wanted`: a rate, to which the application is held, and a limit of power.
+    `governor`: name in GOVERNORS; None for the profile's governor.
+    `wanted`: rate that limits the application, and limit of power.
+
     Raises BadInputError for an unknown name or a time out of range.
     """
     profile, plan, corners, placed = _settled_on(profile, plan, performance_profile, wanted)
@@ -122,7 +123,7 @@ def predict(
 
 
 def _shown_times(profile: Profile, fps: float | None, times: FrameInterval) -> FrameInterval:
-    """Return the times of a frame, which are at least the display's where the rate `fps` is more than it can show."""
+    """Return the times of a frame; at least the display's interval if the rate `fps` is above what it can show."""
     display = profile.application.display_ms.or_else(0)
     return times if not fps or display * fps <= 1e3 else FrameInterval(*(max(ms, display) for ms in times))
 
@@ -132,7 +133,7 @@ def predicted_run(
 ) -> Simulation:
     """Return the run in virtual time, at constant temperature, from which `predict` takes its shares of time.
 
-    Parameters and errors: as in `predict`.
+    Parameters and errors are those of `predict`.
     """
     profile, plan, corners, _ = _settled_on(profile, plan, performance_profile, wanted)
     return simulated(profile, plan, corners)
@@ -141,14 +142,17 @@ def predicted_run(
 def what_if(
     profile: Profile, network: Network, unit: UnitName, performance_profile: str, fps: float | None = None
 ) -> list[dict[str, Any]]:
-    """Return the same network under every row of `ALTERNATIVES` that the unit allows.
+    """Return a row for the network under each of `ALTERNATIVES` that the unit allows.
 
-    With `fps` it is every policy with every edge at that rate; rows then say whether it holds and at which power.
+    With `fps`, return a row for every policy with every edge, which says whether the rate holds, and at which power.
+
     `profile`: hardware profile of the chip.
     `network`: network that runs.
     `unit`: unit that runs it, gpu or dsp.
-    `performance_profile`: its name; raises BadInputError for an unknown one.
-    `fps`: the rate, frames a second; None for no rate.
+    `performance_profile`: one of PERFORMANCE_PROFILES.
+    `fps`: rate in frames a second; None for no rate.
+
+    Raises BadInputError for an unknown performance profile.
     """
     corners = corners_of(profile, performance_profile)
     if fps is not None:
@@ -169,13 +173,15 @@ def predict_table(
     variant: Variant = REFERENCE,
     on_row: Callable[[int], None] = lambda _count: None,
 ) -> Iterator[dict[str, Any]]:
-    """Yield for each row its cells, then `bench_*_ms`, `app_*_ms` with their ranges, and `confidence`.
+    """Yield for each row its cells, and the predicted `bench_*_ms`, `app_*_ms` with their ranges, and `confidence`.
 
     `profile`: hardware profile of the chip.
     `rows`: rows of a table of configurations.
-    `performance_profile`: its name; raises BadInputError for an unknown one.
-    `variant`: how the stages are joined.
-    `on_row`: called after each row with the count of rows so far.
+    `performance_profile`: one of PERFORMANCE_PROFILES.
+    `variant`: how the stages are connected and scheduled.
+    `on_row`: function that is called after each row with the number of rows so far.
+
+    Raises BadInputError for an unknown performance profile.
     """
     corners = corners_of(profile, performance_profile)
     for count, row in enumerate(rows, 1):
@@ -186,9 +192,9 @@ def predict_table(
 def _settled_on(
     profile: Profile, plan: Plan, performance_profile: str, wanted: Wanted
 ) -> tuple[Profile, Plan, Corners, Placed | None]:
-    """Return the chip, the plan at its rate, the corners, and how the units were placed.
+    """Return (profile, plan at its rate, corners, placement of the units).
 
-    On this machine the chip's units are on cores; elsewhere nothing is placed.
+    For this machine the profile has its units on cores. For a chip the placement is None.
     """
     corners = corners_of(profile, performance_profile)
     placed = place_units(profile, plan, corners, host_cores(usable_cores())) if profile.name == HOST else None
@@ -198,7 +204,7 @@ def _settled_on(
 
 
 def _notes(profile: Profile, plan: Plan, placed: Placed | None) -> list[str]:
-    """Return what a reader of the figures must know of the profile, the policy and the placement."""
+    """Return sentences about the profile, the policy and the placement, for the reader of the figures."""
     notes, variant, measured = [], plan.variant, profile.units[plan.unit].measured
     if POLICIES[variant.policy].paced:
         notes.append(
@@ -275,7 +281,7 @@ def _frame_times(profile: Profile, mean_ms: float, frames: Sequence[float]) -> d
 
 
 def ema_range_ms(profile: Profile, mean_ms: float) -> tuple[float, float]:
-    """Return the least and greatest exponential average over 20 frames, in ms; never below the display's interval."""
+    """Return (least, largest) exponential average over 20 frames in ms; not below the display's interval."""
     half = profile.application.ema20_half_range_fraction.or_else(0) * mean_ms
     return max(profile.application.display_ms.or_else(0), mean_ms - half), mean_ms + half
 
@@ -300,12 +306,12 @@ def _row_predictions(profile: Profile, network: Network, corners: Corners, varia
 
 
 def _cells(row: ConfigurationRow) -> dict[str, Any]:
-    """Return the cells of the row as text, whole numbers as integers."""
+    """Return the cells of the row by column: whole numbers as integers, other cells as text."""
     return {key: int(text) if text.isdecimal() else text for key, text in row.cells.items()}
 
 
 def held_to(plan: Plan, fps: float | None) -> Plan:
-    """Return the plan at a rate. A policy that releases frames uses the rate; any other policy is held to it."""
+    """Return the plan at a rate. A policy that releases frames at a rate uses it; for other policies it is a limit."""
     if fps is None:
         return plan
     if POLICIES[plan.variant.policy].paced:
@@ -318,14 +324,16 @@ def _unheld(plan: Plan) -> Plan:
 
 
 def unheld_times(profile: Profile, plan: Plan, corners: Corners, around: Interval, network_ms: float) -> FrameInterval:
-    """Return the times of a frame when neither the display nor a rate holds the application.
+    """Return the times of a frame if neither the display nor a rate limits the application.
 
-    A frame's times follow from the network's. If the other stages were measured together with the network, they have
-    the network's relative error.
+    Their interval follows from the interval of the network's time. If the other stages were measured together with the
+    network, they have the same relative error.
+
     `profile`: hardware profile of the chip.
     `plan`: application that runs on it.
     `corners`: corner of each unit.
-    `around`, `network_ms`: interval and mean of the network's time, milliseconds.
+    `around`: interval of the network's time.
+    `network_ms`: mean of the network's time.
     """
     display = profile.application.display_ms.model_copy(update={"value": 1e3 / MOST_FPS})
     free = profile.model_copy(update={"application": profile.application.model_copy(update={"display_ms": display})})
@@ -338,16 +346,16 @@ def unheld_times(profile: Profile, plan: Plan, corners: Corners, around: Interva
 
 
 def least_ms(profile: Profile, plan: Plan) -> float:
-    """Return the least milliseconds between frames that the display, or the rate, allows."""
+    """Return the least time between frames in ms that the display and the rate allow."""
     fps = plan.variant.fps if POLICIES[plan.variant.policy].paced else plan.most_fps
     return max(profile.application.display_ms.or_else(0), 1e3 / fps if fps else 0.0)
 
 
 def around_frame(frame_ms: float, times: FrameInterval, least: float) -> dict[str, float]:
-    """Return the 80 % interval of a mean frame time, from the interval of the network's time.
+    """Return the 80 % interval of a mean frame time, as `low` and `high`.
 
     `frame_ms`: mean frame time.
-    `times`: times of a frame when nothing holds the application.
+    `times`: times of a frame if nothing limits the application.
     `least`: result of `least_ms`.
     """
     low, high = (frame_ms * max(ms, least) / max(times.ms, least) for ms in times[1:])
@@ -355,7 +363,7 @@ def around_frame(frame_ms: float, times: FrameInterval, least: float) -> dict[st
 
 
 def load_of(profile: Profile, plan: Plan) -> FrameLoad:
-    """Return the load of the application when only the display limits its rate."""
+    """Return the load of the application if only the display limits its rate."""
 
     def work_ms(corners: Corners) -> dict[UnitName, float]:
         times = stage_times_ms(profile, plan, corners)
@@ -370,30 +378,32 @@ def power_of(profile: Profile, plan: Plan, corners: Corners, around: Interval) -
     `profile`: hardware profile of the chip.
     `plan`: application that runs on it.
     `corners`: corner of each unit.
-    `around`: interval of the network's time; the busy share of its unit has the same relative error.
+    `around`: interval of the network's time; the busy share of the network's unit has the same relative error.
     """
     busy = steady(profile, plan, corners).busy
     return device_power(profile, busy, corners, {plan.unit: spread_of(around)})
 
 
 def _settled_power_w(profile: Profile, now: Steady, corners: Corners) -> float:
-    """Return the mean power of the whole device in watts, its base included."""
+    """Return the mean power of the whole device in watts, including its base power."""
     return sum(unit_power_w(profile, now, corners).values()) + profile.thermal.base_power_w.or_else(0)
 
 
 def every_variant() -> Iterator[Variant]:
-    """Yield the reference application, then every policy with every edge that is compared."""
+    """Yield the reference application, then every other combination of a policy and an edge of EDGES."""
     yield REFERENCE
     yield from (Variant(policy, edge) for policy in POLICIES for edge in EDGES if (policy, edge) != REFERENCE[:2])
 
 
 def at_rate(profile: Profile, plan: Plan, corners: Corners, fps: float) -> dict[str, Any]:
-    """Return one row of the comparison at a rate: whether the rate holds, the share of dropped frames, and the power.
+    """Return one row of the comparison at a rate.
+
+    Its keys say whether the rate holds, which share of frames is dropped, and how much power the device takes.
 
     `profile`: hardware profile of the chip.
     `plan`: application that runs on it.
     `corners`: corner of each unit.
-    `fps`: the rate, frames a second.
+    `fps`: rate in frames a second.
     """
     now, variant = steady(profile, held_to(plan, fps), corners), plan.variant
     return {

@@ -23,25 +23,25 @@ from trilane.units import HOST
 
 MAX_BYTES = 1_000_000
 MAX_DEPTH = 8
-#: Keys of a quantity. An extending profile replaces a quantity as a whole, never its value or its source alone.
+#: Keys of a quantity. An extending profile replaces a whole quantity, never only its value or its source.
 WHOLE = frozenset(["value", "kind", "source"])
 UNIT_HINT = "units of measure end the name"
 
 
 def profile_folder() -> Path:
-    """Return the folder of the profiles that come with Trilane."""
+    """Return the folder of the bundled profiles."""
     return Path(str(resources.files("trilane.hw_profiles")))
 
 
 def profile_names() -> list[str]:
-    """Return the names of the profiles that come with Trilane, templates included."""
+    """Return the names of the bundled profiles, including templates."""
     return sorted(path.stem for path in profile_folder().glob("*.toml"))
 
 
 def load_profile(name: str | Path) -> Profile:
-    """Return the profile `name`: one that comes with Trilane, or a path to a TOML file.
+    """Return the profile `name`: the name of a bundled profile, or the path of a TOML file.
 
-    Raises BadInputError when there is none or something in it is wrong.
+    Raises BadInputError if there is no such profile, or if it has a defect.
     """
     path = _find(str(name), Path())
     data = merged_tables(path)
@@ -63,16 +63,13 @@ def load_runnable(name: str | Path) -> Profile:
 
 
 def load_tables(name: str | Path) -> tuple[dict[str, Any], Path]:
-    """Return the merged tables of the profile `name`, before the schema is checked, and its path.
-
-    Raises BadInputError.
-    """
+    """Return (merged tables of the profile `name`, not yet checked; its path). Raises BadInputError."""
     path = _find(str(name), Path())
     return merged_tables(path), path
 
 
 def parse_profile(data: Mapping[str, Any], path: Path) -> Profile:
-    """Check the tables `data` against the schema. `path`: file to name in errors. Raises BadInputError."""
+    """Return the profile of the tables `data`. `path`: file to name in errors. Raises BadInputError."""
     try:
         return Profile.model_validate(data)
     except ValidationError as error:
@@ -80,7 +77,9 @@ def parse_profile(data: Mapping[str, Any], path: Path) -> Profile:
 
 
 def merged_tables(path: Path, seen: tuple[Path, ...] = ()) -> dict[str, Any]:
-    """Return the tables of `path` laid over those of the profile that it extends; `seen`: files that extend this one.
+    """Return the tables of `path`, merged over the tables of the profile that it extends.
+
+    `seen`: files that extend this one.
 
     Raises BadInputError for a cycle or an unreadable file.
     """
@@ -173,7 +172,7 @@ def _short(value: Any) -> str:
 
 
 def _siblings(keys: Sequence[str]) -> Iterator[str]:
-    """Return the keys that the schema allows beside the last of `keys`."""
+    """Yield the keys that the schema allows in the table of the last of `keys`."""
     model: Any = Profile
     for key in keys[:-1]:
         fields = getattr(model, "model_fields", {})
@@ -182,6 +181,6 @@ def _siblings(keys: Sequence[str]) -> Iterator[str]:
 
 
 def _model_of(annotation: Any) -> Any:
-    """Return the model that `dict[str, Model]` holds, or the annotation itself."""
+    """Return `Model` for the annotation `dict[str, Model]`; another annotation is returned unchanged."""
     arguments = getattr(annotation, "__args__", ())
     return arguments[-1] if arguments else annotation

@@ -1,8 +1,9 @@
-"""Whether a rate holds, which rate a limit of power leaves, and the power of a device with its intervals.
+"""Computes whether a rate holds, which rate a limit of power allows, and the power of a device with its interval.
 
-All are pure functions of times and of a profile's powers, for the whole device, its base included. Means come from
-`Unit.power_w`. An interval follows from the spreads of the profile's numbers and of the busy shares, which are taken as
-independent. Powers are positive, so their sums are taken as log-normal.
+All functions are pure; they depend on times and on a profile's powers. Power is the power of the whole device,
+including its base power. Means come from `Unit.power_w`. An interval follows from the spreads of the profile's numbers
+and of the busy shares, which are assumed to be independent. Powers are positive, so their sum is assumed to be
+log-normal.
 """
 
 from __future__ import annotations
@@ -18,7 +19,11 @@ from trilane.units import UNITS, UnitName
 
 
 class Wanted(NamedTuple):
-    """The rate and the limit of power that a user wants to know about."""
+    """The rate and the limit of power that a user asks about; None for a question that is not asked.
+
+    `fps`: rate in frames a second.
+    `power_limit_w`: limit of the device's power in watts.
+    """
 
     fps: float | None = None
     power_limit_w: float | None = None
@@ -28,7 +33,7 @@ NOTHING = Wanted()
 
 
 class FrameInterval(NamedTuple):
-    """Least milliseconds between two frames: expected, and at both ends of the 80 % interval."""
+    """The least time between two frames in ms: expected, and at both ends of the 80 % interval."""
 
     ms: float
     low_ms: float
@@ -36,12 +41,14 @@ class FrameInterval(NamedTuple):
 
 
 def holding(fps: float, times: FrameInterval, dropped: int = 0, late: int = 0, frames: int = 0) -> dict[str, Any]:
-    """Say whether a rate of `fps` frames a second holds, also in words.
+    """Return whether a rate of `fps` frames a second holds, as keys of a report, also in words.
 
-    The reserve is the part of a frame's time that is left.
+    The reserve is the share of the time between two frames that is left over. Jitter may drop or delay frames although
+    the mean frame time is short enough.
 
-    `times`: time of a frame that never waits for its turn. `dropped`, `late`: numbers of the run's `frames` that it
-    drops, or shows too late, at this rate. Jitter may cause both although a mean frame fits.
+    `times`: least time between two frames.
+    `dropped`, `late`: numbers of frames that a run at this rate drops, or presents too late.
+    `frames`: number of frames of this run.
     """
     reserve, high, low = (1 - ms * fps / 1e3 for ms in times)
     if low >= 0:
@@ -64,15 +71,15 @@ def holding(fps: float, times: FrameInterval, dropped: int = 0, late: int = 0, f
 
 
 def wanted_drops(dropped: Mapping[str, int]) -> int:
-    """Return how many frames were dropped although the pipeline wanted them: all but those that `every` leaves out.
+    """Return the number of dropped frames without the frames that `every` leaves out.
 
-    `dropped`: frames by place and cause, as in report.json.
+    `dropped`: numbers of dropped frames by place and cause, as in report.json.
     """
     return sum(count for cause, count in dropped.items() if not cause.endswith(f":{DropCause.EVERY.value}"))
 
 
 def without_interval(rate: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the answer of `holding` where nobody knows the error of the frame's time."""
+    """Return `rate`, a result of `holding`, without intervals; for a frame time whose error is not known."""
     ms = (1 - rate["reserve"]) * 1e3 / rate["fps"]
     holds = f"{'yes' if rate['holds'] else 'no'}; {_short(ms)} ms of {_short(1e3 / rate['fps'])} ms (no interval)"
     said = {"words": rate["words"].partition(",")[0], "sentence": f"holds {rate['fps']:g} fps: {holds}"}
@@ -80,7 +87,7 @@ def without_interval(rate: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _sentence(fps: float, times: FrameInterval, missed: Mapping[str, int], frames: int) -> str:
-    """Say whether the rate holds: `holds 30 fps: yes; 12-19 ms of 33 ms (80 %)`."""
+    """Return a sentence that says whether the rate holds, such as `holds 30 fps: yes; 12-19 ms of 33 ms (80 %)`."""
     frame_ms = 1e3 / fps
     holds = "yes" if times.high_ms <= frame_ms else "no" if times.low_ms > frame_ms else "perhaps"
     said = " and ".join(f"{count} {what}" for what, count in missed.items() if count)
@@ -99,10 +106,11 @@ def _short(ms: float) -> str:
 
 
 class FrameLoad(NamedTuple):
-    """What runs, as functions of the corners of the units.
+    """A load, as functions of the corners of the units.
 
-    `work_ms`: milliseconds that each working unit works for a frame. `frame_ms`: least time between frames; it may take
-    a simulation, so it is called only where it decides.
+    `work_ms`: function that returns the busy time of each working unit for a frame.
+    `frame_ms`: function that returns the least time between frames. It may run a simulation, so it is called only if
+    the result depends on it.
     """
 
     work_ms: Callable[[Corners], Mapping[UnitName, float]]
@@ -110,18 +118,18 @@ class FrameLoad(NamedTuple):
 
 
 def within_power(profile: Profile, requested: Corners, load: FrameLoad, limit_w: float) -> dict[str, Any]:
-    """Return the highest rate at which the device takes at most `limit_w`, and the corners of its units there.
+    """Return the highest rate at which the device takes at most `limit_w`, and the corners of its units at that rate.
 
-    `limited_by` is `speed` where the requested corners reach that rate, `power` otherwise. `low_fps` and `high_fps` are
-    the rates at the two ends of the 80 % interval of the device's power.
+    `limited_by` is `speed` if the requested corners cannot reach a higher rate, otherwise `power`. `low_fps` and
+    `high_fps` are the rates at the two ends of the 80 % interval of the device's power.
 
-    Each unit may be at any corner up to the `requested` one. For given corners the power is linear in the rate: the
-    power of idle units, plus the energy of the work for each frame.
+    Each unit may run at any corner up to the requested one. For given corners the power is linear in the rate: the
+    power of idle units, plus the energy of each frame's work.
 
     `profile`: hardware profile of the chip.
     `requested`: corner of each unit under the performance profile.
-    `load`: what runs, as work and least frame time.
-    `limit_w`: limit of the whole device, watts.
+    `load`: load that runs.
+    `limit_w`: limit of the power of the whole device in watts.
     """
     best, fps = _best(profile, requested, load, limit_w)
     work = load.work_ms(best.corners)
@@ -142,7 +150,7 @@ def within_power(profile: Profile, requested: Corners, load: FrameLoad, limit_w:
 
 
 def _best(profile: Profile, requested: Corners, load: FrameLoad, limit_w: float) -> tuple[_Choice, float]:
-    """Return the choice of corners with the highest rate, and the rate."""
+    """Return (choice of corners with the highest rate, this rate in frames a second)."""
     choices = sorted(
         (_by_power(profile, corners, load, limit_w) for corners in _allowed(requested, load)),
         key=lambda choice: -choice.most_fps,
@@ -161,8 +169,9 @@ def _best(profile: Profile, requested: Corners, load: FrameLoad, limit_w: float)
 class _Choice(NamedTuple):
     """One choice of corners.
 
-    `most_fps`: rate that power and the busiest unit allow. `idle_w`: watts of the device when no unit works. `joules`:
-    energy of a frame on top of that.
+    `most_fps`: highest rate that the power and the busiest unit allow.
+    `idle_w`: power of the device in watts if no unit works.
+    `joules`: energy that the work of a frame adds.
     """
 
     most_fps: float
@@ -182,7 +191,7 @@ def _by_power(profile: Profile, corners: Corners, load: FrameLoad, limit_w: floa
 
 
 def _allowed(requested: Corners, load: FrameLoad) -> list[Corners]:
-    """Return all corners up to the requested ones; only the requested one for a unit that does nothing."""
+    """Return all combinations of corners up to the requested ones; a unit without work keeps its requested corner."""
     working = load.work_ms(requested)
 
     def up_to(unit: UnitName, corner: Corner) -> tuple[Corner, ...]:
@@ -195,12 +204,12 @@ def _allowed(requested: Corners, load: FrameLoad) -> list[Corners]:
 def answers(
     profile: Profile, load: FrameLoad, corners: Corners, wanted: Wanted, times: FrameInterval
 ) -> dict[str, Any]:
-    """Return `rate` and `power_limit`, each only where it is wanted.
+    """Return the keys `rate` and `power_limit` of a prediction, each only if `wanted` asks for it.
 
     `profile`: hardware profile of the chip.
-    `load`: what runs, as work and least frame time.
+    `load`: load that runs.
     `corners`: corner of each unit under the performance profile.
-    `wanted`: the rate and the limit.
+    `wanted`: rate and limit of power.
     `times`: times of a frame of `load` at `corners`.
     """
     found: dict[str, Any] = {}
@@ -212,7 +221,7 @@ def answers(
 
 
 class _Watts(NamedTuple):
-    """A mean in watts, and the interval that holds it with a probability of 80 %."""
+    """A mean power in watts, and the interval that contains it with a probability of 80 %."""
 
     w: float
     low_w: float
@@ -222,12 +231,12 @@ class _Watts(NamedTuple):
 def device_power(
     profile: Profile, busy: Mapping[str, float], corners: Corners, busy_error: Mapping[UnitName, float]
 ) -> dict[str, Any]:
-    """Return the power of the whole device, of each unit, and of the base, which is no unit (memory, screen, radio).
+    """Return the power of the whole device, of each unit, and of its base: memory, screen and radio.
 
     `profile`: hardware profile of the chip.
     `busy`: share of the time in which each unit works.
     `corners`: corner of each unit.
-    `busy_error`: relative error of these shares; 0 for a unit without one.
+    `busy_error`: relative error of these shares; 0 for a unit that is missing.
     """
     base = profile.thermal.base_power_w
     spreads = {
@@ -243,7 +252,7 @@ def device_power(
 
 
 def _unit(profile: Profile, name: UnitName, corners: Corners, busy: float, busy_error: float) -> tuple[float, float]:
-    """Return the mean and standard deviation of the power of a unit, in watts."""
+    """Return (mean, standard deviation) of the power of the unit `name` in watts."""
     unit, corner = profile.units[name], corners[UNITS.index(name)]
     active, idle = unit.power_w(corner, 1.0), unit.power_w(corner, 0.0)
     exponent = unit.power_exponent.or_else(3.0) * unit.power_exponent.relative_error
@@ -257,7 +266,7 @@ def _unit(profile: Profile, name: UnitName, corners: Corners, busy: float, busy_
 
 
 def _watts(mean: float, deviation: float) -> _Watts:
-    """Return the interval of a log-normal distribution of this mean and standard deviation."""
+    """Return the mean and the 80 % interval of a log-normal distribution with this mean and standard deviation."""
     if not mean:
         return _Watts(0.0, 0.0, 0.0)
     variance = math.log1p((deviation / mean) ** 2)

@@ -1,9 +1,9 @@
 """The U-Nets of the reference application: their ONNX graphs, their work, and CSV tables that list many of them.
 
-Decoder, heads and channel counts are the same for all (`trilane.unet_tables`). Encoder, normalisation, size and layout
-of the input differ. Batch normalisation is folded and leaves no operator. No tensor data is made: a weight is a graph
-input with a shape, so a network of any size is cheap to describe. A bad cell of a table is a `BadInputError` that
-names file, line and column.
+All U-Nets have the same decoder, heads and channel counts (`trilane.unet_tables`). They differ in encoder,
+normalisation, size and layout of the input. Batch normalisation is folded and leaves no operator. A weight is a graph
+input with a shape and without data, so that a network of any size is cheap to describe. A bad cell of a table raises a
+`BadInputError` that names file, line and column.
 """
 
 from __future__ import annotations
@@ -51,9 +51,13 @@ ACTIVATIONS = {"relu": "Relu", "relu6": "Clip", "hardswish": "HardSwish"}
 class NetworkSpec:
     """One reference network.
 
-    `encoder`: one of ENCODERS. `norm`: one of NORMS. `layout`: one of LAYOUTS. `height`, `width`: pixels, multiples of
-    32 up to MAX_SIDE. `channels`: channels of the rasterised texture, 1 to 16. Raises BadInputError for any other
-    value.
+    `encoder`: one of ENCODERS.
+    `norm`: one of NORMS.
+    `height`, `width`: size of the input in pixels, multiples of 32 up to MAX_SIDE.
+    `channels`: channels of the rasterised texture, 1 to 16.
+    `layout`: one of LAYOUTS.
+
+    Raises BadInputError for another value.
     """
 
     encoder: str
@@ -79,7 +83,7 @@ class NetworkSpec:
 
 
 def reference_network(spec: NetworkSpec) -> Network:
-    """Return the network of `spec`, with its work and the facts that reports name it by."""
+    """Return the network of `spec`, with its work and its facts for reports."""
     facts = {"encoder": spec.encoder, "norm": spec.norm}
     return Network(facts, spec.height, spec.width, spec.channels, spec.layout, network_work(spec))
 
@@ -106,9 +110,9 @@ def _require_one_of(key: str, value: str, known: tuple[str, ...]) -> None:
 
 
 def _network_input(b: GraphBuilder, spec: NetworkSpec) -> TensorRef:
-    """Return the input as the raster stage makes it.
+    """Return the network's input in the layout of `spec`.
 
-    `packed`: one tensor. `split`: one tensor per raster pass, joined and permuted before the first convolution.
+    With `packed` it is one tensor. With `split` the graph has one input per raster pass, which are joined and permuted.
     """
     shape = (spec.height, spec.width)
     if spec.layout == "packed":
@@ -120,7 +124,7 @@ def _network_input(b: GraphBuilder, spec: NetworkSpec) -> TensorRef:
 
 
 def _decoder(b: GraphBuilder, features: list[TensorRef]) -> TensorRef:
-    """Return the features at full size: from the smallest up, each is joined with the encoder's of its size."""
+    """Return the decoder's features at full size. `features`: features of the encoder, from stride 2 to stride 32."""
     x, skips = features[-1], [*reversed(features[:-1]), None]
     for width, skip in zip(DECODER, skips, strict=True):
         x = b.upsampled(x)
@@ -142,16 +146,20 @@ def _shape(info: onnx.ValueInfoProto) -> list[int]:
 
 @dataclass(frozen=True)
 class ConfigurationRow:
-    """One configuration. `place`: its file and line, for messages. `cells`: its text by column."""
+    """One row of a table of configurations.
+
+    `place`: file and line, for messages.
+    `cells`: text of its cells by column.
+    """
 
     place: str
     cells: dict[str, str]
     spec: NetworkSpec
 
     def number(self, column: str) -> float | None:
-        """Return the measured value, above 0; None where the cell is blank or the column absent.
+        """Return the measured value in `column`; None if the cell is blank or the column is missing.
 
-        Raises BadInputError.
+        Raises BadInputError for a text that is no number above 0.
         """
         text = self.cells.get(column, "")
         if not text:
@@ -162,7 +170,7 @@ class ConfigurationRow:
         return value
 
     def range(self, column: str) -> tuple[float, float] | None:
-        """Return the values of `column`_min and `column`_max; None when one of them is blank. Raises BadInputError."""
+        """Return the values of `column`_min and `column`_max; None if one of them is blank. Raises BadInputError."""
         low, high = self.number(f"{column}_min"), self.number(f"{column}_max")
         if low is None or high is None:
             return None
@@ -172,9 +180,9 @@ class ConfigurationRow:
 
 
 def read_table(path: Path) -> list[ConfigurationRow]:
-    """Read the rows of `path`; lines that begin with `#` are comments.
+    """Return the rows of `path`; lines that begin with `#` are comments.
 
-    Raises BadInputError when the file is unreadable or too large, or lacks a column of KEYS.
+    Raises BadInputError if the file is unreadable or too large, or lacks a column of KEYS.
     """
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -254,7 +262,7 @@ def _basic_block(b: GraphBuilder, x: TensorRef, width: int, stride: int) -> Tens
 
 
 def _squeeze(b: GraphBuilder, x: TensorRef) -> TensorRef:
-    """Append squeeze-and-excitation: mean over the picture, two 1x1 convolutions, gate."""
+    """Append squeeze-and-excitation, and return its result: mean over the picture, two 1x1 convolutions, gate."""
     inner = squeeze_channels(x.channels)
     pooled = b.op("GlobalAveragePool", [x.name], (x.channels, 1, 1))
     hidden = b.same("Relu", b.conv(pooled, inner, 1, bias=True))
@@ -273,7 +281,7 @@ def _inverted_block(b: GraphBuilder, x: TensorRef, row: MobileBlock) -> TensorRe
 
 
 def _inverted_encoder(b: GraphBuilder, x: TensorRef, encoder: MobileEncoder) -> list[TensorRef]:
-    """Return the features before each halving and at the end: strides 2, 4, 8, 16, 32."""
+    """Return the features before each further halving, and at the end: strides 2, 4, 8, 16, 32."""
     x = b.unit(x, encoder.stem, 3, ACTIVATIONS[encoder.activation], stride=2)
     features: list[TensorRef] = []
     for row in encoder.rows:
@@ -293,10 +301,12 @@ class TensorRef(NamedTuple):
 
 
 class GraphBuilder:
-    """Collects operators and the shapes of their results.
+    """Builds an ONNX graph: its methods append operators, and return their results.
 
     All tensors are NCHW with batch 1. They are declared as FLOAT, but the chip's profile decides how many bytes an
-    element takes. `norm`: normalisation after each convolution: `batch` (folded: no operator), `instance`, `group`.
+    element takes.
+
+    `norm`: normalisation after each convolution: `batch` (folded: no operator), `instance`, `group`.
     """
 
     def __init__(self, norm: str) -> None:
@@ -340,7 +350,7 @@ class GraphBuilder:
 
         `x`: input tensor.
         `out`: number of output channels.
-        `kernel`: side of the kernel, pixels.
+        `kernel`: side of the kernel in pixels.
         `stride`: stride along both axes.
         `groups`: number of groups of channels.
         `bias`: whether it has a bias.
@@ -369,7 +379,7 @@ class GraphBuilder:
         return self.op(kind, [x.name, *more], x[1:], **attributes)
 
     def normed(self, x: TensorRef) -> TensorRef:
-        """Append the normalisation that `norm` names."""
+        """Append the normalisation `norm`."""
         if self.norm == "batch":
             return x
         scales = [self.weight((x.channels,)), self.weight((x.channels,))]
@@ -383,7 +393,7 @@ class GraphBuilder:
         """Append a convolution, its normalisation and its activation.
 
         `x`, `out`, `kernel`, `stride`, `groups`: as in `conv`.
-        `act`: ONNX operator of the activation, None for none.
+        `act`: ONNX operator of the activation; None: no activation.
         """
         y = self.normed(self.conv(x, out, kernel, stride, groups, bias=self.norm == "batch"))
         return y if act is None else self.same(act, y)

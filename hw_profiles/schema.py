@@ -1,7 +1,7 @@
 """The schema of a hardware profile: units, speeds, powers and limits, each number with its source.
 
-Every number is a `Quantity`, which states where the number is from; the unit of measure ends the key's name. The
-schema checks shapes and ranges only. `corners_of` tells the corner of each unit under a performance profile.
+Every number is a `Quantity`, which states the number's source; the unit of measure ends the key's name. The schema
+checks only types and ranges. `corners_of` returns the corner of each unit under a performance profile.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from trilane.units import PERFORMANCE_PROFILES, UNITS, PerformanceProfile, UnitN
 Corner = Literal["max", "turbo", "nominal_plus", "nominal", "svs_plus", "svs", "svs2"]
 CORNERS: tuple[Corner, ...] = ("max", "turbo", "nominal_plus", "nominal", "svs_plus", "svs", "svs2")
 Kind = Literal["measured", "published", "fitted", "assumed", "unknown"]
-#: Relative error (standard deviation of the logarithm) of a kind of number, where its profile states none.
+#: Relative error (standard deviation of the logarithm) of a number by its kind, if the profile states none.
 SPREAD_OF_KIND: dict[str, float] = {"measured": 0.05, "published": 0.1, "fitted": 0.15, "assumed": 0.5, "unknown": 1.0}
-#: Standard deviations from the mean within which 80 % of a normal distribution lie.
+#: Number of standard deviations from the mean within which 80 % of a normal distribution lie.
 NORMAL_80 = 1.2816
-#: Intervals of more than 20 times the stated error say nothing.
+#: Largest `error_scale`: an interval of 20 times the stated error says nothing any more.
 MOST_ERROR_SCALE = 20.0
 BYTES = {"int8": 1, "fp16": 2, "fp32": 4}
 
@@ -137,7 +137,7 @@ class EngineRates(ProfileTable):
     job_us: Cost = Field(description="Fixed time of a job.")
 
 
-#: Rate of a term -> key of `EngineRates`, and the factor from the key's unit of measure to base units.
+#: (key of `EngineRates`, factor from the key's unit of measure to base units) of each rate of a term.
 KEY_OF_RATE = {
     "arithmetic": ("arithmetic_tmac_s", 1e12),
     "activation": ("activation_gb_s", 1e9),
@@ -176,11 +176,11 @@ class Engine(ProfileTable):
         return self
 
     def factor(self, term: str) -> float:
-        """Return how many times as much `term` costs as in a plain convolution."""
+        """Return how many times as much `term` costs as the term that defines the unit of its rate."""
         return self.factors[term].or_else(1.0) if term in self.factors else 1.0
 
     def seconds_per_unit(self, rate: str) -> float:
-        """Return the seconds of a product, of an element of an activation or weight, of an operator, or of a job."""
+        """Return the time in seconds of one product, activation element, weight element, operator or job, by `rate`."""
         key, unit = KEY_OF_RATE[rate]
         value: float = getattr(self.rates, key).or_else(1.0)
         if rate in ("operator", "job"):
@@ -269,38 +269,38 @@ class Unit(ProfileTable):
         return self
 
     def clock(self, corner: Corner) -> float:
-        """Return the clock at `corner` as a fraction of the highest."""
+        """Return the clock at `corner` as a fraction of the highest clock."""
         return self.corners[corner].or_else(1.0)
 
     def power_w(self, corner: Corner, busy: float) -> float:
-        """Return the mean power in watts at `corner` when the unit works for a share `busy` of the time."""
+        """Return the mean power in watts at `corner` if the unit works for the share `busy` of the time."""
         active: float = self.power_max_w.or_else(1.0) * self.clock(corner) ** self.power_exponent.or_else(3.0)
         return busy * active + (1 - busy) * self.idle_w.or_else(0.0)
 
     @property
     def slower(self) -> float:
-        """How many times longer the unit takes than its numbers say; 1 where nothing was measured."""
+        """How many times as long as by its numbers the unit takes, as measured; 1 for a unit without measurement."""
         return 1.0 if self.measured is None else self.measured.slower[self.threads]
 
     @property
     def peak(self) -> Quantity:
-        """Highest multiply-accumulates per second at the unit's precision, in tera."""
+        """The peak of multiply-accumulates at the unit's precision, in 1e12 per second."""
         peak: Quantity = getattr(self, f"peak_{self.precision}_tmac_s")
         return peak
 
     @property
     def peak_mac_s(self) -> float:
-        """Highest multiply-accumulates per second at the unit's precision."""
+        """The peak of multiply-accumulates per second at the unit's precision."""
         return self.peak.or_else(0.1) * 1e12
 
     @property
     def engine(self) -> Engine | None:
-        """The tensor engine at the unit's precision, if it has one."""
+        """The tensor engine for the unit's precision and runtime; None if the unit has none."""
         return next((e for name, e in self.engines.items() if name == f"{self.precision}_{self.engine_runtime}"), None)
 
     @property
     def element_bytes(self) -> int:
-        """Bytes of one element at the unit's precision."""
+        """The bytes of one element at the unit's precision."""
         return BYTES[self.precision]
 
 
@@ -386,7 +386,7 @@ class Profile(ProfileTable):
 
 
 def corners_of(profile: Profile, performance_profile: str) -> Corners:
-    """Return corners of cpu, gpu and dsp. Raises BadInputError for a name that is no performance profile."""
+    """Return the corners of cpu, gpu and dsp under a performance profile. Raises BadInputError for an unknown name."""
     for name, settings in profile.performance_profiles.items():
         if name == performance_profile:
             return settings.cpu, settings.gpu, settings.dsp

@@ -1,11 +1,11 @@
-"""Several pipelines on one chip: avatars, networks and pipeline files, each at a rate, on its units, memory and heat.
+"""Predicts several tenants on one chip: avatars, networks and pipeline files, each at its rate, with power and heat.
 
-`tenants.py` says what their jobs cost, and the schedulers in `trilane.scheduler.shared_units` decide whose job waits.
-This file adds how much a network slows while others use the memory: it has the bandwidth that they leave (Gables, Hill
-and Reddi, 2019). Each avatar's camera, display and composition take `application_use_fraction` all the time, and a
-network on another unit takes its bytes, spread over its time. Jobs of one unit follow each other and never compete. A
-network that nothing slows has the time of `network_time.price`, on a chip that computes as the network does. The answer
-has the keys of report.json where they mean the same.
+`tenants.py` computes the times of their jobs, and `trilane.scheduler.shared_units` decides whose job waits. This file
+computes how much a network slows while other jobs use the memory: it has the bandwidth that they leave (Gables, Hill
+and Reddi, 2019). Each avatar's camera, display and composition take `application_use_fraction` of the bandwidth all the
+time. A network on another unit takes the bytes that it moves, spread over its time. Jobs of one unit follow each other
+and never compete. A network that nothing slows has the time of `network_time.price`. Keys of the prediction that mean
+the same as in report.json have the same names.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from trilane.scheduler.virtual import Simulation
 from trilane.units import HOST, INFER, NS_PER_MS, NS_PER_S, SUSTAINED, UNITS
 
 MOST_TENANTS = 8
-#: Share of the bandwidth that others can take at most: something is always left.
+#: Largest share of the bandwidth that other jobs can take, so that some is always left.
 MOST_USE = 0.95
 #: A run lasts at least LEAST_S virtual seconds and LEAST_FRAMES of the slowest tenant, but at most MOST_S.
 LEAST_S, LEAST_FRAMES, MOST_S = 10.0, 64, 600.0
@@ -35,11 +35,12 @@ LEAST_S, LEAST_FRAMES, MOST_S = 10.0, 64, 600.0
 
 @dataclass(frozen=True)
 class Together:
-    """The pipelines once they have settled, at constant corners.
+    """The settled state of several tenants at constant corners.
 
-    `runs`: what the scheduler says of each pipeline. `stages_ms`: for each, mean milliseconds of a job by stage if
-    nothing else ran. `busy`: share of the time in which each unit works for all of them; `by_tenant`: the same for
-    each.
+    `runs`: simulated run of each tenant.
+    `stages_ms`: for each tenant, the mean time of a job by stage if no other tenant ran.
+    `busy`: share of the time in which each unit works for all tenants.
+    `by_tenant`: for each tenant, the share of the time in which each unit works for it.
     """
 
     runs: tuple[Simulation, ...]
@@ -49,7 +50,7 @@ class Together:
 
     @property
     def frame_ms(self) -> float:
-        """Mean frame time of the first tenant."""
+        """The mean frame time of the first tenant in ms."""
         mean: float = self.runs[0].report["frame_time_ms"]["mean"]
         return mean
 
@@ -57,10 +58,10 @@ class Together:
 def together(
     profile: Profile, tenants: Sequence[Pipeline], corners: Corners, turns: str = ROUND_ROBIN, *, keep: bool = False
 ) -> Together:
-    """Run the `tenants` on the chip `profile`, with its units at `corners`, until they have settled.
+    """Return the settled state of `tenants` on the chip `profile`, with its units at `corners`.
 
-    `turns`: rule that chooses whose job a unit takes when several wait.
-    `keep`: whether the steps and jobs of each are recorded.
+    `turns`: name in TURNS, the rule that chooses whose job a unit takes if several wait.
+    `keep`: whether the steps and jobs of each run are recorded.
     """
     costs = _Costs(profile, tenants, corners)
     runs = _run(profile, tenants, costs, _seconds(tenants, costs), turns, keep=keep)
@@ -74,7 +75,7 @@ def together(
 
 
 def alone_ms(profile: Profile, tenant: Pipeline, corners: Corners) -> Mapping[str, float]:
-    """Return the mean milliseconds of a job by stage, for a pipeline alone, over the frames with a network."""
+    """Return the mean time in ms of a job by stage if only `tenant` runs, over its frames with a network."""
     return _Costs(profile, [tenant], corners).mean_ms[0]
 
 
@@ -88,7 +89,10 @@ def _run(
     fed: int | None = None,
     keep: bool = False,
 ) -> Sequence[Simulation]:
-    """Run the `tenants` for `seconds` of virtual time. `fed`: number of the one that always has another frame."""
+    """Return the simulated runs of `tenants` for `seconds` of virtual time.
+
+    `fed`: index of the tenant whose source is always ready; None: no such tenant.
+    """
     stop = round(NS_PER_S * seconds), Stop()
     cores: dict[str, str] = {name: unit.core for name, unit in profile.units.items() if unit.core}
     display_ns = round(NS_PER_MS * profile.application.display_ms.or_else(0.0))
@@ -101,10 +105,9 @@ def _run(
 
 
 def needed(profile: Profile, tenants: Sequence[Pipeline], number: int, corners: Corners, turns: str) -> FrameInterval:
-    """Return the time of a frame of tenant `number`, with its source always ready and the others at their rates.
+    """Return the least frame time of tenant `number`: its source is always ready, the other tenants have their rates.
 
-    A tenant alone needs the time that a prediction of it by itself gives: the run is as long, and the interval the
-    same.
+    For a single tenant, the result is the same as in its own prediction, because the run has the same length.
     """
 
     def needs_ms(end: Ends) -> float:
@@ -120,14 +123,14 @@ def needed(profile: Profile, tenants: Sequence[Pipeline], number: int, corners: 
 
 
 def _busy_s(run: Simulation, tenant: Pipeline, unit: str) -> float:
-    """Return the seconds in which the units of a pipeline that are `unit` of the chip work."""
+    """Return the busy time in seconds of the chip's unit `unit` for a tenant."""
     rows = run.report["units"]
     own = [name for name, hardware in tenant.hardware.items() if hardware == unit and name in rows]
     return float(sum(rows[name]["busy"] for name in own) * run.report["duration_s"])
 
 
 def _seconds(tenants: Sequence[Pipeline], costs: _Costs) -> float:
-    """Return the virtual seconds that the run lasts."""
+    """Return the length of the run in virtual seconds."""
     slowest = max(
         max(1 / tenant.fps, sum(means.values()) / 1e3) for tenant, means in zip(tenants, costs.mean_ms, strict=True)
     )
@@ -135,14 +138,14 @@ def _seconds(tenants: Sequence[Pipeline], costs: _Costs) -> float:
 
 
 class _Job(NamedTuple):
-    """A job with a network: the number of its tenant, and the tenant's name of the network."""
+    """A job with a network: the index of its tenant, and the tenant's name for the network."""
 
     tenant: int
     network: Hashable
 
 
 class _Costs:
-    """The times of the pipelines' jobs on the chip, and how these jobs slow each other."""
+    """The times of the tenants' jobs on the chip, and the speed of jobs beside each other."""
 
     def __init__(self, profile: Profile, tenants: Sequence[Pipeline], corners: Corners, end: Ends = "expected") -> None:
         own = profile.memory.application_use_fraction.or_else(0.0)
@@ -153,7 +156,7 @@ class _Costs:
         self.mean_ms = tuple(each.mean_ms for each in self.jobs)
 
     def speed(self, job: Runs, others: Sequence[Runs]) -> int:
-        """Return the speed of a job beside `others`: a network's by the bandwidth that they leave, `ONE` for others."""
+        """Return the speed of a job beside `others`, in units of 1 / ONE; a job without a network is never slowed."""
         own = self._job(job)
         if own is None:
             return ONE
@@ -175,7 +178,7 @@ class _Costs:
         return self.jobs[job.tenant].network_ms(job.network, use)
 
     def _demand(self, job: _Job) -> float:
-        """Return the share of the bandwidth that a network takes while it runs."""
+        """Return the share of the bandwidth that a network takes while it runs, 0 to 1."""
         moved = self.jobs[job.tenant].moved_bytes(job.network)
         return moved / (self._ms(job, self._always) / 1e3) / self._bytes_s
 
@@ -188,13 +191,14 @@ def predict_beside(
     governor: str | None = None,
     turns: str = ROUND_ROBIN,
 ) -> dict[str, Any]:
-    """Return everything about the `tenants` on one chip: each one beside the others and alone, and the chip's units.
+    """Return the prediction of `tenants` on one chip: each beside the others and by itself, and the chip's units.
 
     `profile`: hardware profile of the chip.
-    `performance_profile`: its name, one of PERFORMANCE_PROFILES.
+    `performance_profile`: one of PERFORMANCE_PROFILES.
     `minutes`: virtual time from a cold start; 0 for constant temperature.
-    `governor`: name in GOVERNORS; None for the profile's own.
-    `turns`: name in TURNS, the rule that chooses whose job a unit takes when several wait.
+    `governor`: name in GOVERNORS; None for the profile's governor.
+    `turns`: name in TURNS, the rule that chooses whose job a unit takes if several wait.
+
     Raises BadInputError for an unknown name or a time out of range.
     """
     corners = corners_of(profile, performance_profile)
@@ -236,9 +240,9 @@ def _base_w(profile: Profile) -> float:
 def _rate(
     profile: Profile, tenants: Sequence[Pipeline], number: int, corners: Corners, turns: str, frames: Mapping[str, Any]
 ) -> dict[str, dict[str, Any]]:
-    """Return `needs_ms` and `rate` of a pipeline; without an interval where this machine was not measured.
+    """Return the keys `needs_ms` and `rate` of tenant `number`; without an interval if the error is not known.
 
-    `frames`: its frames at its rate, as its report counts them.
+    `frames`: counts of its frames at its rate, from its report.
     """
     needs = needed(profile, tenants, number, corners, turns)
     rate = holding(tenants[number].fps, needs, wanted_drops(frames["dropped"]), frames=frames["requested"])
@@ -279,9 +283,10 @@ def _row(
 
 
 def _kept(report: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the part of a run's report that is shown both for a run beside others and for a run alone.
+    """Return the keys of a report that a prediction has for a tenant beside the others, and for the tenant by itself.
 
-    `in_time`: share of the released frames that were presented in time, without those that `every` leaves out.
+    The key `in_time` is the share of released frames that were presented in time, without the frames that `every`
+    leaves out.
     """
     frames, misses = report["frames"], report["deadline_misses"]
     wanted = frames["requested"] - sum(frames["dropped"].values()) + wanted_drops(frames["dropped"])
@@ -297,7 +302,7 @@ def _kept(report: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _settled_ms(moments: Sequence[Moment], at: Callable[[Corners], Together], number: int) -> float | None:
-    """Return the mean frame time of a pipeline in the last fifth of the time; None where no time passes."""
+    """Return the mean frame time of tenant `number` in ms in the last fifth of the moments; None without moments."""
     last = last_fifth(moments)
     return _mean([at(each.corners).runs[number].report["frame_time_ms"]["mean"] for each in last]) or None
 

@@ -1,10 +1,10 @@
-"""Pipelines that can share a chip: scenes, networks by themselves and pipeline files, and what their jobs cost there.
+"""Tenants, the pipelines that share a chip: scenes, networks and pipeline files, with the times of their jobs.
 
     jobs = tenant.on(profile, corners, "expected", 0.1)
     jobs.service_ns("infer", "dsp", 7, 0), jobs.mean_ms
 
-Rule: a tenant knows its own stages and times. `shared_chip.py` computes how several slow each other. It asks which
-network each job computes, and how long a network takes at less bandwidth.
+Rule: a tenant knows only its own stages and times. `shared_chip.py` computes how tenants slow each other. It asks which
+network each job computes, and how long a network takes with less bandwidth.
 """
 
 from __future__ import annotations
@@ -49,17 +49,18 @@ from trilane.scheduler.policy import POLICIES, run_settings
 from trilane.transport.slots import DEFAULT_EDGE
 from trilane.units import BYPASS, INFER, NS_PER_MS, NS_PER_S, UNITS, UnitName
 
-#: How frames are taken by default: only the newest counts, as with a camera; an older one is dropped.
+#: The default: only the newest frame counts, as with a camera; an older frame is dropped.
 NEWEST = Variant("latest", DEFAULT_EDGE)
 ENDLESS = 1 << 40
 SKIPS = -1
 
 
 class Jobs(Protocol):
-    """What the jobs of a pipeline cost on a chip, with its units at given corners.
+    """The times of a tenant's jobs on a chip, with its units at given corners.
 
-    `mean_ms`: mean milliseconds of a job by stage if no other pipeline runs. `bound_ms`: bound on the time of a frame
-    whose source is always ready; 0 where none is known. `is_known`: whether the error of every time is known.
+    `mean_ms`: mean time of a job by stage if no other tenant runs.
+    `bound_ms`: lower bound on the frame time if the source is always ready; 0 if none is known.
+    `is_known`: whether the error of every time is known.
     """
 
     @property
@@ -72,13 +73,13 @@ class Jobs(Protocol):
     def is_known(self) -> bool: ...
 
     def service_ns(self, stage: str, unit: str, frame: int, begin_ns: int) -> int:
-        """Return the time of a job if no other pipeline runs."""
+        """Return the time of a job in ns if no other tenant runs."""
 
     def network(self, stage: str, frame: int) -> Hashable | None:
-        """Return a name of the network that a job computes; None if it computes none."""
+        """Return a name for the network that a job computes; None if the job computes none."""
 
     def network_ms(self, network: Any, use: float) -> float:
-        """Return the time of a job with `network` while the share `use` of the memory's bandwidth is taken."""
+        """Return the time of a job with `network` in ms, while other jobs take the share `use` of the bandwidth."""
 
     def moved_bytes(self, network: Any) -> float:
         """Return the bytes that `network` moves in a job."""
@@ -87,12 +88,15 @@ class Jobs(Protocol):
 class Pipeline(Protocol):
     """A pipeline that shares a chip with others.
 
-    `name`: its name in reports. `source`: what was asked for. `kind`: avatar, network or pipeline. `fps`: frames
-    released a second. `takes_memory`: whether a camera, a display and the composition beside it use the memory all the
-    time. `repeats`: number of frames after which its jobs are the same again. `graph`: its stages, as the scheduler
-    knows them.
-    `fed`: graph and settings with a source that is always ready, and with every frame shown. `hardware`: for each of
-    its units, the unit of the chip that it stands for, or its own name.
+    `name`: name in reports.
+    `source`: text of the user's request.
+    `kind`: avatar, network or pipeline.
+    `fps`: frames that are released a second.
+    `takes_memory`: whether its camera, display and composition use the memory all the time.
+    `repeats`: number of frames after which its jobs are the same again.
+    `graph`: its graph for the scheduler.
+    `fed`: (graph, settings) for a run whose source is always ready and in which no frame is dropped.
+    `hardware`: unit of the chip for each of its units; a unit without one has its own name.
     """
 
     @property
@@ -123,19 +127,19 @@ class Pipeline(Protocol):
     def hardware(self) -> Mapping[str, str]: ...
 
     def settings(self, display_ns: int) -> Settings:
-        """Return the settings of its scheduler: frames without end, at its rate.
+        """Return the settings of its scheduler for endless frames at its rate.
 
         `display_ns`: shortest time between two shown frames of an avatar.
         """
 
     def skips(self, frame: int, is_fresh: bool) -> bool:
-        """Say whether a frame takes the bypass of the graph."""
+        """Return whether a frame takes the bypass of the graph."""
 
     def on(self, profile: Profile, corners: Corners, end: Ends, always: float) -> Jobs:
-        """Return what its jobs cost. `always`: share of the bandwidth that is taken all the time."""
+        """Return the times of its jobs. `always`: share of the bandwidth that is taken all the time, 0 to 1."""
 
     def facts(self, profile: Profile) -> dict[str, Any]:
-        """Return how it runs, for reports: `unit`, `numbers`, `precision`, `policy` and `edge`."""
+        """Return its keys `unit`, `numbers`, `precision`, `policy` and `edge` of a prediction."""
 
 
 def check_rate(name: str, fps: float) -> None:
@@ -148,11 +152,15 @@ def check_rate(name: str, fps: float) -> None:
 class Tenant:
     """An avatar, or a network by itself, as a `Pipeline`.
 
-    `networks`: one network for each shape of the tensor and number of avatars in view. `frames`: for each frame, the
-    place of its network in `networks`, or `SKIPS`; the list starts over after its end. `unit`: unit of the network.
-    `variant`: how the stages are joined. `is_bare`: whether there is nothing but the network, whose result is due when
-    the next frame comes. `avatars`: number of avatars in view for each of `networks`; empty for one each. `computes`:
-    how the networks compute. Raises BadInputError for a unit or a rate out of range.
+    `networks`: one network for each combination of tensor shape and number of avatars in view.
+    `frames`: for each frame, the index of its network in `networks`, or `SKIPS`; after its end the list starts over.
+    `unit`: unit of the network.
+    `variant`: how the stages are connected and scheduled.
+    `is_bare`: whether it consists only of the network, whose result is due when the next frame comes.
+    `avatars`: number of avatars in view for each of `networks`; empty for one avatar each.
+    `computes`: precision and runtime of the networks.
+
+    Raises BadInputError for a unit or a rate out of range.
     """
 
     name: str
@@ -210,12 +218,12 @@ class Tenant:
         return run_settings(policy, ENDLESS, shown_ns, shown_ns, **limits)
 
     def plan(self, kind: int, stretch: float = 1.0) -> Plan:
-        """Return what runs in a frame with the network at place `kind`. `stretch`: factor on the network's time."""
+        """Return the application of a frame with the network `networks[kind]`. `stretch`: factor on its time."""
         avatars = self.avatars[kind] if self.avatars else 1
         return Plan(self.networks[kind], self.unit, self.variant, avatars=avatars, stretch=stretch)
 
     def place(self, frame: int) -> int:
-        """Return the place of the frame's network, or SKIPS."""
+        """Return the index of the frame's network, or SKIPS."""
         return self.frames[frame % len(self.frames)]
 
     def skips(self, frame: int, is_fresh: bool) -> bool:  # noqa: ARG002 an older result is never shown again here
@@ -235,7 +243,10 @@ class Tenant:
 
 
 class _AvatarJobs:
-    """`Jobs` of a `Tenant`. `chip`: as its networks compute. A network is named by its place among the tenant's."""
+    """The `Jobs` of a `Tenant`. The name of a network is its index in `Tenant.networks`.
+
+    `chip`: hardware profile in the precision and under the runtime of the networks.
+    """
 
     is_known = True
     bound_ms = 0.0
@@ -246,7 +257,7 @@ class _AvatarJobs:
         self._ms: dict[tuple[int, float], dict[str, float]] = {}
         kinds = [kind for kind in tenant.frames if kind != SKIPS] or [0]
         each = [self._stages_ms(kind, always) for kind in kinds]
-        # Of the frames with a network; of the first network where no frame has one.
+        # The mean over the frames with a network; if no frame has one, the times of the first network.
         self.mean_ms = {stage: sum(times[stage] for times in each) / len(each) for stage in each[0]}
 
     def service_ns(self, stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
@@ -277,7 +288,7 @@ class _AvatarJobs:
             clock = unit.clock(self._corners[UNITS.index(tenant.unit)])
             time = time_on(unit, used.memory, tenant.networks[kind].work, clock, contended=True)
             return {INFER[0]: stretch * time.total_ms}
-        # Where the unit was measured, the other stages were measured with it, so they share its error.
+        # If the unit was measured, the other stages were measured together with it, so they have the same error.
         whole, of_network = (stretch, 1.0) if unit.measured is not None else (1.0, stretch)
         times = stage_times_ms(used, tenant.plan(kind, of_network), self._corners)
         return {stage: whole * ms for (stage, _), ms in times.items()}
@@ -295,8 +306,10 @@ class _AvatarJobs:
 class FileTenant:
     """A pipeline file, as a `Pipeline`.
 
-    `graphs`: graphs of its networks, by the stage's name. `precision`: int8, fp16 or fp32 for networks whose stage says
-    none; None: as each file says. Raises BadInputError for a file without a rate.
+    `graphs`: graphs of its networks, by the stage's name.
+    `precision`: int8, fp16 or fp32 for networks whose stage states none; None: the network and its unit decide.
+
+    Raises BadInputError for a file without a rate.
     """
 
     name: str
@@ -344,7 +357,7 @@ class FileTenant:
         return _FileJobs(self, profile, corners, end, always)
 
     def chip(self, stage: str, profile: Profile, unit: UnitName) -> Profile:
-        """Return `profile` with `unit` as it computes the network of `stage`."""
+        """Return `profile` with `unit` in the precision of the network of `stage`."""
         keys = self.file.stages[stage]
         asked = (keys.precision if isinstance(keys, OnnxStage) else None) or self.precision
         return Computes(self.graphs[stage].numbers, asked).on(profile, unit)
@@ -356,7 +369,7 @@ class FileTenant:
 
 
 class _Priced(NamedTuple):
-    """A network that the chip's model prices. `factor`: this end of its interval over the expected time."""
+    """A network whose time comes from the chip's model. `factor`: time at the end of its interval / expected time."""
 
     work: Work
     chip: Profile
@@ -365,7 +378,10 @@ class _Priced(NamedTuple):
 
 
 class _FileJobs:
-    """`Jobs` of a `FileTenant`. A network is named by its stage; one with a `time_ms` of its own takes no bandwidth."""
+    """The `Jobs` of a `FileTenant`. The name of a network is the name of its stage.
+
+    A network whose time the file states takes no bandwidth.
+    """
 
     def __init__(self, tenant: FileTenant, profile: Profile, corners: Corners, end: Ends, always: float) -> None:
         self._corners = corners
@@ -407,16 +423,16 @@ def _priced(
 
 
 def _used(profile: Profile, use: float) -> Profile:
-    """Return the chip while others take the share `use` of its memory's bandwidth."""
+    """Return the profile of the chip while other jobs take the share `use` of its memory's bandwidth."""
     fraction = profile.memory.application_use_fraction.model_copy(update={"value": use})
     memory = profile.memory.model_copy(update={"application_use_fraction": fraction})
     return profile.model_copy(update={"memory": memory})
 
 
 def moved_bytes(work: Work, unit: Unit) -> float:
-    """Return the bytes that a network moves in a job on `unit`: the elements of every operator, and the weights once.
+    """Return the bytes that a network moves in a job on `unit`: the elements of every operator, and all weights once.
 
-    A tensor engine moves only what does not stay on the chip.
+    On a tensor engine only elements that do not fit on the chip count.
     """
     if unit.engine is not None:
         return float(sum(spilled(work.layers, numbers_of(unit.engine).room)) + work.weights) * unit.element_bytes

@@ -1,15 +1,17 @@
-"""The time of one job of a network on a unit, and the relative error to expect of it.
+"""The time of one job of a network on a unit, and its expected relative error.
 
-A unit with a tensor engine is priced by layers, from shared terms and six numbers of the chip:
+For a unit with a tensor engine, the time is the sum over layers. It follows from the factors of terms, which all chips
+share, and from six rates of the chip:
 
     cost of a term    amount * factor / rate             factor: shared by all chips; rate: the chip's, one of six
     time of a layer   (a^4 + m^4 + s^4)^(1/4) + w + o    arithmetic, activations moved, spill; weights, fixed
 
-Products, movement and spill go on at once, so the slowest decides, with a smooth transition where two are alike (as in
-the roofline of Williams, Waterman and Patterson, 2009). Spill is what does not fit on the chip. The tensor that is read
-last goes out first (Belady, 1966: no rule moves less). No measured time is looked up anywhere.
+Products, movement and spill happen at the same time, so the slowest decides, with a smooth transition if two are about
+equal (as in the roofline of Williams, Waterman and Patterson, 2009). Spill is the elements that do not fit on the chip.
+The tensor whose next reader comes last is moved out first (Belady, 1966: no rule moves less). No measured time is
+looked up.
 
-Any other unit is priced by operators and a roofline:
+For any other unit, the time is the sum over operators by a roofline:
 
     time = job + operators * dispatch + input elements * conversion + weights / bandwidth
            + sum over operators of max(arithmetic, traffic) + operators that fall back to the CPU
@@ -34,14 +36,14 @@ from trilane.hw_profiles.network_work import Work
 from trilane.hw_profiles.operators import ARITHMETIC, CLASSES, INDEX, NAMES, RATES, TERMS, TRAFFIC, Layers
 from trilane.hw_profiles.schema import KEY_OF_RATE, Engine, Memory, Unit
 
-#: Which power joins what goes on at once: 1 would be one after the other, infinity the slowest alone.
+#: Exponent that combines parts that happen at the same time: 1 would add them, infinity would take only the slowest.
 JOINED = 4.0
-#: What decides an operator's time.
+#: The resource that decides an operator's time.
 Bound = Literal["arithmetic", "activation traffic", "spill", "weight traffic", "fixed"]
 BOUNDS: tuple[Bound, ...] = ("arithmetic", "activation traffic", "spill", "weight traffic", "fixed")
 #: Terms of each rate, as a mask (rates, terms).
 OF_RATE = np.array([[TERMS[name] == rate for name in NAMES] for rate in RATES])
-#: Terms that belong to the job and to no layer.
+#: Terms that belong to the job and not to a layer, as a mask (terms,).
 OF_JOB = np.array([name in ("input", "output", "job") for name in NAMES])
 
 
@@ -49,7 +51,8 @@ OF_JOB = np.array([name in ("input", "output", "job") for name in NAMES])
 class EngineNumbers:
     """An engine as plain numbers.
 
-    `seconds`: seconds of one unit of each term (terms,). `room`: elements that fit on the chip.
+    `seconds`: time of one unit of each term, in seconds (terms,).
+    `room`: number of activation elements that fit on the chip.
     """
 
     seconds: F64
@@ -58,10 +61,12 @@ class EngineNumbers:
 
 @dataclass(frozen=True)
 class EngineTime:
-    """Seconds of a job.
+    """The time of a job in seconds.
 
-    `layers`: by layer and bound (layers, 5). `job`: what belongs to no layer. `shares`: by term (terms,), how the whole
-    grows with each term; a term that another one hides has a small share.
+    `layers`: time by layer and bound (layers, 5).
+    `job`: time that belongs to no layer.
+    `shares`: share of each term in the growth of the whole time (terms,); a term that runs behind a slower one has a
+    small share.
     """
 
     layers: F64
@@ -77,8 +82,8 @@ def numbers_of(engine: Engine, clock_fraction: float = 1.0, memory_fraction: flo
     """Return the numbers of an engine.
 
     `engine`: tensor engine of a profile.
-    `clock_fraction`: fraction of its highest clock, above 0 to 1; it slows everything that happens on the engine.
-    `memory_fraction`: share of the memory's bandwidth that is left for it.
+    `clock_fraction`: fraction of the highest clock, above 0 to 1; it slows all work on the engine.
+    `memory_fraction`: share of the memory's bandwidth that is left for the engine, above 0 to 1.
     """
     # Only spill and weights cross the main memory; all other work slows down with the engine's clock.
     slower = {"spill": memory_fraction, "weight": memory_fraction}
@@ -88,7 +93,10 @@ def numbers_of(engine: Engine, clock_fraction: float = 1.0, memory_fraction: flo
 
 
 def amounts(network: Layers, room: int) -> F64:
-    """Return the amount of each term (layers + 1, terms): a row for each layer, with its spill, and one for the job."""
+    """Return the amount of each term (layers + 1, terms): a row for each layer, with its spill, then a row for the job.
+
+    `room`: number of activation elements that fit on the chip.
+    """
     table = np.vstack([network.table, np.zeros(len(NAMES))])
     table[:-1, INDEX["spill"]] = spilled(network, room)
     for name, amount in (("input", network.input), ("output", network.output), ("job", 1)):
@@ -97,7 +105,7 @@ def amounts(network: Layers, room: int) -> F64:
 
 
 def engine_time(network: Layers, engine: EngineNumbers, batch: int = 1) -> EngineTime:
-    """Return the time of one job of `batch` frames. Weights and fixed costs count once per job.
+    """Return the time of one job of `batch` frames; weights and fixed costs count once per job.
 
     `network`: layers of the network.
     `engine`: numbers of the engine.
@@ -110,15 +118,15 @@ def engine_time(network: Layers, engine: EngineNumbers, batch: int = 1) -> Engin
 
 
 def join(costs: F64) -> tuple[F64, F64]:
-    """Join the costs of each layer.
+    """Return (seconds by layer and bound (layers, 5), derivative of a layer's time by each cost (layers, terms)).
 
-    Return seconds by layer and bound (layers, 5), and how a layer's time grows with each cost (layers, terms). Parts
-    that go on at once divide the time by their shares in the sum of powers.
+    Parts that happen at the same time divide the layer's time in proportion to their powers.
+
     `costs`: seconds by layer and term (layers, terms).
     """
     by_rate = costs @ OF_RATE.T
     at_once = by_rate[:, :3]
-    # Relative to the largest, so that the powers neither overflow nor vanish.
+    # Relative to the largest, so that the powers neither overflow nor underflow.
     largest = np.maximum(at_once.max(axis=1, keepdims=True), 1e-30)
     powers = (at_once / largest) ** JOINED
     whole = largest * powers.sum(axis=1, keepdims=True) ** (1 / JOINED)
@@ -130,18 +138,18 @@ def join(costs: F64) -> tuple[F64, F64]:
 
 @lru_cache(maxsize=512)
 def spilled(network: Layers, room: int) -> tuple[int, ...]:
-    """Return elements that each layer reads from or sends to the main memory when `room` elements fit on the chip.
+    """Return the elements that each layer moves from and to the main memory if `room` elements fit on the chip.
 
     The network's input comes from the main memory, and its results go there. A layer's result stays on the chip until
-    its last reader. Where room is short, the tensor that is read last goes out, in part if a part is enough. A
-    concatenation moves nothing: its readers read its parts.
+    its last reader. If room is short, the tensor whose next reader comes last is moved out, only in part if a part is
+    enough. A concatenation moves nothing, because its readers read its parts.
     """
     chip = _Chip(network, room)
     return tuple(chip.run(index) for index in range(len(network.layers)))
 
 
 class _Chip:
-    """What lies on the chip: elements of each tensor, and when each will be read."""
+    """The content of the chip's memory: elements of each tensor, and the layers that will read it."""
 
     def __init__(self, network: Layers, room: int) -> None:
         self._layers, self._sizes, self._room = network.layers, network.sizes, room
@@ -156,11 +164,11 @@ class _Chip:
                 self._readers[name].append(index)
 
     def _read(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the tensors behind `names`, each once; a concatenation stands for its parts."""
+        """Return the tensors that `names` stand for, each once; a concatenation stands for its parts."""
         return tuple(dict.fromkeys(part for name in names for part in self._parts.get(name, (name,))))
 
     def _next(self, name: str, index: int) -> int:
-        """Return the next layer after `index` that reads the tensor, or one past the last."""
+        """Return the index of the next layer after `index` that reads the tensor; the number of layers without one."""
         return next((reader for reader in self._readers[name] if reader > index), len(self._layers))
 
     def run(self, index: int) -> int:
@@ -176,7 +184,7 @@ class _Chip:
         return moved + sum(self._keep(name, index) for name in (layer.writes, *layer.more))
 
     def _keep(self, name: str, index: int) -> int:
-        """Put the result of the layer `index` on the chip; return the elements that must go out for want of room."""
+        """Put the result `name` of the layer `index` on the chip; return the elements that are moved out for it."""
         size, soon, gone = self._sizes[name], self._next(name, index), 0
         if soon == len(self._layers):
             return size
@@ -196,11 +204,13 @@ TRAFFIC_KEYS = tuple(f"{kind}_traffic" for kind in ARITHMETIC) + TRAFFIC
 
 @dataclass(frozen=True)
 class JobTime:
-    """Milliseconds of one job by part: `fixed`, `input`, `weights`, `fallback` and the operator classes.
+    """The time of one job.
 
-    A tensor engine has `arithmetic`, `activation` and `spill` in place of the classes. `unsure`: relative error that
-    the engine's numbers leave; None for a roofline. `unlike`: how unlike the network is to `like`, the nearest network
-    that the numbers were fitted to, 0 to 1.
+    `parts`: time in ms by part: `fixed`, `input`, `weights`, `fallback` and the operator classes. A tensor engine has
+    `arithmetic`, `activation` and `spill` in place of the classes.
+    `unsure`: relative error from the spreads of the engine's numbers; None for a roofline.
+    `unlike`: distance of the network from `like`, 0 to 1.
+    `like`: nearest network of the fit of the engine's numbers; empty without one.
     """
 
     parts: Mapping[str, float]
@@ -221,7 +231,7 @@ def time_on(
     `unit`, `memory`: unit and memory of one profile.
     `work`: work of one frame.
     `clock_fraction`: fraction of the unit's highest clock, above 0 to 1.
-    `contended`: whether the rest of the application uses the memory meanwhile.
+    `contended`: whether the rest of the application uses the memory at the same time.
     `batch`: number of frames in the job.
     """
     if unit.engine is None:
@@ -239,10 +249,10 @@ def time_on(
 
 
 def relative_error(job: JobTime, unit: Unit) -> float:
-    """Return the relative error to expect of the time of `job` on `unit`; for a measured unit, the measured error.
+    """Return the expected relative error of the time of `job` on `unit`; for a measured unit, the measured error.
 
-    For other units it joins two errors: that of the numbers behind each part of the time, and that of the model itself.
-    It multiplies both by the unit's `error_scale`, which rows of the user's own give.
+    For another unit, it combines the error of the numbers behind each part of the time and the error of the model. Both
+    are multiplied by the unit's `error_scale`, which comes from the user's own rows.
     """
     if unit.measured is not None:
         return unit.measured.error
@@ -266,9 +276,9 @@ def relative_error(job: JobTime, unit: Unit) -> float:
 def layer_times(
     unit: Unit, memory: Memory, work: Work, clock_fraction: float = 1.0, *, contended: bool = False, batch: int = 1
 ) -> EngineTime:
-    """Return the seconds of each layer on the engine of `unit`, 0 for a layer that falls back to the CPU.
+    """Return the time of each layer on the engine of `unit`; it is 0 for a layer that runs on the CPU instead.
 
-    Parameters: as in `time_on`.
+    The parameters are those of `time_on`.
     """
     assert unit.engine is not None
     left = 1 - (memory.application_use_fraction.or_else(0.0) if contended else 0.0)
@@ -278,21 +288,22 @@ def layer_times(
 
 
 def fallback_ms(unit: Unit, work: Work, batch: int = 1) -> list[tuple[str, float]]:
-    """Return the name and milliseconds of each operator that the unit hands to the CPU."""
+    """Return (name, time in ms) of each operator that runs on the CPU instead of the unit."""
     fixed, each = unit.fallback_fixed_ms.or_else(0.0), unit.fallback_ns_per_element.or_else(0.0) / 1e6
     return [(o.name, fixed + batch * o.out * each) for o in work.operators if o.op_type in unit.fallback]
 
 
 def _permutes_ms(unit: Unit, work: Work) -> float:
-    """Return the milliseconds that a picture in several tensors costs."""
+    """Return the additional time in ms if the picture comes in several tensors; otherwise 0."""
     return unit.permute_fixed_ms.or_else(0.0) if work.input_tensors > 1 else 0.0
 
 
 def nearest(engine: Engine, shares: F64) -> tuple[float, str]:
-    """Return how unlike a network is to the nearest one of the fit of the engine's numbers, and the name of that one.
+    """Return (distance of a network from the nearest network of the engine's fit, name of the latter).
 
-    The distance is the total variation of both networks' shares: the part of the time that goes into other terms, 0 to
-    1. An engine that names no networks gives 1 and "".
+    The distance is the total variation distance of both networks' shares, 0 to 1. For an engine that names no networks
+    the result is (1, "").
+
     `shares`: share of each term in the network's time (terms,).
     """
     own = dict(zip(NAMES, shares.tolist(), strict=True))
@@ -300,18 +311,15 @@ def nearest(engine: Engine, shares: F64) -> tuple[float, str]:
 
 
 def _apart(own: Mapping[str, float], others: Mapping[str, float]) -> float:
-    """Return half the sum of absolute differences of two networks' shares.
-
-    A term that `others` do not name counts as 0.
-    """
+    """Return half the sum of the absolute differences of two networks' shares; a missing term of `others` is 0."""
     # The shares of `own` sum to 1, so the 1 contains the terms that `others` does not name.
     return (1 + sum([abs(own[name] - share) - own[name] for name, share in others.items()])) / 2
 
 
 def unsure(engine: Engine, shares: F64) -> float:
-    """Return the relative error that the engine's numbers leave in the time of a job.
+    """Return the relative error of a job's time that comes from the spreads of the engine's numbers.
 
-    `shares`: share of each term in its time (terms,).
+    `shares`: share of each term in the job's time (terms,).
     """
     of_rates = [sum(s for n, s in zip(NAMES, shares, strict=True) if TERMS[n] == rate) for rate in RATES]
     spreads = [getattr(engine.rates, KEY_OF_RATE[rate][0]).relative_error for rate in RATES]
@@ -323,12 +331,16 @@ def unsure(engine: Engine, shares: F64) -> float:
 class UnitNumbers:
     """A unit as plain numbers. Rates are per second, times in seconds.
 
-    `arithmetic`: multiply-accumulates per second of each of CLASSES, infinite for classes without products. `traffic`:
-    bytes per second of each of CLASSES. `stream`: bytes of weights per second. `element_bytes`: bytes of one element.
-    `block`: multiple to which channel counts are rounded up. `job`, `operator`: fixed time of a job, of an operator.
-    `input`: time of an element of the network's input. `permute`: extra time where the input comes as several tensors.
-    `fallback`: ONNX types of the operators that run on the CPU; `fallback_job`: fixed time of each; `fallback_element`:
-    time of an element of its result.
+    `arithmetic`: rate of multiply-accumulates of each of CLASSES (classes,); infinite for classes without products.
+    `traffic`: rate of bytes of each of CLASSES (classes,).
+    `stream`: rate of bytes of weights.
+    `element_bytes`: bytes of one element.
+    `block`: multiple to which channel counts are rounded up.
+    `job`, `operator`: fixed times of a job and of an operator.
+    `input`: time of an element of the network's input.
+    `permute`: additional time if the input comes as several tensors.
+    `fallback`: ONNX types of the operators that run on the CPU.
+    `fallback_job`, `fallback_element`: fixed time of such an operator, and time of an element of its result.
     """
 
     arithmetic: NDArray[np.float64]
@@ -346,12 +358,12 @@ class UnitNumbers:
 
 
 def machine_of(unit: Unit, memory: Memory, clock_fraction: float = 1.0, contended: bool = False) -> UnitNumbers:
-    """Return the numbers of a unit, all of them slower by the factor that was measured for the unit.
+    """Return the numbers of a unit; for a measured unit, all are slower by the measured factor.
 
     `unit`: unit of a profile.
     `memory`: memory of the same profile.
-    `clock_fraction`: fraction of its highest clock, above 0 to 1.
-    `contended`: whether the rest of the application uses the memory meanwhile.
+    `clock_fraction`: fraction of the unit's highest clock, above 0 to 1.
+    `contended`: whether the rest of the application uses the memory at the same time.
     """
     use = memory.application_use_fraction.or_else(0.0) if contended else 0.0
     bandwidth = memory.bandwidth_gb_s.or_else(10.0) * 1e9 * (1 - use)
@@ -375,7 +387,7 @@ def machine_of(unit: Unit, memory: Memory, clock_fraction: float = 1.0, contende
 
 
 def job_time(work: Work, machine: UnitNumbers, batch: int = 1) -> JobTime:
-    """Return the time of one job of `batch` frames. The fixed costs and the weights count once per job."""
+    """Return the time of one job of `batch` frames; fixed costs and weights count once per job."""
     classes, counts = work.classes, work.table
     on_cpu = np.array([o.op_type in machine.fallback for o in work.operators], dtype=bool)
     seconds = np.where(on_cpu, 0.0, _operator_seconds(counts, classes, machine))
@@ -394,7 +406,11 @@ def job_time(work: Work, machine: UnitNumbers, batch: int = 1) -> JobTime:
 def _operator_seconds(
     counts: NDArray[np.float64], classes: NDArray[np.int64], machine: UnitNumbers
 ) -> NDArray[np.float64]:
-    """Return the seconds of each operator (operators,): the larger of its arithmetic and its traffic."""
+    """Return the time of each operator in seconds (operators,): the larger of its arithmetic and its traffic.
+
+    `counts`: counts of the operators (operators, 5), from `Work.table`.
+    `classes`: index into CLASSES of each operator (operators,).
+    """
     macs, moved, c_in, c_out = counts[:, 0], counts[:, 1], counts[:, 2], counts[:, 3]
     padded = macs * _padding_factor(c_in, machine.block) * _padding_factor(c_out, machine.block)
     arithmetic = np.where(classes == CLASSES.index("depthwise"), macs, padded) / machine.arithmetic[classes]
@@ -404,6 +420,6 @@ def _operator_seconds(
 
 
 def _padding_factor(channels: NDArray[np.float64], block: float) -> NDArray[np.float64]:
-    """Return `channels` rounded up to whole blocks, over `channels`; 1 for an operator without products."""
+    """Return (`channels` rounded up to whole blocks) / `channels`; 1 for an operator without products."""
     known = np.maximum(channels, 1.0)
     return np.ceil(known / block) * block / known

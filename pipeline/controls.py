@@ -1,10 +1,11 @@
-"""Requests to a live run: controls, frames on request, and signals.
+"""Requests to a live run: controls, frame requests, and signals.
 
-Rule: any thread may send a request; the run handles it between two of its steps, on its own thread. A signal interrupts
-nothing: its handler only counts.
+Rule: any thread may send a request; the run handles it between two of its steps, on its own thread. A signal handler
+only counts the signal.
 
-A request becomes an event of the scheduler, so the recording holds it and a replay does the same. A kill becomes an
-event when the unit's end is heard. Frames that were asked for are answered in the order in which they were presented.
+A request becomes an event of the scheduler, so that the recording contains it and a replay repeats it. A kill becomes
+an event when the end of the unit's process is noticed. Requested frames are answered in the order in which they were
+presented.
 """
 
 from __future__ import annotations
@@ -25,7 +26,10 @@ ALL = -1
 
 
 class RunControls:
-    """Passes requests to one run; once the run is over, they do nothing."""
+    """Passes requests to one run; once the run is over, requests do nothing.
+
+    `fd`: descriptor that becomes readable with each request.
+    """
 
     def __init__(self) -> None:
         self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
@@ -71,12 +75,13 @@ class RunControls:
 
 
 class FrameRequestQueue:
-    """Passes requests for frames to one run; frames are numbered from 0 in the order of the requests.
+    """Passes frame requests to one run; frames are numbered from 0 in the order of the requests.
 
-    `answered(frame)`: function that is called when the frame was presented.
-    `ended()`: function that is called when the run is over, after which nothing is answered.
+    `answered(frame)`: function that is called when a frame was presented.
+    `ended()`: function that is called when the run is over; no frame is answered after it.
     `unanswered(causes)`: function that is called once, when the first frames were dropped or lost. `causes`: number of
     these frames by the cause's key in the report.
+    `is_open`: event that is set when the run takes requests, and when it is over.
     """
 
     def __init__(
@@ -98,11 +103,11 @@ class FrameRequestQueue:
         self._put(FrameRequest(count))
 
     def end(self) -> None:
-        """Ask for no more frames; those that were asked for are finished."""
+        """Ask for no more frames; the requested frames are finished."""
         self._put(Stop())
 
     def events(self) -> list[Event]:
-        """Return what was requested since the last call."""
+        """Return the requests since the last call."""
         events: list[Event] = []
         with contextlib.suppress(IndexError):
             while True:
@@ -110,13 +115,13 @@ class FrameRequestQueue:
         return events
 
     def tell_unanswered(self, causes: Mapping[str, int]) -> None:
-        """Tell the caller how many frames were dropped or lost so far, by cause; called by the run."""
+        """Call `unanswered` with the number of dropped and lost frames by cause, the first time that there are any."""
         if causes and not self._told:
             self._told = True
             self._unanswered(causes)
 
     def close(self) -> None:
-        """Note that the run is over: call `ended`, and let whoever waits for `is_open` go on."""
+        """Note that the run is over: call `ended`, and set `is_open` so that no thread waits for it any longer."""
         with self._lock:
             if self._closed:
                 return
@@ -135,9 +140,10 @@ class FrameRequestQueue:
 class Interrupts:
     """Context manager that counts signals and makes `fd` readable at each; it does nothing outside the main thread.
 
-    SIGPIPE is ignored meanwhile, as Python does it: a message to a unit that is gone must not end the program.
+    Within the context SIGPIPE is ignored: a message to a unit that is gone must not end the program.
 
-    `count`: number of signals that end a run. `last`: the last of them.
+    `count`: number of signals so far that end a run.
+    `last`: the last of these signals.
     `continued`: number of times that this process went on after a signal had stopped it.
     """
 

@@ -1,17 +1,17 @@
-"""What bounds the frame time: the critical path of jobs and waits that ends with a presented frame, walked backwards.
+"""Finds what bounds the frame time: the critical path, walked backwards from a presented frame.
 
-Rule: a job begins when the last thing that it needs is there. It needs its input, its unit, a slot, room in flight, and
-its frame's release. Of several inputs, the one that came last counts. The path goes on with the job that brought the
-last thing. Time between the two belongs to no job: overhead, a cap, a restart. Therefore the pieces of a path follow
-each other without gaps and sum to the time that it spans.
+Rule: a job begins when the last of its conditions is met. The conditions are its input, its unit, a slot, room in
+flight, and its frame's release. If a job has several inputs, the last input counts. The path goes on with the job whose
+end met the last condition. Time between the two jobs belongs to neither: overhead, a cap, a restart. Therefore the
+pieces of a path follow each other without gaps and add up to the time that it spans.
 
-The last thing is known, not guessed. If a job was handed over while its unit did another job, it waited for that job.
-Any other job waited for a job whose end the scheduler heard of in the step that handed it over.
+The job that met the last condition is known, not guessed. If a job was handed over while its unit did another job, it
+waited for that job. Any other job waited for a job whose end the scheduler heard of in the step that handed it over.
 
-Units that share cores slow each other down, although neither brings the other anything. Therefore time in which a job
-on the path had no core belongs to the stage whose job had the core (`Sharing`). The kernel counted how long a job had
-no core. Meanwhile other jobs ran on cores that both units may use; `Sharing` computes from them which stage had the
-core. For the rest of the time no job of this run had it, but another program, or a thread between jobs.
+Units that share cores slow each other down, although neither needs the other's result. Therefore time in which a job on
+the path had no core belongs to the stage whose job had the core (`Sharing`). The kernel counted how long a job had no
+core. In that time other jobs ran on cores that both units may use; from them `Sharing` computes which stage had the
+core. For the rest of the time another program had it, or a thread of a unit between two jobs.
 """
 
 from __future__ import annotations
@@ -27,14 +27,16 @@ from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.stats import LEAST_FRAMES, batch_interval
 
-DELAY: Final = 256  # in jobs; all that ran beside a job have ended after as many further jobs
+DELAY: Final = 256  # number of further jobs after which all jobs that ran beside a job have ended
 
 
 class Taken(NamedTuple):
-    """Times of all jobs of a stage together, in ns.
+    """Sums over all jobs of a stage, in ns.
 
-    `of`: time in which a job of another stage had the core that they lacked, by that stage.
-    `other_ns`: time without a core that no job of the run explains.
+    `service_ns`: time from begin to end of the jobs.
+    `preempted_ns`: time in which the jobs had no core.
+    `of`: part of `preempted_ns` in which a job of another stage had the core, by that stage.
+    `other_ns`: part of `preempted_ns` that no job of the run explains.
     """
 
     unit: str
@@ -49,9 +51,10 @@ class Taken(NamedTuple):
 
 
 class Sharing:
-    """Computes, for the jobs of each stage, which other stages had the core while they had none.
+    """Computes for the jobs of each stage which other stages had the core while these jobs had none.
 
-    `cores`: numbers of the cores of each unit; empty where not known.
+    `cores`: numbers of the cores of each unit; a unit whose cores are not known is missing.
+    `delay`: number of further jobs after which all jobs that ran beside a job have ended.
     """
 
     def __init__(self, cores: Mapping[str, Sequence[int]], delay: int = DELAY) -> None:
@@ -76,16 +79,16 @@ class Sharing:
             self._count(self._waiting.popleft())
 
     def close(self) -> dict[str, Taken]:
-        """Return for each stage which stages had the core while it lacked one; called after the last job."""
+        """Return the sums of each stage, by its name; called after the last job."""
         while self._waiting:
             self._count(self._waiting.popleft())
         return self._sums
 
     def taken(self, unit: str, begin_ns: int, end_ns: int, lacked_ns: int) -> dict[str, int]:
-        """Return how long each stage's jobs had the core that `unit` lacked between two times.
+        """Return the time in ns in which each stage's jobs had the core that `unit` lacked between two times.
 
-        The time without a core, `lacked_ns`, is divided in proportion to how long the jobs ran between the two times.
-        No stage gets more than its jobs ran.
+        `lacked_ns`, the unit's time without a core, is divided among the stages. Each stage's part is proportional to
+        the time that its jobs ran between the two times, and is not longer than this time.
         """
         if not lacked_ns:
             return {}
@@ -117,7 +120,10 @@ def _end_ns(job: JobRecord) -> int:
 
 
 def _within_ns(job: JobRecord, begin_ns: int, end_ns: int) -> int:
-    """Return how long `job` ran between two times, without its share of time in which it had no core or slept."""
+    """Return the time in ns that `job` ran between two times.
+
+    The job's time without a core and its sleep are assumed to be spread evenly over the job.
+    """
     ns = min(job.end_ns, end_ns) - max(job.begin_ns, begin_ns)
     length_ns = job.end_ns - job.begin_ns
     return ns * max(length_ns - job.preempted_ns - job.asleep_ns, 0) // length_ns if ns > 0 else 0
@@ -142,10 +148,10 @@ WHATS = {
 }
 #: The causes into which a gap between two jobs is divided, in this order; the rest is overhead.
 OF_GAPS = (LOST, DOWN, THROTTLED, HELD, PREEMPTED)
-MARGIN: Final = 32  # presented frames after which paths that end with different frames have met
+MARGIN: Final = 32  # number of presented frames within which paths that end with different frames meet
 STEP: Final = 3 * LEAST_FRAMES
 MOST_BLOCKS: Final = 128
-#: Kinds of pieces whose time is the stage's and its unit's. All other time is named after its kind.
+#: Kinds of pieces whose time belongs to the stage and its unit. All other time is named after its kind.
 OF_STAGES = frozenset({WORK, TAKEN, ASLEEP, THROTTLED, LOST, DOWN})
 OTHER_PROGRAMS = "other programs"
 
@@ -153,9 +159,11 @@ OTHER_PROGRAMS = "other programs"
 class Piece(NamedTuple):
     """A piece of a path.
 
-    `job`: job to which it belongs, or before which it lies.
-    `stage`: stage of that job, or a stage of the unit that was down.
-    `asleep`: kind of the time in which the job slept.
+    `what`: kind of the piece, a key of `WHATS`.
+    `stage`: stage of `job`; for DOWN, a stage of the unit that was down.
+    `job`: job whose time the piece is part of, or the first job after the piece.
+    `begin_ns`, `end_ns`: begin and end of the piece, in ns of the run's clock.
+    `asleep`: kind that the job's sleep counts as, ASLEEP or STOPPED.
     """
 
     what: str
@@ -170,8 +178,8 @@ class Paths:
     """Keeps the last jobs of a run, and walks back through them.
 
     `graph`, `settings`: graph and settings of the run.
-    `downs`: times in which units were down so far, as `Timeline` notes them.
-    `stalls`: times in which the scheduler did not run so far, as `Timeline` notes them.
+    `downs`: times so far in which units were down (`Timeline.downs`).
+    `stalls`: times so far in which the scheduler did not run (`Timeline.stalls`).
     `kept`: number of jobs that are kept.
     """
 
@@ -197,7 +205,7 @@ class Paths:
         self._stage_of = {stage.unit: stage.name for stage in reversed(graph.stages)}
         self._downs, self._stalls, self._kept = downs, stalls, kept
         self._jobs: OrderedDict[Key, ExplainedJob] = OrderedDict()
-        self._before: dict[Key, Key] = {}  # the job that the same unit did before
+        self._before: dict[Key, Key] = {}  # the unit's job before each job
         self._last_of_unit: dict[str, Key] = {}
         self._input: dict[Key, Key] = {}
         self._last_of_frame: dict[int, Key] = {}
@@ -229,7 +237,7 @@ class Paths:
             del self._last_of_frame[key[1]]
 
     def walk(self, last: ExplainedJob, until_ns: int) -> Iterator[Piece]:
-        """Yield the pieces from the end of `last` back to `until_ns`, the last first."""
+        """Yield the pieces from the end of `last` back to `until_ns`, the latest piece first."""
         now: ExplainedJob | None = last
         end_ns = last.job.end_ns
         while now is not None and end_ns > until_ns:
@@ -243,7 +251,11 @@ class Paths:
             now, end_ns = before, from_ns
 
     def _gap(self, now: ExplainedJob, from_ns: int, released: bool, is_first: bool) -> Iterator[Piece]:
-        """Yield the pieces between `from_ns` and the begin of `now`, the last first."""
+        """Yield the pieces between `from_ns` and the begin of `now`, the latest piece first.
+
+        `released`: whether the job also waited for its frame's release.
+        `is_first`: whether the job that the path goes on with is not known.
+        """
         job = now.job
         if released:
             ready_ns = min(max(job.ready_ns, from_ns), job.begin_ns)
@@ -256,7 +268,7 @@ class Paths:
             yield from _divided(now, from_ns, HELD if is_latched else self._overhead(now, from_ns))
 
     def _overhead(self, now: ExplainedJob, from_ns: int) -> str:
-        """Return what the time from `from_ns` to the begin of `now` is that has no other cause."""
+        """Return the kind of the time from `from_ns` to the begin of `now` that has no other cause."""
         begin_ns = now.job.begin_ns
         for stall in reversed(self._stalls):
             if stall.end_ns <= from_ns:
@@ -266,9 +278,9 @@ class Paths:
         return STOPPED if from_ns < now.stopped_ns <= begin_ns else OVERHEAD
 
     def _unreleased(self, job: JobRecord, from_ns: int, end_ns: int) -> Iterator[Piece]:
-        """Yield the time before a frame was released.
+        """Yield the pieces of the time before a frame was released, the latest piece first.
 
-        A unit that was down then explains why no frame before it got through.
+        If a unit was down in this time, that explains why no earlier frame was presented.
         """
         for down in reversed(self._downs):
             if end_ns <= from_ns or down.end_ns <= from_ns:
@@ -282,11 +294,11 @@ class Paths:
         yield Piece(RELEASE, job.stage, job, from_ns, end_ns)
 
     def _bound_by(self, now: ExplainedJob) -> tuple[ExplainedJob | None, bool]:
-        """Return the job whose end let `now` begin, and whether `now` then still had to wait for its release."""
+        """Return (job whose end let `now` begin, or None; whether `now` also waited for its frame's release)."""
         key, job = now.key, now.job
         own = [self._before.get(key), self._input.get(key)]
         mine = self._jobs.get(own[0]) if own[0] else None
-        # It was handed over while its unit did another job, so it waited for that one.
+        # The job was handed over while its unit did another job, so it waited for the end of that job.
         if mine is not None and mine.job.end_ns > job.dispatch_ns:
             return mine, False
         heard = [other for other in now.after if other in own or other[0] in self._next[job.stage]]
@@ -296,20 +308,23 @@ class Paths:
         return found, False
 
     def _shown_by(self, by_ns: int) -> ExplainedJob | None:
-        """Return the job that presented the last frame before `by_ns`."""
+        """Return the job that presented the last frame up to `by_ns`; None if it is not kept."""
         shown = (self._jobs[key] for key in reversed(self._presented) if key in self._jobs)
         return next((each for each in shown if each.job.end_ns <= by_ns), None)
 
     def _latest(self, keys: list[Key], job: JobRecord) -> ExplainedJob | None:
-        """Return the job of `keys` that ended last before `job` began."""
+        """Return, of the jobs in `keys` that ended before `job` began, the one that ended last; None without one."""
         ended = [self._jobs[key] for key in keys if key in self._jobs and self._jobs[key].job.end_ns <= job.begin_ns]
         return max(ended, key=lambda each: each.job.end_ns, default=None)
 
 
 def _divided(now: ExplainedJob, from_ns: int, rest: str) -> Iterator[Piece]:
-    """Yield the gap before a job, by causes.
+    """Yield the gap before a job as one piece for each cause, the latest piece first.
 
-    Where in the gap each cause lay is not kept: the time without a cause, `rest`, is placed last.
+    The true order of the causes is not known. The time without a cause becomes the latest piece.
+
+    `from_ns`: begin of the gap.
+    `rest`: kind of the time without a cause.
     """
     end_ns = now.job.begin_ns
     left_ns = end_ns - from_ns
@@ -334,11 +349,11 @@ Part = tuple[str, str]
 
 
 def parts(piece: Piece, begin_ns: int, end_ns: int, sharing: Sharing | None = None) -> dict[Part, int]:
-    """Return the ns of a piece between two times, by kind and stage.
+    """Return the time of a piece between `begin_ns` and `end_ns` in ns, by kind and stage.
 
-    It is not known where in a job the unit was preempted or asleep. Therefore each part of the job gets the same share
-    of that time.
-    `sharing`: tells which stages had a core that the job lacked; None: no job of the run had it.
+    It is not known when in a job the unit was preempted or asleep. Therefore this time is spread evenly over the job.
+
+    `sharing`: object that says which stages had the core that a job lacked; None: no job of the run had it.
     """
     ns = min(piece.end_ns, end_ns) - max(piece.begin_ns, begin_ns)
     if ns <= 0:
@@ -361,9 +376,13 @@ def parts(piece: Piece, begin_ns: int, end_ns: int, sharing: Sharing | None = No
 
 
 def _divided_preempted(stage: str, ns: int, taken: Mapping[str, int], lacked_ns: int) -> dict[Part, int]:
-    """Divide `ns` without a core by who had it: each stage gets the share that `taken` has in `lacked_ns`.
+    """Return how `ns`, a time without a core, is divided among the stages that had the core.
 
-    The rest was taken by no stage, and counts as preempted.
+    Each stage gets the same share of `ns` that it has of `lacked_ns`. The rest counts as preempted.
+
+    `stage`: stage of the job without a core.
+    `taken`: time in ns in which each stage had the core.
+    `lacked_ns`: whole time without a core.
     """
     found = {(TAKEN, other): ns * of_other // lacked_ns for other, of_other in taken.items()}
     left_ns = ns - sum(found.values())
@@ -371,13 +390,15 @@ def _divided_preempted(stage: str, ns: int, taken: Mapping[str, int], lacked_ns:
 
 
 class Budget:
-    """What bounded a whole run: the path that ends with its last frame.
+    """The critical path of a whole run, as time by kind and stage.
 
-    A path is walked back from every STEP-th presented frame. Each walk leaves the last MARGIN frames before its start
-    to the next walk, because paths that end with different frames meet within that margin. Therefore the cost per frame
-    does not grow with the run. `ns_of` counts from the first presented frame.
+    A path is walked back from every STEP-th presented frame. A walk does not count the last MARGIN frames before its
+    start: paths that end with different frames meet within this margin, so the next walk counts these frames.
+    Therefore the cost per frame does not grow with the run.
 
-    `sharing`: tells which stages had a core that a job lacked.
+    `paths`: jobs of the run so far.
+    `sharing`: object that says which stages had a core that a job lacked.
+    `ns_of`: time of the path in ns by kind and stage, from the first presented frame on.
     """
 
     def __init__(self, paths: Paths, sharing: Sharing | None = None) -> None:
@@ -385,7 +406,7 @@ class Budget:
         self._since: deque[int] = deque()
         self._from_ns: int | None = None
         self._newest: ExplainedJob | None = None
-        self._blocks: list[dict[Part, int]] = []  # of equally many frames each, in order
+        self._blocks: list[dict[Part, int]] = []  # one for each run of the same number of frames, in order
         self._merged = 1  # number of blocks that were merged into one
         self._open: list[dict[Part, int]] = []
         self.ns_of: dict[Part, int] = {}
@@ -401,7 +422,7 @@ class Budget:
             self._cut([self._since.popleft() for _ in range(STEP)][LEAST_FRAMES - 1 :: LEAST_FRAMES])
 
     def close(self) -> dict[Part, int]:
-        """Return ns by kind and stage; called after the last frame."""
+        """Count the rest of the path, and return `ns_of`; called after the last frame."""
         if self._newest is not None and self._since:
             ends_ns = [*self._since][LEAST_FRAMES - 1 :: LEAST_FRAMES]
             is_whole = len(self._since) % LEAST_FRAMES == 0
@@ -410,10 +431,11 @@ class Budget:
         return self.ns_of
 
     def names(self, unit_of: Mapping[str, str]) -> dict[str, dict[Part, str]]:
-        """Return the owner of each part of the path: by `unit`, and by `stage` for parts that a stage owns.
+        """Return two maps from parts of the path to names: `unit` has all parts, `stage` only the parts of stages.
 
-        `unit_of`: unit of each stage. Time that no unit owns is named after its kind: other programs, release,
-        overhead, held.
+        Time that belongs to no unit is named after its kind: other programs, release, overhead, held.
+
+        `unit_of`: unit of each stage.
         """
         stages = {part: part[1] for part in self.ns_of if part[0] in OF_STAGES}
         names = {PREEMPTED: OTHER_PROGRAMS}
@@ -421,10 +443,12 @@ class Budget:
         return {"unit": units, "stage": stages}
 
     def largest(self, name_of: Mapping[Part, str]) -> dict[str, Any] | None:
-        """Return the `share` of the name with most of the path, and its rivals; None without a path.
+        """Return the largest `share` of a name in the path, with its `rivals`; None without a path.
 
         Rivals are the names whose share may be as large: the 95 % interval of the difference contains 0. Called after
         `close`.
+
+        `name_of`: name of each part of the path, from `names`.
         """
         sums = _by_name(self.ns_of, name_of)
         if not sums:
@@ -437,7 +461,7 @@ class Budget:
         return {**self.share(name_of, name), "rivals": rivals}
 
     def share(self, name_of: Mapping[Part, str], name: str) -> dict[str, Any]:
-        """Return the share of `name` in the path, with its 95 % interval by the scatter over frames."""
+        """Return `name`, its `share` in the path, and `share_low` and `share_high`, the bounds of its 95 % interval."""
         share = _by_name(self.ns_of, name_of).get(name, 0) / sum(self.ns_of.values())
         half = self._half_width(name_of, name)
         low, high = (None, None) if half is None else (max(share - half, 0.0), min(share + half, 1.0))
@@ -450,14 +474,15 @@ class Budget:
         return {name: ns / total for name, ns in sorted(sums.items(), key=lambda row: -row[1])}
 
     def _half_width(self, name_of: Mapping[Part, str], name: str, other: str = "") -> float | None:
-        """Return half the interval of a share, or of its difference from the share of `other`."""
+        """Return half the 95 % interval of the share of `name`, or of its difference from the share of `other`."""
         blocks = [(_by_name(block, name_of), max(sum(block.values()), 1)) for block in self._blocks]
         return batch_interval([(ns.get(name, 0) - ns.get(other, 0)) / of for ns, of in blocks])
 
     def _cut(self, ends_ns: Sequence[int], *, is_whole: bool = True) -> None:
-        """Count the path from its counted part to the last of `ends_ns`, in blocks that end with each of them.
+        """Count the path from the end of its counted part up to the last of `ends_ns`, in blocks.
 
-        `is_whole`: whether the last block has as many frames as the others.
+        `ends_ns`: end of each block, in ns.
+        `is_whole`: whether the last block has as many frames as the other blocks.
         """
         assert self._newest is not None
         assert self._from_ns is not None
@@ -474,7 +499,7 @@ class Budget:
         self._keep()
 
     def _keep(self) -> None:
-        """Store blocks that are whole; at MOST_BLOCKS, merge each two neighbours into one."""
+        """Store whole blocks; when there are MOST_BLOCKS, merge each two neighbours into one."""
         while len(self._open) >= self._merged:
             block: dict[Part, int] = {}
             for each in self._open[: self._merged]:

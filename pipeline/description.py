@@ -1,14 +1,13 @@
 """Describes a pipeline as data: stages, the edges between them, and the units that they run on.
 
-Rule: it does not know what a stage does; it knows only the name of the stage's factory. A `Pipeline` is plain data, so
-that JSON can carry it to a unit's process.
+Rule: this module does not know what a stage does; it knows only the name of the stage's factory. A `Pipeline` is plain
+data, so that JSON can carry it to a unit's process.
 
-Writes a pipeline's description as the text of a pipeline file, and says what such a file cannot hold.
+The module also writes a description as the text of a pipeline file, and says what such a file cannot contain:
 
     tables = tables_of(pipeline, {"policy": "latest", "fps": 30.0}, {"camera": 0.4})
     text = file_text(tables, unsaid(pipeline))
 
-Rule: this module writes any description, by its stages, edges and units; it does not know what the stages do.
 `pipeline_file.checked_tables` reads the same tables, so every written file can be checked and predicted.
 """
 
@@ -41,9 +40,9 @@ from trilane.transport.slots import DEFAULT_EDGE, edge_rule
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
 from trilane.units import NS_PER_MS
 
-LONGEST_FOUND = 120  # of a wrong value, in characters, as a message shows it
-LONGEST_NAME = 40  # of a stage or unit; a socket of that name must fit into a path of 107 bytes
-MOST_EDGES = 200  # of one unit; their memory and all else that it gets must fit into one message of 250 descriptors
+LONGEST_FOUND = 120  # characters of a wrong value that a message shows
+LONGEST_NAME = 40  # characters of a stage or unit; a socket of that name must fit into a path of 107 bytes
+MOST_EDGES = 200  # edges of one unit; all its descriptors must fit into one message of 250 descriptors
 FACTORY = r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"
 
 
@@ -78,7 +77,7 @@ HeaderDtype = Annotated[
 
 
 class Described(Model):
-    """Base class of the parts of a pipeline's description, which a person writes."""
+    """Base class of the parts of a pipeline's description. A wrong value raises BadInputError."""
 
     @model_validator(mode="wrap")
     @classmethod
@@ -90,7 +89,7 @@ class Described(Model):
 
 
 def _bad_input(what: str, error: ValidationError) -> BadInputError:
-    """Return the error for the first defect that `error` lists of a `what`."""
+    """Return the error for the first defect in `error`. `what`: name of the checked class."""
     first = error.errors()[0]
     place = ".".join([what, *(str(part) for part in first["loc"])])
     unexpected = unexpected_in(first)
@@ -103,9 +102,9 @@ def _bad_input(what: str, error: ValidationError) -> BadInputError:
 
 
 class UnitSettings(Described):
-    """The part of the host that a unit may use.
+    """The cores and threads that a unit may use.
 
-    `cores`: cores of this machine.
+    `cores`: numbers of cores of this machine.
     `threads`: number of threads, from 1.
     `spin`: whether threads may spin between jobs.
     """
@@ -116,9 +115,9 @@ class UnitSettings(Described):
 
 
 class StageInput(Described):
-    """What a stage of a graph reads: the stream that another stage writes.
+    """An input of a stage of a graph.
 
-    `stage`: name of the stage that writes it.
+    `stage`: name of the stage whose stream the input reads.
     `latest`: whether the stage takes the newest frame, whatever its number.
     `max_age_ms`: age in ms from which on the newest frame counts as absent; 0: no such age.
     """
@@ -133,7 +132,7 @@ class PipelineStage(Described):
 
     `factory`: `module:name` of a `trilane.pipeline.stage.StageFactory`, importable in the unit's process.
     `settings`: JSON values that are handed to the factory.
-    `pace_ns`: least time in ns for which a job is held.
+    `pace_ns`: least time of a job; a shorter job waits until its end. 0: none.
     `inputs`: what the stage reads; None for a stage of a chain, which reads what the stage before it writes.
     `every`: distance between the frames that the stage takes.
     """
@@ -154,9 +153,9 @@ class PipelineStage(Described):
 
 
 class PipelineEdge(Described):
-    """The slots behind a stage. The next stage reads them; in a graph, all readers of the stage do.
+    """The slots behind a stage, which the next stage reads; in a graph, all readers of the stage read them.
 
-    `payload_bytes`: bytes of every packet's payload.
+    `payload_bytes`: size of every packet's payload.
     `header`: dtype of every packet's header, made by `trilane.transport.packets.header_dtype`.
     `rule`: single, double, triple, fifo:N or orphan[:N].
     """
@@ -173,9 +172,9 @@ class Pipeline(Described):
     `edges`: slots behind each stage that has a reader, in the order of the stages.
     `units`: cores and threads of each unit that a stage names; the scheduler runs on the cores of the first stage's
     unit.
-    `latency_to`: stage at whose end a frame's latency ends; without it, the last stage.
-    `bypass`: names of two stages. If the first returns a `Skip` for a frame, the frame goes on to the second, past the
-    stages between. The edges behind the first and before the second have the same header.
+    `latency_to`: stage at whose end a frame's latency ends; empty for the last stage.
+    `bypass`: names of two stages. If the first stage returns a `Skip` for a frame, the frame goes on to the second
+    stage, past the stages between. The edges behind the first and before the second have the same header.
     `from_release`: whether the latency begins with a frame's release, as for a camera with a rate.
     `warms_up`: whether the stages of a chain do a frame before the run; False if they may count their calls.
     `module_folders`: folders where a unit's process first looks for the modules of factories.
@@ -201,7 +200,7 @@ class Pipeline(Described):
         return self
 
     def _check(self) -> None:
-        """Raise UnexpectedValue for parts that do not fit each other."""
+        """Raise UnexpectedValue if stages, edges, units or the bypass do not fit each other."""
         missing = {stage.unit for stage in self.stages} - set(self.units)
         if missing:
             raise UnexpectedValue(f"no settings of unit {', '.join(sorted(missing))}", "them in `units`")
@@ -227,7 +226,7 @@ class Pipeline(Described):
 
     @property
     def joints(self) -> dict[str, tuple[PipelineStage, tuple[PipelineStage, ...]]]:
-        """The stage before each edge and those behind it, by the edge's name `FROM->TO`, in the order of `edges`."""
+        """(Writer, readers) of each edge, by the edge's name `FROM->TO`, in the order of `edges`."""
         graph, named = self.graph(), {stage.name: stage for stage in self.stages}
         return {
             graph.edge_name(place): (named[name], tuple(named[reader] for reader in readers))
@@ -252,7 +251,7 @@ class Pipeline(Described):
 
     @property
     def rule(self) -> str:
-        """The rule of every edge; when rules differ, all of them in order, joined by commas."""
+        """The rule of all edges; if rules differ, the rules in the order of `edges`, joined by commas."""
         rules = [edge.rule for edge in self.edges]
         return ",".join(dict.fromkeys(rules) if len(set(rules)) == 1 else rules)
 
@@ -269,7 +268,7 @@ class Pipeline(Described):
     def places(self) -> dict[str, Place]:
         """Return the cores and threads of each unit.
 
-        A unit that is held to a pace counts as one thread, because it works all the while, as one thread would.
+        A unit with a paced stage (`pace_ns`) counts as one thread: it is busy during the whole pace, like one thread.
         """
         paced = {stage.unit for stage in self.stages if stage.pace_ns}
         return {
@@ -278,7 +277,7 @@ class Pipeline(Described):
         }
 
     def stages_of(self, unit: str) -> tuple[PipelineStage, ...]:
-        """Return the unit's stages, in the order of the chain."""
+        """Return the unit's stages, in the order of `stages`."""
         return tuple(stage for stage in self.stages if stage.unit == unit)
 
     def with_rule(self, rule: str) -> Pipeline:
@@ -293,7 +292,7 @@ class Pipeline(Described):
 
 
 def _inputs(stage: PipelineStage) -> tuple[Input, ...] | None:
-    """Return what the scheduler knows of the stage's inputs."""
+    """Return the stage's inputs for the scheduler's graph; None for a stage of a chain."""
     if stage.inputs is None:
         return None
     return tuple(Input(each.stage, each.latest, round(each.max_age_ms * NS_PER_MS)) for each in stage.inputs)
@@ -310,8 +309,9 @@ def tables_of(
 ) -> dict[str, Any]:
     """Return the tables of a pipeline file.
 
-    `run`: the table [run] without edges and latency, which the description states. `times_ms`: mean time of a job by
-    stage, in ms; a stage that is missing states no time. `taken`: which frames take the bypass, as keys of its table.
+    `run`: the table [run] without `edge` and `latency_to`, which come from the pipeline.
+    `times_ms`: mean time of a job of each stage, in ms; a stage that is missing gets no time.
+    `taken`: keys of the bypass's table that say which frames take it, `share` or `pattern`.
     """
     joints = list(pipeline.joints.values())
     rules = {before.name: edge.rule for (before, _), edge in zip(joints, pipeline.edges, strict=True)}
@@ -335,7 +335,7 @@ def tables_of(
 
 
 def _stage(pipeline: Pipeline, place: int, payload_bytes: int, times_ms: Mapping[str, float]) -> dict[str, Any]:
-    """Return the keys of the stage at `place`, whose slots have `payload_bytes`."""
+    """Return the keys of the stage at index `place`, whose output has `payload_bytes`."""
     stage = pipeline.stages[place]
     keys: dict[str, Any] = {"python": stage.factory, "unit": stage.unit}
     if reads := _reads(pipeline, place):
@@ -350,7 +350,10 @@ def _stage(pipeline: Pipeline, place: int, payload_bytes: int, times_ms: Mapping
 
 
 def _reads(pipeline: Pipeline, place: int) -> str | dict[str, Any] | None:
-    """Return what the stage at `place` reads: the stage before it in a chain, else a table by the stages' names."""
+    """Return the value of the key `in` of the stage at index `place`; None for a stage without inputs.
+
+    In a chain the value is the stage before it; in a graph it is a table by the names of the stages.
+    """
     stage: PipelineStage = pipeline.stages[place]
     if stage.inputs is None:
         return pipeline.stages[place - 1].name if place else None
@@ -364,7 +367,7 @@ def _reads(pipeline: Pipeline, place: int) -> str | dict[str, Any] | None:
 
 
 def unsaid(pipeline: Pipeline) -> Iterator[str]:
-    """Yield what a pipeline file cannot say of the pipeline, each as a sentence."""
+    """Yield a sentence for each property of the pipeline that a pipeline file cannot state."""
     yield NOT_RUN
     own = max((edge.header.itemsize for edge in pipeline.edges), default=0)
     if own > header_dtype().itemsize:
@@ -375,9 +378,9 @@ def unsaid(pipeline: Pipeline) -> Iterator[str]:
 
 
 def file_text(tables: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
-    """Return the tables as TOML: a line for each key, and for each stage. `comments`: lines before them.
+    """Return the tables as TOML, with a line for each key and for each stage. `comments`: lines before the tables.
 
-    Keys are names of stages and of units, whose letters need no quotes.
+    Names of stages and units need no quotes as keys.
     """
     lines = [f"# {each}" for each in comments]
     for name, table in tables.items():

@@ -1,6 +1,6 @@
-"""What the scheduler knows of a pipeline file: its graph, the rules of its streams, and the settings of a run.
+"""Turns a pipeline file into the scheduler's input: the graph, the rules of its streams, and the settings of a run.
 
-Rule: a run on this machine and a prediction both take them from here, so that a file means the same on both clocks.
+Rule: a run on this machine and a prediction both use these functions, so that a file means the same on both clocks.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ DEFAULT_FRAMES: Final = 1000
 
 
 def graph_of(file: PipelineFile, rules: Mapping[str, str]) -> Graph:
-    """Return the scheduler's graph of a file; it is a chain if each stage reads the stage before it.
+    """Return the scheduler's graph of a file. It is a chain if each stage takes every frame of the stage before it.
 
-    `rules`: rule of the stream of each stage that has a reader.
+    `rules`: edge rule of each stream, by the name of the stage that writes it.
     """
     stages = tuple(
         StageSpec(
@@ -45,12 +45,17 @@ def graph_of(file: PipelineFile, rules: Mapping[str, str]) -> Graph:
 
 
 def bypass_of(file: PipelineFile) -> tuple[str, str] | None:
-    """Return the two stages between which a frame may skip stages; None without a bypass."""
+    """Return the names of the stages at which the bypass begins and ends; None without a bypass."""
     return None if file.bypass is None else (file.bypass[0], file.bypass[1].to)
 
 
 def skips_of(file: PipelineFile, seed: int = 0) -> Skips:
-    """Return which frames take the bypass in virtual time: those that the file says, none where it says nothing."""
+    """Return a function that says whether a frame takes the bypass in virtual time.
+
+    If the file does not say which frames take it, no frame does.
+
+    `seed`: seed of the random choice by the file's `share`.
+    """
     if file.bypass is None:
         return none_skips
     _, way = file.bypass
@@ -58,7 +63,7 @@ def skips_of(file: PipelineFile, seed: int = 0) -> Skips:
 
 
 def shares_of(file: PipelineFile) -> dict[str, Fraction]:
-    """Return, for each stage that some frames skip, the share of the frames that it does."""
+    """Return the share of frames that do not skip a stage, 0 to 1, for each stage that some frames skip."""
     if file.bypass is None or not (taken := file.bypass[1].taken):
         return {}
     names, (begin, end) = list(file.stages), (file.bypass[0], file.bypass[1].to)
@@ -66,7 +71,7 @@ def shares_of(file: PipelineFile) -> dict[str, Fraction]:
 
 
 def source_ns(file: PipelineFile) -> int:
-    """Return the period of the source, a mean for random arrivals; 0: it is always ready."""
+    """Return the period of the source in ns; for random arrivals, the mean. 0: the source has no rate."""
     rate = file.run.fps or (file.run.arrivals.poisson if file.run.arrivals else 0.0)
     return round(NS_PER_S / rate) if rate else 0
 
@@ -74,8 +79,8 @@ def source_ns(file: PipelineFile) -> int:
 def settings_of(file: PipelineFile, frames: int = 0, seed: int = 0, **others: Any) -> Settings:
     """Return the settings of a run of the file.
 
-    `frames`: number of frames; 0: as the file says, or DEFAULT_FRAMES.
-    `seed`: seed of the arrivals.
+    `frames`: number of frames; 0: the file's number, or DEFAULT_FRAMES if the file has none.
+    `seed`: seed of random arrivals.
     `others`: further fields of Settings.
     """
     run, count, period_ns = file.run, frames or file.run.frames or DEFAULT_FRAMES, source_ns(file)
@@ -87,14 +92,14 @@ def settings_of(file: PipelineFile, frames: int = 0, seed: int = 0, **others: An
 
 
 def edge_rules(file: PipelineFile, times_ns: Mapping[str, int] | None = None) -> dict[str, str]:
-    """Return the rule of each stream: that of the file, else two slots, or more where branches meet.
+    """Return the edge rule of each stream, by the name of the stage that writes it.
 
-    Where branches meet, a stream has the fewest slots that do not lengthen the period by the times of the file. If the
-    file does not state all times, all stages count as equally long, each on a unit of its own. These slots are enough
-    for any times, because no cycle then has more stages than slots. A run and all predictions of a file have the same
-    slots.
+    If the file states no rule, a stream has two slots. If branches meet, it may have more: the fewest that do not make
+    the period longer with the file's times. If the file does not state all times, all stages count as equally long, and
+    each stage has a unit of its own. These slots are enough for any times, because no cycle has more stages than slots.
+    A run and all predictions of a file have the same slots.
 
-    `times_ns`: time of a job of each stage, in place of those of the file.
+    `times_ns`: time of a job of each stage, in place of the file's times.
     """
     given = {name: file.run.edge for name in file.readers} if file.run.edge else {}
     given |= file.edges
@@ -109,12 +114,12 @@ def edge_rules(file: PipelineFile, times_ns: Mapping[str, int] | None = None) ->
 
 
 def _own_times_ns(file: PipelineFile) -> dict[str, int]:
-    """Return the mean time of a job of each stage, if the file states all of them; else nothing."""
+    """Return the mean time of a job of each stage in ns; empty if the file does not state the times of all stages."""
     known = {name: time.mean_ms for name, stage in file.stages.items() if (time := stage.own_time) is not None}
     return {name: round(ms * NS_PER_MS) for name, ms in known.items()} if len(known) == len(file.stages) else {}
 
 
 def in_flight_of(file: PipelineFile) -> int:
-    """Return the limit of frames in flight, by the file or by its policy; 0: none."""
+    """Return the limit of frames in flight, the smaller of the file's and its policy's; 0: no limit."""
     limits = [each for each in (file.run.in_flight, POLICIES[file.run.policy].in_flight) if each]
     return min(limits, default=0)

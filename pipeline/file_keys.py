@@ -1,8 +1,8 @@
-"""The keys of a pipeline file, each as one field: its type, its range and what it means.
+"""The keys of a pipeline file, each as one field: its type, its range and its meaning.
 
-Rule: this module checks one value at a time; `pipeline_file.py` checks what must fit together. The tables of
-docs/pipeline-file.md come from the descriptions here. A pipeline file may be a stranger's, so nothing that it names is
-opened or imported.
+Rule: this module checks one value at a time; `pipeline_file.py` checks values that must fit together. The tables of
+docs/pipeline-file.md come from the descriptions here. A pipeline file may come from a stranger. Therefore no file that
+it names is opened, and no module that it names is imported.
 """
 
 from __future__ import annotations
@@ -29,15 +29,15 @@ from trilane.units import UNITS
 MOST_STAGES: Final = 64
 MOST_SAMPLES: Final = 1_000_000
 MOST_PORT_BYTES: Final = 256 << 20
-LONGEST_SIDE: Final = 16_384  # of a picture, in pixels
-LONGEST_MS: Final = 3.6e6  # of a stage, an hour
+LONGEST_SIDE: Final = 16_384  # longest side of a picture, in pixels
+LONGEST_MS: Final = 3.6e6  # longest time of a job, an hour
 ONE_TIME: Final = "mean with or without sd, exponential, samples, or from with or without name"
-MOST_SDS: Final = 1000  # standard deviation of a time, in means
+MOST_SDS: Final = 1000  # largest standard deviation of a time, as a multiple of its mean
 RUNTIMES: Final = ("ort", "openvino", "qnn", "cuda")
 NAME: Final = rf"^[\w-]{{1,{LONGEST_NAME}}}$"
-#: What a text must be that a pattern refuses.
+#: The expected form of a text, by its pattern; for messages.
 FORMS: Final = {NAME: f"at most {LONGEST_NAME} letters, digits, _ and -", FACTORY: "MODULE:FACTORY, such as crop:best"}
-#: Types of numbers in a port, by NumPy's name.
+#: NumPy's name of each number type that a port may have.
 TYPES: Final = {
     "u8": "uint8",
     "i8": "int8",
@@ -53,7 +53,7 @@ TYPES: Final = {
 
 
 def shown(value: object) -> str:
-    """Return a wrong value as a message shows it."""
+    """Return the text that stands for a wrong value in a message."""
     if isinstance(value, Mapping):
         return "a table"
     if isinstance(value, list):
@@ -63,7 +63,7 @@ def shown(value: object) -> str:
 
 
 def is_number(value: object) -> bool:
-    """Say whether a value of the file is a number; true and false are no numbers."""
+    """Return whether a value of the file is a number; true and false are no numbers."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
@@ -74,7 +74,7 @@ class Keys(BaseModel):
 
     @classmethod
     def known(cls) -> list[str]:
-        """The keys of the table, as the file has them."""
+        """Return the names of the table's keys in a file."""
         return [field.alias or name for name, field in cls.model_fields.items()]
 
 
@@ -165,7 +165,7 @@ def _bytes_of(dtype: str) -> int:
 
 
 def port_type(text: object) -> PortType:
-    """Read `u8 256x256x3`. Raises UnexpectedValue."""
+    """Return the type that a text such as `u8 256x256x3` states; raises UnexpectedValue for another text."""
     expected = f"a type and sizes, such as 'u8 256x256x3', of at most {MOST_PORT_BYTES >> 20} MiB"
     found = re.fullmatch(r"(\w+) (\d{1,9}(?:x\d{1,9}){0,7})", text) if isinstance(text, str) else None
     if found is None:
@@ -179,7 +179,7 @@ def port_type(text: object) -> PortType:
 
 
 def _ports(value: object) -> object:
-    """Read the ports that a stage writes, by name; the name of a lone one is empty."""
+    """Return the ports that a stage writes, by name; a single port has an empty name."""
     if not isinstance(value, dict):
         return {"": port_type(value)}
     if not value:
@@ -194,10 +194,11 @@ def _ports(value: object) -> object:
 class StageInput:
     """What a port of a stage reads.
 
-    `port`: name of the port; empty where the file names a stage alone.
-    `stage`, `from_port`: stage that is read, and its port; the port is empty for a stage with one port.
-    `latest`: whether it takes the newest frame instead of the frame of the other inputs.
-    `max_age_ms`: age from which on the newest frame counts as absent; 0: no such age.
+    `port`: name of the reading port; empty if the stage has one port.
+    `stage`: stage that is read.
+    `from_port`: port of that stage; empty if it has one port.
+    `latest`: whether the port takes the newest frame instead of the frame of the other inputs.
+    `max_age_ms`: age in ms from which on the newest frame counts as absent; 0: no such age.
     """
 
     port: str
@@ -232,7 +233,10 @@ class InputKeys(Keys):
 
 
 def read_input(port: str, value: object) -> StageInput:
-    """Read one input. `port`: name of the port; empty without one. Raises UnexpectedValue or pydantic's error."""
+    """Return one input from its value in the file. `port`: name of the reading port, or empty.
+
+    Raises UnexpectedValue or pydantic's ValidationError.
+    """
     if isinstance(value, dict):
         keys = InputKeys.model_validate(value)
     elif isinstance(value, str):
@@ -247,7 +251,7 @@ def read_input(port: str, value: object) -> StageInput:
 
 
 def _inside(text: str) -> str:
-    """Refuse a path that leads out of the file's folder; the file may be a stranger's."""
+    """Return the path; raise UnexpectedValue if it leads out of the file's folder, as a stranger's file may try."""
     normal = posixpath.normpath(text)
     if not text or "\0" in text or "\\" in text or normal in (".", "..") or normal.startswith(("/", "../")):
         remedy = "copy the file there, or put a link to it there"
@@ -256,7 +260,7 @@ def _inside(text: str) -> str:
 
 
 def _mp4(text: str) -> str:
-    """Refuse a path of another kind of file: code and networks of the folder must not become a video."""
+    """Return the path; raise UnexpectedValue if it is no .mp4, so that no code or network of the folder is replaced."""
     if not text.endswith(".mp4"):
         raise UnexpectedValue(repr(text), "a video to write, such as out.mp4", "let the name end with .mp4")
     return text
@@ -268,7 +272,7 @@ InsidePath = Annotated[str, Field(max_length=1000), AfterValidator(_inside)]
 class StageTime(Keys):
     """The time of one job of a stage, in ms: one of `mean`, `exponential`, `samples` and `source`.
 
-    `sd` stands beside `mean`, `name` beside `source`, which `pipeline_file.py` replaces by the times of that file.
+    `sd` belongs to `mean`, and `name` to `source`. `pipeline_file.py` replaces `source` by the times of that file.
     """
 
     mean: float | None = Field(default=None, ge=0, le=LONGEST_MS, allow_inf_nan=False, description="Mean time, ms.")
@@ -349,7 +353,7 @@ def _pattern(text: str | None) -> str | None:
 
 
 class BypassKeys(Keys):
-    """The way of a frame for which the stages behind have nothing to do: past them, to stage `to`."""
+    """The table `bypass` of a stage: frames without work for the next stages skip them, and go on to stage `to`."""
 
     to: str = Field(
         pattern=NAME, description="Stage to which such a frame goes, two places or more behind in the row of stages."
@@ -381,13 +385,13 @@ class BypassKeys(Keys):
 
     @property
     def taken(self) -> Fraction | None:
-        """The share of the frames that go this way; None where the file does not say it."""
+        """The share of the frames that take the bypass, 0 to 1; None if the file does not state it."""
         if self.pattern is not None:
             return Fraction(self.pattern.count("1"), len(self.pattern))
         return None if self.share is None else Fraction(str(self.share))
 
     def takes(self, frame: int, seed: int = 0) -> bool:
-        """Say whether a frame goes this way. `seed`: seed of the random choice by `share`."""
+        """Return whether a frame takes the bypass. `seed`: seed of the random choice by `share`."""
         if self.pattern is not None:
             return self.pattern[frame % len(self.pattern)] == "1"
         drawn = blake2b(f"{seed} {frame}".encode(), digest_size=8).digest()
@@ -395,7 +399,7 @@ class BypassKeys(Keys):
 
 
 def _size(text: str) -> tuple[int, int]:
-    """Read `640x480` as width and height in pixels."""
+    """Return (width, height) in pixels from a text such as `640x480`."""
     found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", text)
     if found is None:
         raise UnexpectedValue(repr(text), "WIDTHxHEIGHT in pixels, such as 640x480")
@@ -416,7 +420,7 @@ SIZE_HELP = "Width and height in pixels, such as '640x480'"
 
 
 def _sizes(value: object) -> object:
-    """Read `1x3x224x224`."""
+    """Return the sizes in a text such as `1x3x224x224`, as a tuple."""
     found = re.fullmatch(r"\d{1,7}(x\d{1,7}){0,7}", value) if isinstance(value, str) else None
     if found is None or 0 in (sizes := tuple(map(int, found[0].split("x")))):
         raise UnexpectedValue(shown(value), "sizes, such as '1x3x224x224'")
@@ -426,8 +430,9 @@ def _sizes(value: object) -> object:
 class StageKeys(Keys):
     """The keys that every stage may have.
 
-    `kind`: key that says what the stage is. `in_ports`: ports that it can read, and whether it needs them; None where
-    that is not known from the file. `out_ports`: names of the ports that it writes; None where that is not known.
+    `kind`: key that says what kind of stage it is.
+    `in_ports`: ports that it can read, and whether it needs each; None if the file does not say so.
+    `out_ports`: names of the ports that it writes; None if the file does not say so.
     """
 
     kind: ClassVar[str]
@@ -462,12 +467,12 @@ class StageKeys(Keys):
 
     @property
     def named_kind(self) -> str:
-        """The kind as `trilane check` says it."""
+        """The kind as `trilane check` shows it; for a block, the block's name."""
         return self.kind
 
     @property
     def own_time(self) -> StageTime | None:
-        """The time that the file itself states; None where it states none."""
+        """The time of a job that the file states; None if it states none."""
         return self.time_ms
 
     @property
@@ -476,7 +481,7 @@ class StageKeys(Keys):
 
 
 class TimedStage(StageKeys):
-    """A time alone: no model, no code."""
+    """A stage with only a time: no network and no code."""
 
     kind = "time_ms"
 
@@ -509,7 +514,7 @@ class BlockStage(StageKeys):
     """A built-in block."""
 
     kind = "block"
-    writes_one: ClassVar[bool] = False  # a picture or a tensor, on a port without a name
+    writes_one: ClassVar[bool] = False  # whether it writes a picture or a tensor, on a port without a name
     block: str = Field(description="Built-in stage: video, prepare, overlay, encode, discard or busy.")
 
     @property
@@ -601,7 +606,7 @@ BLOCKS: Final[dict[str, type[BlockStage]]] = {
     "discard": DiscardBlock,
     "busy": BusyBlock,
 }
-#: Blocks behind which nothing comes.
+#: Blocks that write no stream.
 ENDS: Final = frozenset(["encode", "discard"])
 KINDS: Final[dict[str, type[StageKeys]]] = {
     each.kind: each for each in (OnnxStage, PythonStage, BlockStage, TimedStage)

@@ -1,13 +1,14 @@
 """The process that units are forked from. Rule: it has one thread; it ends with its parent, and its units outlive it.
 
-`python -P -m trilane.pipeline.fork_server --socket FD --parent PID --preload MODULE,...` imports once what every unit
-needs, then forks a unit for each request. Therefore a unit starts in milliseconds instead of importing everything
-again.
+`python -P -m trilane.pipeline.fork_server --socket FD --parent PID --preload MODULE,...` imports once the modules that
+every unit needs, then forks a unit for each request. Therefore a unit starts in milliseconds, without imports of its
+own.
 
 A request is one packet on a SOCK_SEQPACKET socket: JSON with descriptors. The descriptors are the unit's spec (in a
-memory file), its stderr, its lifeline, and those that the spec names. The answer is the unit's process id with its
-pidfd and a pipe. When the unit has ended, its exit code comes through that pipe, negative for a signal. A request with
-`call` names a function instead; its result goes to the pipe that comes with the request, and there is no other answer.
+memory file), its stderr, its lifeline, and the descriptors that the spec names. The answer is the unit's process id
+with its pidfd and a pipe. When the unit has ended, the server writes its exit code to that pipe, negative for a signal.
+A request with `call` names a function instead. Its result goes to the pipe that comes with the request, and there is no
+other answer.
 
 A lifeline is a pipe whose other end only the parent has: the kernel kills the unit when that end is closed.
 """
@@ -34,10 +35,10 @@ from trilane.signals import ENDING
 
 PR_SET_PDEATHSIG, PR_SET_NAME = 1, 15  # <linux/prctl.h>
 F_SETSIG = 10  # <linux/fcntl.h>
-MAX_FDS = 250  # descriptors that one packet carries; SCM_MAX_FD of Linux is 253
+MAX_FDS = 250  # most descriptors in one packet; SCM_MAX_FD of Linux is 253
 PACKET_BYTES = 1 << 16
 ALWAYS = "trilane.pipeline.unit_loop"
-#: Variables that libraries with threads of their own read when they are loaded.
+#: Environment variables from which libraries read their number of threads when they are loaded.
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS")
 
 
@@ -80,7 +81,11 @@ def serve(requests: socket.socket) -> None:
 
 
 def _reap(codes: dict[int, int], options: int) -> None:
-    """Wait for the units that have ended, and tell their exit codes; with options 0, for all units until they end."""
+    """Reap the units that have ended, and write their exit codes to their pipes.
+
+    `codes`: pipe of each living unit, by process id.
+    `options`: options of waitpid; WNOHANG: only units that have ended already. 0: wait for all units.
+    """
     with contextlib.suppress(ChildProcessError):
         while (ended := os.waitpid(-1, options))[0]:
             writes = codes.pop(ended[0])
@@ -114,7 +119,10 @@ def _run_unit(request: dict[str, Any], fds: Sequence[int]) -> int:
 
 
 def _call(request: dict[str, Any], fds: Sequence[int], server_pid: int) -> int:
-    """In a forked process, write the result of the function `module:name` as JSON to `fds[0]`; return the exit code."""
+    """In a forked process, call the function `request["call"]`, and write its result to `fds[0]` as JSON.
+
+    Return the exit code of the process.
+    """
     _leave_server()
     die_with_parent(server_pid)
     module, _, name = request["call"].partition(":")
@@ -128,7 +136,7 @@ def _call(request: dict[str, Any], fds: Sequence[int], server_pid: int) -> int:
 
 
 def _leave_server() -> None:
-    """In a forked process, take signals as any process does, except for Ctrl-C, which the parent handles."""
+    """In a forked process, restore the default action of signals, except SIGINT, which the parent handles."""
     for number in {signal.SIGCHLD, *ENDING} - {signal.SIGINT}:
         signal.signal(number, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGCHLD})
@@ -168,16 +176,16 @@ def main() -> None:
     parser.add_argument("--preload", default="")
     arguments = parser.parse_args()
     die_with_parent(arguments.parent)
-    for number in ENDING:  # the parent decides what they end, and how
+    for number in ENDING:  # the parent decides what these signals end
         signal.signal(number, signal.SIG_IGN)
     importlib.import_module(ALWAYS)
     for module in filter(None, arguments.preload.split(",")):
-        with contextlib.suppress(ImportError):  # whoever needs it says what is missing
+        with contextlib.suppress(ImportError):  # the unit that needs the module reports the error
             importlib.import_module(module)
     gc.collect()
-    gc.freeze()  # a unit's collector then leaves alone, and so does not copy, the pages that all units share
+    gc.freeze()  # a unit's garbage collector would write to, and so copy, the pages that all units share
     serve(socket.socket(fileno=arguments.socket))
-    os._exit(0)  # taking all the modules down again would keep the parent waiting
+    os._exit(0)  # a normal exit would unload all modules while the parent waits
 
 
 if __name__ == "__main__":

@@ -1,34 +1,34 @@
-"""Measures in a unit's process what happens around its jobs: times by the kernel, and counts by the processor.
+"""Measures the jobs of a unit in the unit's process: times by the kernel, and counts by the processor.
 
-Rule: the kernel counts, and it is asked where no frame waits for the answer. A unit is busy for at most its CPU time.
+Rule for times: the kernel counts, and its counts are read when no frame waits for the answer. A unit is busy for at
+most its CPU time.
 
 CPU time is CLOCK_PROCESS_CPUTIME_ID, over all threads. The run delay of a thread is the time in ns in which it was
 ready and another thread had the core. It is the second number of `/proc/self/task/TID/schedstat`
 (Documentation/scheduler/sched-stats.rst of the kernel). The file is opened once and read again.
 
-A piece of time is a job, or the time between two jobs. Every ns of CPU time is in one piece. Three numbers are known of
-each piece, in ns:
-- `wall_ns`: its length;
-- `cpu_ns`: CPU time of all threads of the unit's process in it;
-- `delay_ns`: run delay in it, summed over these threads.
+A piece of time is a job, or the time between two jobs. Every ns of CPU time is in one piece. Each piece has three
+numbers, in ns:
+- `wall_ns`: length of the piece;
+- `cpu_ns`: CPU time of all threads of the unit's process in the piece;
+- `delay_ns`: run delay in the piece, summed over these threads.
 
 Run delay is read after the answer to a job, and before the answer only if the job may have lost more than LOSS_NS.
-Before a job something is read in three cases only:
+Before a job, counts are read only in three cases:
 - the unit has had the job for longer than HELD_NS;
 - its stage's last job lost time;
 - other threads may have run between the jobs.
 
-docs/decisions/preempted-time.md says what the two thresholds can hide. It derives what follows from the three numbers,
-and proves that units which share cores are never busy for more than those cores.
+docs/decisions/preempted-time.md says what the two thresholds can hide. It derives preempted time and sleep from the
+three numbers, and proves that units which share cores are never busy for longer than those cores.
 
-Counts instructions and cache misses of a unit's jobs through perf_event_open.
+Rule for counts: instructions and cache misses are the processor's counts (perf_event_open), or are reported as absent.
+Only user mode counts. A counter covers the thread that opens it and all threads that begin later in this thread or in
+its children; the kernel adds them up (`inherit`). A processor with fewer counters than events counts each event for a
+part of the time; such counts are scaled to the whole time.
 
-Rule: a figure is the processor's count, or is reported as absent. Counts are those of user mode. They cover the thread
-that opens them and all threads that it and its threads begin later, which the kernel adds up (`inherit`). A processor
-with fewer counters than events counts each for a part of the time; such counts are scaled to the whole time.
-
-Each event is opened and read by itself, because `inherit` and a group do not go together (`man 2 perf_event_open`).
-Some kernels refuse to read such a group (ECHILD). If a figure cannot be read, the job goes on without it.
+Each event is opened and read by itself, because `inherit` does not work with a group (`man 2 perf_event_open`). Some
+kernels refuse to read such a group (ECHILD). If a count cannot be read, the job goes on without it.
 """
 
 from __future__ import annotations
@@ -51,7 +51,10 @@ _LINKS_BESIDE_THREADS = 2  # a folder has a link for each folder in it, `.` and 
 
 
 def counts_run_delay(process: str = PROCESS) -> bool:
-    """Return whether this kernel says how long threads waited for a core (CONFIG_SCHED_INFO)."""
+    """Return whether this kernel counts the run delay of threads (CONFIG_SCHED_INFO).
+
+    `process`: path of the kernel's folder of this process.
+    """
     try:
         with open(f"{process}/schedstat", "rb") as file:  # noqa: PTH123 - as the meter reads it
             return int(file.read(_LINE_BYTES).split()[0]) > 0
@@ -60,20 +63,21 @@ def counts_run_delay(process: str = PROCESS) -> bool:
 
 
 class CoreMeter:
-    """Counts from its creation on. `look` finds threads that appear later; those in `others` are left out.
+    """Counts CPU time and run delay from its creation on. `look` finds threads that begin later.
 
+    `others`: ids of threads that are not counted.
     `process`: path of the kernel's folder of this process.
     """
 
     def __init__(self, others: Set[int] = frozenset(), process: str = PROCESS) -> None:
         self._others, self._tasks = others, f"{process}/task"
         self._files: dict[int, int] = {}  # file of each thread
-        self._seen_ns: dict[int, int] = {}  # delay of each file when it was last read
+        self._seen_ns: dict[int, int] = {}  # run delay of each thread when it was last read, by the thread's file
         self._threads = self._born_ns = 0
         self._folder = os.open(self._tasks, os.O_RDONLY | os.O_CLOEXEC) if counts_run_delay(process) else -1
         self._cpu_ns = time.process_time_ns()
         self.look()
-        self._born_ns = 0  # what these threads waited before does not count
+        self._born_ns = 0  # the run delay of these threads before this moment does not count
 
     @property
     def threads(self) -> int:
@@ -100,7 +104,7 @@ class CoreMeter:
         return delay_ns
 
     def look(self) -> None:
-        """Find the threads that have begun and ended since the last look; this is quick if their number is the same."""
+        """Find the threads that have begun and ended since the last look, if the number of threads has changed."""
         if self._folder < 0:
             return
         threads = os.fstat(self._folder).st_nlink - _LINKS_BESIDE_THREADS
@@ -151,19 +155,23 @@ class Lost(NamedTuple):
 
 
 def most_preempted_ns(wall_ns: int, cpu_ns: int, cores: int) -> int:
-    """Return the longest part of `wall_ns` that a unit with `cores` cores can have waited for them.
+    """Return the longest time in ns within `wall_ns` that a unit can have waited for its cores.
 
-    It is what remains of `wall_ns` if the unit's CPU time is divided evenly among the cores.
+    It is the rest of `wall_ns` if the unit's CPU time is divided evenly among its cores.
+
+    `cores`: number of the unit's cores.
     """
     return max(wall_ns - -(-cpu_ns // cores), 0)
 
 
 def preempted_ns(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int) -> int:
-    """Return how much of `wall_ns` a unit with `cores` cores waited for them.
+    """Return the time in ns within `wall_ns` that a unit waited for its cores.
 
-    Its threads were ready for cpu + delay. Therefore m = (cpu + delay) / wall of them were ready at a time, but at
-    least one. Their waiting took delay / m, and never more than what the CPU time leaves of the cores. With one core
-    this is min(delay, wall - cpu).
+    Its threads were ready for cpu + delay in sum. Therefore m = (cpu + delay) / wall threads were ready at a time, but
+    at least one. They waited for delay / m, and at most for the time that the CPU time leaves of the cores. With one
+    core the result is min(delay, wall - cpu).
+
+    `cores`: number of the unit's cores.
     """
     if not delay_ns:
         return 0
@@ -172,10 +180,12 @@ def preempted_ns(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int) -> int:
 
 
 def lost_in_job(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int, has_device: bool) -> Lost:
-    """Return what a job of `wall_ns` lost. The unit was busy in the rest, which is at most `cpu_ns` without a device.
+    """Return the times that a job of `wall_ns` lost.
 
-    `has_device`: whether something else than the cores works (a graphics card, a modelled chip), so that the unit works
-    while its threads sleep.
+    The unit was busy for the rest of the job. Without a device the rest is at most `cpu_ns`.
+
+    `cores`: number of the unit's cores.
+    `has_device`: whether a device (a graphics card, a modelled chip) works while the unit's threads sleep.
     """
     preempted = preempted_ns(wall_ns, cpu_ns, delay_ns, cores)
     asleep = 0 if has_device else wall_ns - preempted - cpu_ns
@@ -184,7 +194,7 @@ def lost_in_job(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int, has_device
 
 LOSS_NS: Final = 20_000
 HELD_NS: Final = 100_000  # longer than a hand-over takes
-JOBS_PER_LOOK: Final = 64  # jobs between two searches for new threads, where no job loses time
+JOBS_PER_LOOK: Final = 64  # jobs between two searches for new threads, if no job loses time
 
 
 class Meter(Protocol):
@@ -229,7 +239,7 @@ class JobClock:
         self._end_ns = self._now_ns()
 
     def begin(self, stage: int, dispatch_ns: int) -> None:
-        """Note that a job of the unit's `stage`-th stage begins, which was dispatched at `dispatch_ns`."""
+        """Note that a job begins. `stage`: index of its stage in the unit. `dispatch_ns`: time of its dispatch."""
         self._stage = stage
         begin_ns = self._now_ns()
         is_long = begin_ns - max(dispatch_ns, self._end_ns) > HELD_NS
@@ -244,7 +254,7 @@ class JobClock:
         self._begin_ns = begin_ns
 
     def end(self, works_asleep: bool) -> None:
-        """Note that the job has ended. `works_asleep`: whether it went on while its threads slept."""
+        """Note that the job has ended. `works_asleep`: whether a device worked for it while its threads slept."""
         cpu_ns = self._meter.cpu_ns()
         end_ns = self._end_ns = self._now_ns()
         wall_ns = end_ns - self._begin_ns
@@ -258,16 +268,21 @@ class JobClock:
         self._preempted_ns, self._asleep_ns = lost_in_job(wall_ns, cpu_ns, delay_ns, self._cores, works_asleep)
 
     def done(self, job_id: int, sampled_ns: int, metrics: dict[str, float], skips: bool = False) -> Done:
-        """Return the answer to the job that has ended. `skips`: whether its frame takes the bypass."""
+        """Return the answer to the job that has ended.
+
+        `sampled_ns`: time at which the job sampled its frame; 0 if its stage does not sample.
+        `metrics`: metrics of the stage for this job, by name.
+        `skips`: whether its frame takes the bypass.
+        """
         lost = (self._preempted_ns, self._asleep_ns, self._preempted_before_ns)
         times = (self._begin_ns, self._end_ns, sampled_ns, *lost, int(skips), self._cpu_ns, self._cpu_before_ns)
         return Done(job_id, *times, metrics)
 
     def answered(self) -> None:
-        """Read what took place in the job and since; called after the answer was sent.
+        """Read the counts of the time since the job's end; called after the answer was sent.
 
-        If the run delay was not read at the job's end, part of it may belong to the job. Therefore it counts at most
-        the time since that end, in which this thread did not sleep.
+        If the run delay was not read at the job's end, part of it belongs to the job. Therefore at most the time since
+        that end counts, because this thread did not sleep in it.
         """
         delay_ns = self._meter.delay_ns()
         self._cpu_before_ns = self._meter.cpu_ns()
@@ -282,7 +297,7 @@ class JobClock:
         self._has_one_thread = self._meter.threads == 1
 
 
-MOST_PARANOID: Final = 2  # setting up to which a process may still count its own user mode
+MOST_PARANOID: Final = 2  # largest kernel.perf_event_paranoid with which a process may count its own user mode
 
 # linux/perf_event.h
 ATTR: Final = struct.Struct("=IIQQQQQIIQ")  # type, size, config, period, sample_type, read_format, flags, 0, 0, 0
@@ -296,8 +311,8 @@ HARDWARE: Final = 0
 class CounterReading(NamedTuple):
     """An event to count.
 
-    `name`: name of the figure.
-    `kind`, `config`: the kernel's type and number of the event.
+    `name`: name of the count in the report.
+    `kind`, `config`: type and number of the event for perf_event_open.
     """
 
     name: str
@@ -309,8 +324,8 @@ class Reading(NamedTuple):
     """One reading of a counter.
 
     `value`: its count.
-    `enabled_ns`: time for which the count was asked for.
-    `running_ns`: time for which the processor counted.
+    `enabled_ns`: time for which the counter was enabled.
+    `running_ns`: part of this time in which the processor counted.
     """
 
     value: int
@@ -322,9 +337,9 @@ KINDS: Final = (CounterReading("instructions", HARDWARE, 1), CounterReading("cac
 
 
 class HardwareCounters:
-    """Counts every event that the kernel allows, from now on, for this thread and the threads that come from it.
+    """Counts the events `kinds` that the kernel allows, for this thread and for all threads that it begins later.
 
-    Raises OSError when none of `kinds` can be counted.
+    Raises OSError if none of them can be counted.
     """
 
     def __init__(self, kinds: Sequence[CounterReading] = KINDS) -> None:
@@ -342,7 +357,7 @@ class HardwareCounters:
 
     @property
     def names(self) -> list[str]:
-        """The names of the figures that are counted."""
+        """The names of the events that are counted."""
         return list(self._files)
 
     def begin(self) -> None:
@@ -350,9 +365,9 @@ class HardwareCounters:
         self._before = self._read()
 
     def figures(self) -> dict[str, float]:
-        """Return the figures of the job that has begun, by name.
+        """Return the counts since `begin`, by name.
 
-        Figures that the processor did not count, or that nobody could read, are left out.
+        A count that the processor did not make, or that cannot be read, is left out.
         """
         figures = {}
         for name, now in self._read().items():
@@ -363,7 +378,7 @@ class HardwareCounters:
         return figures
 
     def close(self) -> None:
-        """Count no longer."""
+        """Close all counters."""
         while self._files:
             os.close(self._files.popitem()[1])
 
@@ -374,25 +389,25 @@ class HardwareCounters:
                 row = machine.here.read_counter(file, ROW.size)
             except OSError:
                 continue
-            if len(row) == ROW.size:  # the kernel ends the file of an event that it had to give up
+            if len(row) == ROW.size:  # the file of an event that the kernel gave up is empty
                 readings[name] = Reading._make(ROW.unpack(row))
         return readings
 
 
 class NoCounters:
-    """Takes the place of counters where there are none."""
+    """Takes the place of `HardwareCounters` on a machine where nothing can be counted."""
 
     def begin(self) -> None: ...
 
     def figures(self) -> dict[str, float]:
-        """Return no figures, as nothing was counted."""
+        """Return no counts."""
         return {}
 
     def close(self) -> None: ...
 
 
 def counters_here() -> HardwareCounters | NoCounters:
-    """Return counters of this thread, or `NoCounters` where `absence` gives a reason."""
+    """Return counters for this thread, or `NoCounters` if nothing can be counted here."""
     try:
         return HardwareCounters()
     except OSError:
@@ -400,7 +415,7 @@ def counters_here() -> HardwareCounters | NoCounters:
 
 
 def absence() -> str | None:
-    """Return why nothing can be counted here, as part of a sentence; None where something can be."""
+    """Return the reason why nothing can be counted here, as part of a sentence; None if an event can be counted."""
     try:
         with closing(HardwareCounters()):
             return None
@@ -409,7 +424,7 @@ def absence() -> str | None:
 
 
 def availability() -> str:
-    """Return the counted events as a fact of the machine, or that nothing is counted, and why."""
+    """Return the names of the events that can be counted here, or `absent:` with the reason."""
     try:
         with closing(HardwareCounters()) as counters:
             return ", ".join(counters.names)
@@ -436,7 +451,7 @@ def _reason(error: OSError) -> str:
 
 
 def paranoid_level() -> int | None:
-    """Return the kernel's setting; None where it has none."""
+    """Return the kernel's setting kernel.perf_event_paranoid; None if it has none."""
     try:
         return int((machine.here.proc / "sys/kernel/perf_event_paranoid").read_text())
     except (OSError, ValueError):
@@ -444,7 +459,7 @@ def paranoid_level() -> int | None:
 
 
 def remedy(why: str) -> str:
-    """Return the command, or the condition, that removes the reason from `absence`."""
+    """Return the command, or the condition, that removes a reason. `why`: reason, from `absence`."""
     if "perf_event_paranoid" in why:
         return f"sysctl kernel.perf_event_paranoid={MOST_PARANOID}"
     return "needs a machine of its own" if "virtual" in why else "allow perf_event_open"

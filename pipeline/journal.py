@@ -1,11 +1,11 @@
-"""The journal of a run: one file that records what happened, in order, while it happens. Readers may follow it.
+"""The journal of a run: one file that records what happens, in order, during the run. Readers may follow it.
 
-Rule: nothing of a run is kept in memory only because somebody may want it later. Whoever wants it reads the journal,
-after the run or during it, from the same bytes.
+Rule: nothing of a run is kept in memory only because it may be needed later. A reader takes it from the journal, during
+the run or after it, from the same bytes.
 
-The file is MessagePack: each record is an array of the record's place in RECORDS and its fields, and the first is a
-`Begun`. A step comes before the accounts, jobs and counts that follow from it, and all of these before the next step. A
-journal that ends within a record, or without `Ended`, belongs to a run that was killed or still goes on.
+The file is MessagePack. Each record is an array: the index of the record's type in RECORDS, then its fields. The first
+record is a `Begun`. A step comes before the accounts, jobs and counts that follow from it, and all of these before the
+next step. A journal that ends within a record, or without `Ended`, belongs to a run that was killed or still goes on.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ from trilane.writing import require_name
 
 NAME = "journal.msgpack"
 SCHEMA: Final = 1
-#: Bounds of a record: the longest that a run writes has a few kB, and a map has 25 entries. In memory, an empty map
-#: takes 72 times its byte. A list takes 8 bytes for each entry that it announces, in each of at most 1024 nested lists.
+#: Bounds of a record, against hostile files. The longest record of a run has a few kB, and its largest map 25 entries.
+#: An empty map is 1 byte in the file and 72 bytes in memory. A list takes 8 bytes for each entry that it announces, in
+#: each of at most 1024 nested lists.
 MAX_RECORD_BYTES: Final = 1 << 20
 MAX_ENTRIES: Final = 1 << 14
 MAX_TEXT_BYTES: Final = 1 << 16
@@ -71,16 +72,16 @@ class Accounted(NamedTuple):
 
 
 class Worked(NamedTuple):
-    """A job that has ended. `figures`: numbers that its stage reported of it, by name."""
+    """A job that has ended. `figures`: metrics of its stage for this job, by name."""
 
     job: JobRecord
     figures: Mapping[str, float]
 
 
 class Counted(NamedTuple):
-    """Counts of the frames `lost` and `dropped` until `now_ns`, by the cause's key in the report.
+    """Numbers of frames `lost` and `dropped` until `now_ns`, by the cause's key in the report.
 
-    The record is written when they have changed.
+    The record is written when a number has changed.
     """
 
     now_ns: int
@@ -89,7 +90,7 @@ class Counted(NamedTuple):
 
 
 class Sampled(NamedTuple):
-    """Readings taken in passing, by dotted name, such as `temperature_c.device` or `duty.gpu`."""
+    """Readings at `now_ns`, by dotted name, such as `temperature_c.device` or `duty.gpu`."""
 
     now_ns: int
     values: Mapping[str, float]
@@ -110,7 +111,7 @@ class Ended(NamedTuple):
 
 
 class Stopped(NamedTuple):
-    """At `now_ns` a signal had stopped the process of `unit`; it is noted once for each time."""
+    """At `now_ns` the process of `unit` was seen stopped by a signal; there is one record for each stop."""
 
     now_ns: int
     unit: str
@@ -122,11 +123,13 @@ _PLACES = {kind: place for place, kind in enumerate(RECORDS)}
 
 
 class JournalWriter:
-    """Context manager that writes records: `add` writes one, and `flush` or the end brings all to the file.
+    """Context manager that writes records: `add` buffers one, and `flush` or the end writes all to the file.
 
-    `path`: path of a file that does not exist yet; raises OSError where it cannot be made.
-    `failure`: the UnwrittenError that a method raised, once, when the file could not be written, such as on a full
-    disk. After it nothing more is written.
+    If the file cannot be written, such as on a full disk, one method raises an UnwrittenError. After that, nothing more
+    is written.
+
+    `path`: path of a file that does not exist yet; raises OSError if the file cannot be made.
+    `failure`: the UnwrittenError that was raised, or None.
     """
 
     def __init__(self, path: Path) -> None:
@@ -146,9 +149,9 @@ class JournalWriter:
             self._fail(UnwrittenError(self._path, error))
 
     def flush(self) -> None:
-        """Bring all added records to the file, where whoever follows the journal sees them.
+        """Write all added records to the file, so that its readers see them.
 
-        A file that was removed counts as one that cannot be written.
+        A file that was removed counts as a file that cannot be written.
         """
         if self.failure is not None:
             return
@@ -178,9 +181,9 @@ class JournalWriter:
 
 
 class JournalReader:
-    """Reads the journal at `path` while it grows; after a move of the file, set `path` to the new place.
+    """Reads the journal at `path` while it grows. If the file is moved, set `path` to its new path.
 
-    Raises BadInputError for a file that is no journal, and for a bad record, which it names by its number, from 1 on.
+    Raises BadInputError for a file that is no journal, and for a bad record, with the record's number from 1 on.
     """
 
     def __init__(self, path: Path) -> None:
@@ -198,7 +201,7 @@ class JournalReader:
         self._run: _Checks | None = None
 
     def new(self) -> Iterator[Record]:
-        """Yield each record that became whole since the last call, once and in order."""
+        """Yield each record that was completed since the last call, in order."""
         try:
             with self.path.open("rb") as file:
                 file.seek(self._read_bytes)
@@ -225,7 +228,7 @@ class JournalReader:
             raise self._refused(f"more than {MAX_RECORD_BYTES} bytes")
 
     def _refused(self, found: str) -> BadInputError:
-        """Return the error for the next record, which cannot be read."""
+        """Return the error for the next record, which cannot be read. `found`: its defect."""
         return BadInputError(f"{self.path}, record {self._count + 1}", found, EXPECTED)
 
     def _record(self, row: Any) -> Record:
@@ -269,14 +272,14 @@ def read_journal(path: Path) -> Iterator[Record]:
 
 
 def records_of(recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[Record]:
-    """Yield the records of a run in memory that are needed to say what bounded it."""
+    """Yield the records, of a run in memory, that are needed to find what bounded it: steps, accounts and jobs."""
     for stepped, others in _steps_of(recording, jobs):
         yield stepped
         yield from others
 
 
 def _steps_of(recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[tuple[Stepped, list[Record]]]:
-    """Yield each step's record, with the records of what it changed and of the jobs that it ended."""
+    """Yield each step's record, with the records of the accounts that it changed and of the jobs that it ended."""
     accounts = deque(recording.accounts)
     left: dict[str, deque[JobRecord]] = {unit: deque() for unit in recording.graph.units}
     for job in sorted(jobs, key=lambda job: job.begin_ns):
@@ -296,7 +299,7 @@ def journal_of(
 ) -> Iterator[Record]:
     """Yield the records of a run in memory, such as one in virtual time (`Simulation` with `keep`).
 
-    A second `Core` that hears the same events counts the frames lost and dropped.
+    A second `Core` takes the same events, and counts the lost and dropped frames.
 
     `facts`: facts of `Begun`.
     `report`: report of `Ended`.
@@ -315,7 +318,10 @@ def journal_of(
 
 
 def config_of(begun: Begun) -> Mapping[str, Any]:
-    """Return the configuration that a journal begins with; empty for a journal without one."""
+    """Return the configuration in a journal's first record; empty for a journal without one.
+
+    Raises BadInputError for a configuration that no run writes.
+    """
     config = begun.facts.get("config", {})
     if not isinstance(config, Mapping) or not all(
         isinstance(config.get(key, {}), Mapping) for key in ("units", "scene", "pace_ns")
@@ -324,14 +330,14 @@ def config_of(begun: Begun) -> Mapping[str, Any]:
     return config
 
 
-#: The fields of a record as written, for records whose fields are not written as they are.
+#: Functions that return the written fields of a record, for the types whose fields are not written as they are.
 _FIELDS: dict[type[Any], Callable[[Any], list[Any]]] = {
     Begun: lambda record: [record.schema, record.graph.written(), asdict(record.settings), record.facts],
     Stepped: lambda record: [record.now_ns, [*map(row_of, record.events)], [*map(row_of, record.actions)]],
 }
 
 
-#: What is wrong with the bytes, by the exception that the MessagePack reader raises.
+#: The defect of the bytes, by the exception that the MessagePack reader raises.
 _UNREADABLE: tuple[tuple[type[Exception], str], ...] = (
     (msgpack.FormatError, "bytes that are no MessagePack"),
     (msgpack.StackError, "lists inside lists, too deep"),
@@ -344,7 +350,7 @@ _Checks = tuple[tuple[Callable[[Any], Any], ...], ...]
 
 
 def _checks(run: RunValues) -> _Checks:
-    """Return the checks of each record's fields, by the record's place in RECORDS."""
+    """Return the checks of the fields of each type of record, in the order of RECORDS."""
     of: dict[type[Any], tuple[Callable[[Any], Any], ...]] = {
         Begun: (),
         Stepped: (run.step_ns, run.events, run.actions),

@@ -1,7 +1,7 @@
 """Checks the values of a journal's records.
 
-Rule: a check takes a value as it was read, from an untrusted file. It returns what the value stands for, or raises
-UnexpectedValue in plain words. What a check remembers of a run does not grow with the run.
+Rule: a check takes a value that was read from an untrusted file. It returns the checked value, or raises
+UnexpectedValue in plain words. The state that checks keep does not grow with the run.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ JOB_TYPES: Final = tuple(get_type_hints(JobRecord).values())  # journals of an o
 SETTINGS_TYPES: Final = {
     name: tuple if "tuple" in str(kind) else kind for name, kind in get_type_hints(Settings).items()
 }
-#: Where the row of each event or action has a unit and a stage; 0: nowhere.
+#: Indices of the unit and of the stage in the row of each event or action; 0: the row has none.
 _NAMED: Final = {
     kind.__name__: tuple(fields.index(name) + 1 if name in fields else 0 for name in ("unit", "stage"))
     for kind in (*EVENTS, *ACTIONS)
@@ -36,7 +36,7 @@ _NAMED: Final = {
 
 
 def shown(value: Any) -> str:
-    """Return a value as part of a message."""
+    """Return the text that stands for a value in a message."""
     text = repr(value)
     return text if len(text) <= LONGEST_FOUND else f"{text[:LONGEST_FOUND]}…"
 
@@ -75,7 +75,7 @@ def counts(value: Any) -> Mapping[str, int]:
 
 
 def facts(value: Any) -> Mapping[str, Any]:
-    """Return a map of what JSON can hold, by name."""
+    """Return values that JSON can contain, by name."""
     if type(value) is not dict:
         raise UnexpectedValue(shown(value), "facts by name")
     waiting: list[tuple[Any, int]] = [(value, 1)]
@@ -109,7 +109,7 @@ def graph(value: Any) -> Graph:
 
 
 def settings(value: Any, of_graph: Graph) -> Settings:
-    """Return the settings of a run with the graph `of_graph`; a scheduler can be made from the two."""
+    """Return the settings of a run with the graph `of_graph`, after making a scheduler `Core` from both."""
     try:
         found = settings_of(value)
         for name, kind in SETTINGS_TYPES.items():
@@ -144,7 +144,7 @@ class RunValues:
         self._step_ns = 0
 
     def step_ns(self, value: Any) -> int:
-        """Return the time of a step, which is not before the last one's."""
+        """Return the time of a step in ns, which is not before the last step's time."""
         if type(value) is not int or not self._step_ns <= value <= NEVER:
             raise UnexpectedValue(
                 f"time {shown(value)} of a step", f"{A_TIME}, not before the last step's {self._step_ns}"
@@ -182,9 +182,9 @@ class RunValues:
         return found
 
     def _check_row(self, row: tuple[Any, ...]) -> None:
-        """Check that a row names units and stages of the graph, and that its numbers are in range.
+        """Check that a row names a unit and a stage of the graph, and that its numbers are in range.
 
-        Its types are checked already.
+        The types of its values are already checked.
         """
         unit, stage = _NAMED.get(row[0], (0, 0))
         if unit and row[unit] not in self._units:
@@ -196,7 +196,7 @@ class RunValues:
                 raise UnexpectedValue(f"{value} in {row[0]}", f"a whole number from -1 to {NEVER}")
 
     def job(self, row: Any) -> JobRecord:
-        """Return a job that has ended; each stage does frames in order, and none twice."""
+        """Return a job that has ended. Each stage does frames in order, and no frame twice."""
         if type(row) is not tuple or tuple(map(type, row)) not in (JOB_TYPES, JOB_TYPES[:-1]):
             raise UnexpectedValue(f"job {shown(row)}", f"texts and whole numbers: {', '.join(JobRecord._fields)}")
         job = JobRecord(*row)

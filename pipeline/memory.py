@@ -1,16 +1,16 @@
-"""The memory that the units of a run share: regions for the edges, and the assets; and how many bytes move through it.
+"""The memory that the units of a run share, for edges and assets, and counts of the bytes that move through it.
 
-Rule: the parent makes a region for each edge, and closes it whatever happens. Assets are written once, sealed, mapped,
-never copied.
+Rule: the parent makes a region for each edge, and always closes it. Assets are written once, sealed, mapped, and never
+copied.
 
-One region of anonymous memory holds all assets. It begins with 8 bytes for the length of the index, then the index as
-JSON, then the arrays, each on its own page. A unit maps it read-only. The kernel frees it when the last process that
-has it ends.
+One region of anonymous memory contains all assets. It begins with 8 bytes for the length of the index, then the index
+as JSON, then the arrays, each on its own page. A unit maps the region read-only. The kernel frees it when the last
+process that has it ends.
 
-A stage counts the bytes that it copies for a frame, and the least number of bytes that would do. A byte counts at each
-memory that it is read from or written to. A copy from a slot to the GPU counts as read and as uploaded; a copy back
-counts as read back and as written. Therefore the four figures add up to what passed through the memories. A stage that
-copies nothing between its input and its output moves its least.
+A stage counts the bytes that it moves for a frame, and the least number of bytes that the frame needs. A byte counts at
+each memory from which it is read or to which it is written. A copy from a slot to the GPU counts as read and as
+uploaded; a copy back counts as read back and as written. Therefore the four counts add up to all bytes that passed
+through the memories. A stage that copies nothing between its input and its output moves its least.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from trilane.transport.slots import edge_rule
 class EdgeRegion(Model):
     """A region that a unit maps.
 
-    `fd`: descriptor, which the unit's process inherits.
+    `fd`: descriptor of the region, which the unit's process inherits.
     `slots`: number of slots.
     `header`: dtype of every packet's header.
     `payload_bytes`: bytes of every packet's payload.
@@ -80,7 +80,7 @@ Assets = Mapping[str, NDArray[Any]]
 
 _F_SEAL_WRITE = 0x8  # <linux/fcntl.h>
 _LENGTH_BYTES = 8
-_KINDS = "?biufcmMSU"  # kinds of NumPy types that consist of their bytes alone
+_KINDS = "?biufcmMSU"  # kinds of NumPy types whose values contain no Python objects
 
 
 def share_assets(assets: Assets) -> int:
@@ -124,9 +124,9 @@ def map_assets(fd: int) -> dict[str, NDArray[Any]]:
 
 
 def _index(assets: Assets) -> tuple[dict[str, dict[str, Any]], int]:
-    """Return type, shape and place of every array, and the end of the last one.
+    """Return (type, shape and offset of every array by its name, end of the last array in bytes).
 
-    Places count from the first page after the index.
+    Offsets count from the first page after the index.
     """
     index, offset = {}, 0
     for name, array in assets.items():
@@ -148,7 +148,7 @@ def _write_all(fd: int, array: NDArray[Any], offset: int) -> None:
         data, offset = data[written:], offset + written
 
 
-#: Keys in report.json, with the name under which a stage reports each with a job.
+#: Key in report.json of each count, and name of the metric by which a stage reports it.
 NAMES = {
     "read": "bytes_read",
     "written": "bytes_written",
@@ -164,7 +164,7 @@ _LEAST = "least"
 class ByteCounter:
     """The bytes that a stage moves for one frame.
 
-    `read`: bytes read from slots, shared assets and what the stage samples.
+    `read`: bytes read from slots, shared assets and samples.
     `written`: bytes written into the output slot or the file.
     `uploaded`: bytes moved from the CPU's memory into the GPU's.
     `read_back`: bytes moved from the GPU's memory into the CPU's.
@@ -179,17 +179,17 @@ class ByteCounter:
     least: int = 0
 
     def start(self, passed_on: int = 0) -> None:
-        """Begin a frame. `passed_on`: bytes of the header, copied from the input slot to the output slot."""
+        """Begin a frame. `passed_on`: size in bytes of the header, which is copied from input slot to output slot."""
         self.read = self.written = passed_on
         self.uploaded = self.read_back = self.least = 0
 
     def copied(self, count: int) -> None:
-        """Count `count` bytes that were read in one slot and written to another."""
+        """Count `count` bytes that were read from one slot and written to another."""
         self.read += count
         self.written += count
 
     def figures(self) -> dict[str, float]:
-        """Return the figures of the stage's job."""
+        """Return the counts as metrics of the stage's job."""
         return {
             "bytes_read": self.read,
             "bytes_written": self.written,
@@ -200,10 +200,13 @@ class ByteCounter:
 
 
 def add_bytes(report: dict[str, Any], sums: Mapping[str, Mapping[str, float]]) -> None:
-    """Add what each stage moved for a presented frame, and the total, to `report`, the keys of report.json.
+    """Add the mean bytes that each stage moved for a presented frame, and their total, to `report`.
 
-    `sums`: sums of what the jobs of each stage reported. A stage without a job moved nothing; a stage that does not
-    count has no row. Nothing is added where no frame was presented or no stage counts.
+    A stage without a job moved nothing; a stage that does not count bytes gets no row. If no frame was presented or no
+    stage counts, nothing is added.
+
+    `report`: keys of report.json.
+    `sums`: sums of each stage's metrics over its jobs, by stage and metric.
     """
     frames = report["frames"]["presented"]
     counted = {stage: row for stage, row in sums.items() if row.keys() >= BYTES}
@@ -219,7 +222,7 @@ def add_bytes(report: dict[str, Any], sums: Mapping[str, Mapping[str, float]]) -
 
 
 def _per_frame(sums: Mapping[str, float], frames: int) -> dict[str, float | None]:
-    """Return the means per frame, and `ratio`, all that was moved over the least; null where the least is 0."""
+    """Return the mean bytes per frame by key, and `ratio`, all moved bytes over the least; None if the least is 0."""
     least = sums[NAMES[_LEAST]]
     means = {key: sums[name] / frames for key, name in NAMES.items()}
     return {**means, "ratio": _moved(sums) / least if least else None}

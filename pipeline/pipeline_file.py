@@ -1,10 +1,10 @@
-"""Reads a pipeline file: TOML that describes stages, what each reads, and the units that they run on.
+"""Reads a pipeline file: TOML that describes stages, their inputs, and the units that they run on.
 
     file = read_pipeline(Path("street.toml"))
-    file.stages["detector"].unit, file.graph_inputs("overlay")
+    file.stages["detector"].unit, stage_inputs(file.stages["overlay"])
 
-Rule: a defect becomes one BadInputError that names the file and the key. The file may be a stranger's: sizes are
-checked before anything is made, no path leads out of its folder, and nothing of it is imported.
+Rule: a defect becomes one BadInputError that names the file and the key. The file may come from a stranger: sizes are
+checked before memory is allocated, no path leads out of its folder, and no module that it names is imported.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ from trilane.unexpected_value import UnexpectedValue, unexpected_in
 from trilane.units import UNITS
 
 MOST_BYTES: Final = 16 << 20
-MOST_PERIOD: Final = 100_000  # of a stage, in frames: the least common multiple of all `every` before it
-LIKE: Final = 0.8  # likeness of two names of which one may be a slip, by difflib
+MOST_PERIOD: Final = 100_000  # of a stage, in frames: the least common multiple of all `every` up to it
+LIKE: Final = 0.8  # least likeness, by difflib, of a name and the name that was probably meant
 TABLES: Final = ("run", "units", "stages", "edges")
 STAGES: Final = re.compile(rb"""^\s*(\[\s*["']?stages["']?\s*[\].]|["']?stages["']?\s*[.=])""", re.MULTILINE)
 #: A comma between two assignments, not one in a list or a table.
@@ -81,10 +81,11 @@ class PipelineFile:
     """A checked pipeline file.
 
     `path`: path of the file; paths in it are relative to its folder.
-    `stages`: stages by name, each after those that it reads; otherwise in the order of the file.
+    `run`: keys of the table [run].
+    `stages`: stages by name, each after the stages that it reads, otherwise in the order of the file.
     `units`: every unit that a stage names, in the order of the stages.
-    `edges`: rule of each stream for which the file states one, by the stage that writes the stream.
-    `tables`: the tables as the file has them.
+    `edges`: rules that the table [edges] states, by the stage that writes the stream.
+    `tables`: unchanged tables of the file.
     """
 
     path: Path
@@ -99,7 +100,7 @@ class PipelineFile:
         return self.path.parent
 
     def hardware(self, unit: str) -> str | None:
-        """Return the unit of a hardware profile that `unit` stands for: cpu, gpu or dsp; None where it is unknown."""
+        """Return the unit of a hardware profile (cpu, gpu or dsp) that `unit` stands for; None if it is unknown."""
         return self.units[unit].hardware or (unit if unit in UNITS else None)
 
     @property
@@ -113,7 +114,7 @@ class PipelineFile:
 
     @property
     def periods(self) -> dict[str, int]:
-        """The distance between the frames that each stage takes, from its own `every` and those of what it reads."""
+        """The distance in frames between the frames that each stage takes, by its own and its inputs' `every`."""
         found: dict[str, int] = {}
         for name, stage in self.stages.items():
             found[name] = lcm(stage.every, *(found[each.stage] for each in stage.inputs if not each.latest))
@@ -121,7 +122,7 @@ class PipelineFile:
 
     @property
     def out_of_row(self) -> str:
-        """The first stage that leaves out frames, or reads anything but the stage before it; "" in a chain."""
+        """The first stage that leaves out frames, or does not read only the stage before it; "" in a chain."""
         before: tuple[StageInput, ...] = ()
         for name, stage in self.stages.items():
             if stage_inputs(stage) != before or stage.every != 1:
@@ -145,7 +146,7 @@ class PipelineFile:
         return self.run.latency_to or [name for name in self.stages if name not in self.readers][-1]
 
     def changed(self, assignments: Sequence[str]) -> PipelineFile:
-        """Return the file with other values, each written `stages.seg.unit=dsp`. Raises BadInputError."""
+        """Return the file with changed values. `assignments`: such as `stages.seg.unit=dsp`. Raises BadInputError."""
         tables = dict(self.tables)
         for text in assignments:
             tables = _assigned(tables, text)
@@ -170,8 +171,8 @@ def tables_of(path: Path) -> dict[str, Any]:
 
 
 def is_pipeline_file(path: Path) -> bool:
-    """Say whether a file looks like a pipeline file: a .toml with stages. A scene is a .toml without stages."""
-    if path.suffix != ".toml" or not path.is_file():  # a pipe with that name would be waited for
+    """Return whether a file looks like a pipeline file: a .toml with stages. A scene is a .toml without stages."""
+    if path.suffix != ".toml" or not path.is_file():  # reading a pipe could wait for ever
         return False
     try:
         with path.open("rb") as file:
@@ -182,7 +183,7 @@ def is_pipeline_file(path: Path) -> bool:
 
 
 def _of_toml(path: Path, message: str) -> BadInputError:
-    """Return the error for what the TOML reader said."""
+    """Return the error for a message of the TOML reader."""
     place = re.search(r" \(at line (\d+), column \d+\)$", message)
     where = f"{path}, line {place[1]}" if place else str(path)
     text = message[: place.start()] if place else message
@@ -225,9 +226,10 @@ def checked_tables(tables: Mapping[str, Any], path: Path) -> PipelineFile:
 
 
 def _slip(unit: str, known: Sequence[str]) -> str:
-    """Return the unit that was most likely meant by a name that is nearly another one; "" for a name of its own.
+    """Return the known unit that a misspelt name most likely means; "" if the name is probably meant as it is.
 
-    Names that differ in a number or a letter at their end, such as gpu and gpu2 or npu_a and npu_b, are no slips.
+    A name that differs from a known one only in a number or a letter at its end, such as gpu2 or npu_b, is meant as it
+    is.
     """
     stem = unit.rstrip("0123456789")
     if unit in known or any(stem == name.rstrip("0123456789") or unit[:-1] == name[:-1] for name in known):
@@ -244,7 +246,7 @@ def _table(tables: Mapping[str, Any], name: str, path: Path) -> Mapping[str, Any
 
 
 def _checked(model: type[AnyKeys], values: object, where: str) -> AnyKeys:
-    """Check a table by its model. Raises BadInputError that names the key behind `where`."""
+    """Return a table as an instance of its model. Raises BadInputError that names the key after `where`."""
     if not isinstance(values, dict):
         raise BadInputError(where, shown(values), f"a table with {', '.join(model.known())}", IN_BRACES)
     try:
@@ -254,7 +256,7 @@ def _checked(model: type[AnyKeys], values: object, where: str) -> AnyKeys:
 
 
 def _bad_input(model: type[Keys], error: ValidationError, where: str) -> BadInputError:
-    """Return the error for the first defect that pydantic found; an unknown key comes first, as it may be a slip."""
+    """Return the error for the first defect that pydantic found; an unknown key comes first: it may be misspelt."""
     errors = error.errors(include_url=False)
     first = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])
     place = [str(part) for part in first["loc"]]
@@ -275,7 +277,7 @@ def _bad_input(model: type[Keys], error: ValidationError, where: str) -> BadInpu
 
 
 def _meaning(model: type[Keys], key: str) -> str:
-    """Return what the description of a key says, as part of a sentence."""
+    """Return a key and its description as part of a sentence; empty for a key without one."""
     fields = {one.alias or name: one for name, one in model.model_fields.items()}
     text = (fields[key].description or "") if key in fields else ""
     return f"{key}: {text[:1].lower()}{text[1:].rstrip('.')}" if text else ""
@@ -322,7 +324,7 @@ def _with_times(stage: StageKeys, where: str, folder: Path) -> StageKeys:
 
 
 def time_of(measurement: Measurement) -> StageTime:
-    """Return a measurement as the time of a stage: its samples, or else its mean and, where it has one, its spread."""
+    """Return a measurement as the time of a stage: its samples, or else its mean and its standard deviation, if any."""
     if measurement.samples_ms:
         return StageTime(samples=measurement.samples_ms[:MOST_SAMPLES])
     mean, sd = measurement.mean_ms or 0.0, measurement.sd_ms or 0.0
@@ -330,7 +332,7 @@ def time_of(measurement: Measurement) -> StageTime:
 
 
 def _inputs(value: object, where: str) -> tuple[StageInput, ...]:
-    """Read `in`: a stage, stage.port, or a table of ports."""
+    """Return the inputs of a stage from its key `in`: a stage, stage.port, or a table of ports."""
     ports = value if isinstance(value, dict) and not _is_input(value) else {"": value}
     if not ports:
         raise BadInputError(where, "an empty table", "a port, such as { frame = 'camera' }", "a source has no `in`")
@@ -349,12 +351,12 @@ def _inputs(value: object, where: str) -> tuple[StageInput, ...]:
 
 
 def _is_input(value: Mapping[str, object]) -> bool:
-    """Say whether a table is one input, `{ from = "camera", sync = "latest" }`, not a table of ports."""
+    """Return whether a table is one input, `{ from = "camera", sync = "latest" }`, and not a table of ports."""
     return "from" in value and value.keys() <= set(InputKeys.known())
 
 
 def _check_ports(stage: StageKeys, where: str) -> None:
-    """Check the ports that a stage reads against those that its kind has."""
+    """Check that a stage reads only ports that its kind has, and all ports that its kind needs."""
     known = stage.in_ports
     if known is None:
         return
@@ -377,7 +379,10 @@ def _check_ports(stage: StageKeys, where: str) -> None:
 
 
 def _in_order(stages: Mapping[str, StageKeys], path: Path) -> dict[str, StageKeys]:
-    """Return the stages so that each follows those that it reads, otherwise in their order. Raises BadInputError."""
+    """Return the stages in an order in which each follows the stages that it reads; otherwise their order stays.
+
+    Raises BadInputError for an unknown stage or port, and for stages that wait for each other in a circle.
+    """
     for name, stage in stages.items():
         _check_sources(name, stage, stages, path)
     places = {name: place for place, name in enumerate(stages)}
@@ -402,7 +407,7 @@ def _in_order(stages: Mapping[str, StageKeys], path: Path) -> dict[str, StageKey
 
 
 def _check_sources(name: str, stage: StageKeys, stages: Mapping[str, StageKeys], path: Path) -> None:
-    """Check that the stages and ports which a stage reads are there."""
+    """Check that the stages and ports that a stage reads exist, and that it may read them as it does."""
     synced: dict[str, StageInput] = {}
     for each in stage.inputs:
         where = f"{path}: stages.{name}.in" + (f".{each.port}" if each.port else "")
@@ -434,7 +439,10 @@ def _check_sources(name: str, stage: StageKeys, stages: Mapping[str, StageKeys],
 
 
 def _circle(waits: Mapping[str, set[str]]) -> list[str]:
-    """Return a circle of stages that wait for each other, from a stage on to itself, in the direction of frames."""
+    """Return a circle of stages that wait for each other, in the direction of frames; first and last are the same.
+
+    `waits`: stages for which each stage waits.
+    """
     seen: list[str] = []
     name = next(iter(waits))
     while name not in seen:
@@ -444,7 +452,7 @@ def _circle(waits: Mapping[str, set[str]]) -> list[str]:
 
 
 def _check_together(file: PipelineFile) -> None:
-    """Check what concerns several tables. Raises BadInputError."""
+    """Check that the tables of the file fit each other. Raises BadInputError."""
     _check_run(file)
     _check_edges(file)
     _check_written(file)
@@ -488,7 +496,7 @@ def _check_edges(file: PipelineFile) -> None:
 
 
 def _check_written(file: PipelineFile) -> None:
-    """Check that no video is written over another one, or over one that the pipeline reads."""
+    """Check that no video is written to the path of another video that the pipeline writes or reads."""
     taken = {normpath(stage.path): name for name, stage in file.stages.items() if isinstance(stage, VideoBlock)}
     for name, stage in file.stages.items():
         if isinstance(stage, EncodeBlock) and (other := taken.setdefault(normpath(stage.path), name)) != name:
@@ -544,12 +552,12 @@ def _check_bypass(file: PipelineFile) -> None:
 
 
 def assignments(text: str) -> list[str]:
-    """Return the assignments in a value of `--set`: one, or several with commas between them."""
+    """Return the assignments in a value of `--set`, which commas separate."""
     return BETWEEN.split(text)
 
 
 def _assigned(tables: Mapping[str, Any], text: str) -> dict[str, Any]:
-    """Return `tables` with one other value. `text`: KEY=VALUE; a value that is no TOML is a text."""
+    """Return `tables` with one value changed. `text`: KEY=VALUE; a VALUE that is no TOML counts as text."""
     key, equals, value = text.partition("=")
     parts = [part.strip() for part in key.split(".")]
     if not equals or not all(parts) or parts[0] not in TABLES or len(parts) < 2:
@@ -564,7 +572,7 @@ def _assigned(tables: Mapping[str, Any], text: str) -> dict[str, Any]:
 
 
 def _check_new_stages(tables: Mapping[str, Any], names: Sequence[str]) -> None:
-    """Refuse a stage that --set names, that the file does not have and that --set does not make."""
+    """Raise BadInputError for a stage that --set names, if the file does not have it and --set gives it no kind."""
     for name, keys in tables["stages"].items():
         if name not in names and isinstance(keys, dict) and not {*keys} & {*KINDS}:
             expected = f"a stage of the file: {', '.join(names)}"
@@ -584,5 +592,5 @@ def _with_value(tables: Mapping[str, Any], parts: Sequence[str], value: object) 
 
 
 def stage_inputs(stage: StageKeys) -> tuple[StageInput, ...]:
-    """Return one input for each stage that `stage` reads; several ports of one stage are one stream."""
+    """Return one input for each stage that `stage` reads; several ports of a stage belong to one stream."""
     return tuple({each.stage: replace(each, port="", from_port="") for each in stage.inputs}.values())

@@ -1,16 +1,13 @@
-"""The clock of this machine, for the scheduler's loop. Rule: it waits and does what the core says; it decides nothing.
+"""The clock of this machine, for the scheduler's loop, and the CPU time of units in the report of such a run.
 
-`wait` turns messages of the units, signals and the governor's duties into events; `perform` turns actions into
-messages. Shares of the units include the time for which a viewer held the run, and the run says how much (`HeldTime`).
+Rule: the clock waits and carries out the core's actions; it decides nothing. `wait` turns messages of the units,
+signals and the governor's duties into events; `perform` turns actions into messages. The shares of the units include
+the time for which a viewer held the run, and a message says how long that was (`HeldTime`).
 
-Compares the CPU time of units with their wall time, and adds both to the report of a run on the host clock.
-
-Rule: only the run counts, and no core does more than it can. Figures that must agree stand side by side. Where they
-contradict each other, or were not measured, a message says so.
-
-A unit's CPU time is that of all threads of its process, including those that a runtime lets spin between jobs. Units
-that may only run on a set of cores cannot have more CPU time than these cores had time. Where the figures say
-otherwise, a thread has run elsewhere or a clock is wrong.
+Rule: CPU time counts only within the run, and no core does more than it can. If figures contradict each other, or were
+not measured, a message says so. A unit's CPU time covers all threads of its process, including threads that a runtime
+lets spin between jobs. Units that may only run on a set of cores cannot have more CPU time than these cores had time.
+If they have more, a thread has run elsewhere or a clock is wrong.
 """
 
 from __future__ import annotations
@@ -56,13 +53,14 @@ from trilane.transport import messages
 from trilane.transport.messages import Done, Failed, Ping, Ready, RunJob
 from trilane.units import NS_PER_S
 
-CLOCKS_DIFFER = 0.001  # CLOCK_MONOTONIC is slewed by up to 500 ppm, but the clock of CPU times is not
+CLOCKS_DIFFER = 0.001  # CLOCK_MONOTONIC is slewed by up to 500 ppm; the clock of CPU times is not
 
 
 class CoreUse(NamedTuple):
     """The use of a set of cores by the units that run on `cores` and nowhere else.
 
-    `cpu`, `busy`: sums of the units' CPU time and busy time, as shares of the time that the cores had.
+    `cpu`: sum of the units' CPU time, as a share of the time that the cores had.
+    `busy`: sum of the units' busy time, as a share of the same time.
     """
 
     cores: tuple[int, ...]
@@ -72,7 +70,7 @@ class CoreUse(NamedTuple):
 
     @property
     def is_possible(self) -> bool:
-        """Whether no core did more than it can."""
+        """Whether the CPU time is at most the time that the cores had."""
         return self.cpu <= 1 + CLOCKS_DIFFER
 
 
@@ -93,8 +91,11 @@ class CpuTimes:
     def add(self, unit: str, stage: str, done: Done, run_begin_ns: int) -> None:
         """Book a job.
 
-        CPU time before a unit's first job counts at most the time that its cores had since the run began. CPU time
-        between two jobs counts as it was read: an impossible figure must stay visible (`is_possible`).
+        CPU time before a unit's first job is limited to the time that its cores had since the run began. CPU time
+        between two jobs is not limited: an impossible figure must stay visible (`is_possible`).
+
+        `done`: the unit's answer to the job.
+        `run_begin_ns`: time at which the run began.
         """
         self.in_jobs_ns[unit] += done.cpu_ns
         self.stage_ns[stage].add(done.cpu_ns)
@@ -168,7 +169,7 @@ LONGEST_STEP_NS = PING_NS + 250_000_000  # between two steps, unless this proces
 
 
 class ClockGovernor(Protocol):
-    """Limits each unit to a share of the time. `due_ns`: time at which `tick` is to be called next."""
+    """Limits each unit to a share of the time. `due_ns`: time at which the clock calls `tick` next."""
 
     due_ns: int
 
@@ -176,16 +177,16 @@ class ClockGovernor(Protocol):
         """Return the duties at the start of the run."""
 
     def tick(self, now_ns: int, busy_ns: dict[str, int]) -> list[SetDuty]:
-        """Return the duties that change now. `busy_ns`: work of each unit in ns since the run began."""
+        """Return the duties that change now. `busy_ns`: busy time of each unit in ns since the run began."""
 
 
 class RealtimeClock:
-    """The `trilane.scheduler.core.Clock` of one run over `processes`, which lets `core` run until it finishes.
+    """The `trilane.scheduler.core.Clock` of one run of `core` on the unit processes `processes`.
 
-    `metrics`: sums of what the jobs of each stage reported, over the jobs that `ended` has returned.
-    `reported`: number of those jobs that reported each figure.
+    `metrics`: sums of each stage's metrics, over the jobs that `ended` has returned.
+    `reported`: number of these jobs that reported each metric, by stage.
     `cpu`: CPU time of units and stages over the same jobs.
-    `first`: events that come before all others.
+    `first`: events that come before all other events.
     """
 
     def __init__(
@@ -221,17 +222,17 @@ class RealtimeClock:
             processes.watch(requests.fd)
 
     def heed(self, controls: RunControls) -> None:
-        """Do from now on what `controls` asks of the run."""
+        """Take requests from `controls` from now on."""
         self._controls = controls
         self._processes.watch(controls.fd)
 
     def wait(self, deadline_ns: int) -> tuple[int, tuple[Event, ...]]:
-        """Wait for something to happen, until `deadline_ns` at the latest, and return the time and the events."""
+        """Wait for an event, until `deadline_ns` at the latest, and return the time in ns and the events."""
         self._show_progress()
         self._tell_unanswered()
         events = self._listen(deadline_ns) if self._begun else self._begin()
         now_ns = time.monotonic_ns()
-        # This process was stopped. Unless the core is told, it restarts healthy units.
+        # This process was stopped. Without this event, the core would restart healthy units.
         if now_ns - self._step_ns > LONGEST_STEP_NS:
             events.insert(0, SchedulerStalled(now_ns - self._step_ns))
             self._tell_stalled(now_ns - self._step_ns)
@@ -258,7 +259,7 @@ class RealtimeClock:
         return len(self._unbooked)
 
     def ended(self) -> list[Worked | None]:
-        """Book and return the jobs that have ended since the last call; None stands for a job whose frame was lost."""
+        """Book and return the jobs that have ended since the last call; None stands for a job whose frame is gone."""
         found: list[Worked | None] = []
         for job, dispatch_ns, ready_ns, done in self._unbooked:
             if ready_ns is None:
@@ -276,18 +277,18 @@ class RealtimeClock:
         return found
 
     def stopped(self) -> list[Stopped]:
-        """Return the units that were seen stopped by a signal since the last call, each once for each time."""
+        """Return a record for each stop of a unit by a signal that was seen since the last call."""
         unnoted, self._unnoted = self._unnoted, []
         return unnoted
 
     def finish(self) -> None:
-        """Show the final progress, and say how long the run was held."""
+        """Show the final progress, and log how long the run was held."""
         if held := self._held.sentence(time.monotonic_ns()):
             self._log.say(held)
         self._show_progress(final=True)
 
     def _start(self, unit: str) -> None:
-        """Start the unit again; if no process can be made for it, the run ends with what was done until then."""
+        """Start the unit again; if no process can be made for it, the run is aborted at the next step."""
         try:
             self._processes.start(unit)
         except (TrilaneError, OSError) as error:
@@ -324,7 +325,7 @@ class RealtimeClock:
         return events
 
     def _interrupted(self) -> list[Event]:
-        """Return the events of interrupts: the first stops the run, the second aborts it."""
+        """Return the events that follow from signals: the first signal stops the run, the second aborts it."""
         if self._interrupts.count > 1:
             return [Abort()]
         if self._interrupts.count and not self._stopping:
@@ -344,7 +345,7 @@ class RealtimeClock:
         return events
 
     def _ping(self, now_ns: int) -> list[Event]:
-        """Ask idle units whether they live; a busy unit shows it when its job ends."""
+        """Ping the units without a job; a busy unit shows with the end of its job that it lives."""
         self._ping_ns = now_ns + PING_NS
         with contextlib.suppress(OSError):  # starting the next unit tries again
             if why := self._processes.renew_starter():
@@ -356,7 +357,7 @@ class RealtimeClock:
         return [Pinged(unit) for unit in units]
 
     def _tell_stopped(self, now_ns: int) -> None:
-        """Say for how long each unit was stopped by a signal, once it runs again; looked at with each ping."""
+        """Note units that a signal has stopped, and log for how long a unit was stopped once it runs again."""
         stopped = self._processes.stopped
         for unit in stopped - self._stopped_ns.keys():
             self._stopped_ns[unit] = now_ns
@@ -366,7 +367,7 @@ class RealtimeClock:
             self._log.say(f"unit {unit} was stopped by a signal for about {seconds:.1f} s")
 
     def _tell_stalled(self, ns: int) -> None:
-        """Say that a signal had stopped this process for `ns`, if one had; without it, the process had no core."""
+        """Log that a signal had stopped this process for `ns`; without a signal, the process had no core."""
         if self._interrupts.continued > self._continued:
             frame = min(self._core.frames, default=self._core.ledger.presented_count)
             seconds = ns / NS_PER_S
@@ -393,7 +394,7 @@ class RealtimeClock:
 
     def _done(self, unit: str, message: Done) -> Event:
         job, dispatch_ns = self._open.pop(message.id)
-        # `ended` books the job later, so that the next one is sent first.
+        # `ended` books the job later, so that the unit's next job is sent first.
         self._unbooked.append((job, dispatch_ns, self._core.ready_ns(job), message))
         if job.frame in self._core.frames and self._requests is not None and job.stage == self._last_stage:
             self._requests.answered(job.frame)
@@ -413,7 +414,7 @@ class RealtimeClock:
         self._processes.send(job.unit, RunJob(*fields))
 
     def _tell_unanswered(self) -> None:
-        """Tell whoever asked for frames at once which of them will not come."""
+        """Report dropped and lost frames to the queue of frame requests."""
         if self._requests is None:
             return
         ledger = self._core.ledger
@@ -428,14 +429,14 @@ class RealtimeClock:
 
 
 class HeldTime:
-    """Measures how long the run was held. A hold that lets some frames through lasts until the run goes on."""
+    """Measures how long the run was held. A hold lasts until the run goes on, even if single frames are released."""
 
     def __init__(self) -> None:
         self._total_ns = 0
         self._since_ns: int | None = None
 
     def hear(self, now_ns: int, events: Iterable[Event]) -> None:
-        """Take `events`, which were asked for at `now_ns`."""
+        """Take the events that were requested at `now_ns`; only `Hold` counts."""
         for event in events:
             if not isinstance(event, Hold):
                 continue
@@ -445,7 +446,7 @@ class HeldTime:
                 self._since_ns = now_ns
 
     def until(self, now_ns: int) -> int:
-        """Return for how many ns the run was held up to `now_ns`."""
+        """Return the time in ns for which the run was held up to `now_ns`."""
         return self._total_ns + (0 if self._since_ns is None else now_ns - self._since_ns)
 
     def sentence(self, now_ns: int) -> str:

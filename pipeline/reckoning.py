@@ -1,19 +1,19 @@
-"""Computes what bounded a run and how well it used its cores, once for everyone who shows it.
+"""Computes what bounded a run and how well it used its cores.
 
-Rule: report.json, the table, `trilane explain`, the dashboard and Python take these figures; nobody computes them
-again. The memory for reading a run is bounded, however long the run lasts.
+Rule: report.json, the table, `trilane explain`, the dashboard and Python show these figures; no other module computes
+them. The memory for reading a run is bounded, however long the run lasts. Nothing is measured here; equal journals give
+equal answers.
 
-Replays a run in virtual time with one stage slower, and says what that costs. The stage that costs most bounds it.
+A replay of the run in virtual time, with one stage slower, says what slowing the stage costs (`WhatIf`). The stage that
+costs most bounds the run.
 
-Rule: nothing is measured here; equal journals give equal answers.
+A share of the critical path says how the time was spent. It does not say how a run reacts: a longer job is moved to
+another core more often, and takes that core from a unit that was on no path. Therefore some of the run's frames are
+replayed (`trilane.scheduler.virtual`), with the CPU times of their own jobs, the run's placement and the run's
+scheduler. After that they are replayed once more for each stage, with all jobs of the stage longer by SLOWER.
 
-A share of the critical path says how the time went. It does not say how a run reacts: a longer job is moved to another
-core more often, and takes that core from a unit that was on no path. Therefore the replay does some of the run's frames
-again (`trilane.scheduler.virtual`). It uses the CPU times of their own jobs, the run's placement and the run's
-scheduler. After that it does them once more for each stage, with all jobs of the stage longer by SLOWER.
-
-The replay knows no other programs, caps or restarts. Therefore its frame time is compared with the run's, and it is
-trusted only where the two are near each other.
+The replay knows no other programs, caps or restarts. Therefore it is trusted only if its frame time is near the frame
+time of the run.
 """
 
 from __future__ import annotations
@@ -35,24 +35,24 @@ from trilane.scheduler.placement import SCHEDULER_NS, Place, Placement, busiest_
 from trilane.scheduler.stats import LEAST_FRAMES, batch_interval
 from trilane.scheduler.virtual import Need, SharedCores
 
-SLOWER: Final = 0.2
+SLOWER: Final = 0.2  # share by which the jobs of a stage take longer
 #: Largest difference between the frame times of the replay and of the run, as a share, for which the replay is trusted.
 TRUSTED: Final = 0.15
-#: Least cost that names a bound; below it nothing that a stage does matters.
+#: Least cost of the bound, as a share; if no stage costs that much, no stage is the bound.
 LEAST_COST: Final = 0.01
-#: Most blocks of frames that are kept. Of more, as many are drawn: evenly spaced ones may all fall on the same part of
-#: a motion that repeats.
+#: Most blocks of frames that are kept. From more blocks, this number is drawn at random: evenly spaced blocks might all
+#: show the same part of a motion that repeats.
 MOST_BLOCKS: Final = 12
-HAND_OVERS: Final = 512
-#: Frames after which one that was begun and not presented is taken to be lost; more than can be in flight.
+HAND_OVERS: Final = 512  # measured times of hand-over that are kept
+#: Number of later frames after which a frame that was not presented counts as lost; more than can be in flight.
 MOST_OPEN: Final = 64
 
 
 class Cost(NamedTuple):
-    """What slowing a stage, or all stages of a unit, costs.
+    """The cost of slowing a stage, or all stages of a unit.
 
     `share`: growth of the frame time as a share.
-    `of_blocks`: the same for each block of LEAST_FRAMES frames.
+    `of_blocks`: growth for each block of LEAST_FRAMES frames.
     """
 
     share: float
@@ -65,7 +65,7 @@ class Cost(NamedTuple):
 
 
 class Slowed(NamedTuple):
-    """What the replays say.
+    """The results of the replays.
 
     `costs`: cost of slowing each stage by SLOWER.
     `frames`: number of frames that were replayed and counted.
@@ -79,12 +79,12 @@ class Slowed(NamedTuple):
 
     @property
     def is_trusted(self) -> bool:
-        """Whether the replay is near the run, and slowing a stage costs anything."""
+        """Whether the replay is near the run, and slowing one of the stages costs at least LEAST_COST."""
         worst = max(cost.share for cost in self.costs.values())
         return abs(self.over_measured - 1) <= TRUSTED and worst >= LEAST_COST
 
     def by(self, name_of: Mapping[str, str]) -> dict[str, Cost]:
-        """Return the cost of each group of stages, such as a unit, summed over them. `name_of`: group of a stage."""
+        """Return the summed cost of each group of stages, such as a unit. `name_of`: group of each stage."""
         found: dict[str, Cost] = {}
         for stage, cost in self.costs.items():
             was = found.get(name_of[stage], Cost(0.0, (0.0,) * len(cost.of_blocks)))
@@ -96,7 +96,8 @@ class Slowed(NamedTuple):
 class _Block(NamedTuple):
     """LEAST_FRAMES presented frames in a row.
 
-    `needs`: needs of each frame's jobs by stage. `span_ns`: time from the frame before to the last of them.
+    `needs`: for each frame, the needs of its jobs by stage.
+    `span_ns`: time from the last presented frame before the block to the block's last frame.
     """
 
     needs: tuple[Mapping[str, Need], ...]
@@ -104,9 +105,10 @@ class _Block(NamedTuple):
 
 
 class WhatIf:
-    """Takes the jobs of a run in order; keeps those of a bounded number of frames, spread over the run.
+    """Takes the jobs of a run in order, and replays a bounded number of its frames, spread over the run.
 
-    `graph`, `settings`: graph and settings of the run. `places`: places of its units.
+    `graph`, `settings`: graph and settings of the run.
+    `places`: cores and threads of its units, as far as they are known.
     """
 
     def __init__(self, graph: Graph, settings: Settings, places: Placement) -> None:
@@ -145,7 +147,7 @@ class WhatIf:
         self._count += 1
         self._blocks.append(_Block(tuple(self._presented), end_ns - self._first_ns))
         if len(self._blocks) > MOST_BLOCKS:
-            # Vitter's algorithm R: the last block takes the place of one that was kept, or goes.
+            # Vitter's algorithm R: the last block replaces a kept one at random, or is thrown away.
             place = self._draw.randrange(self._count)
             del self._blocks[place if place < MOST_BLOCKS else MOST_BLOCKS]
         self._first_ns = end_ns
@@ -155,7 +157,7 @@ class WhatIf:
         """Return what slowing each stage costs; None for fewer than two blocks, or a run that cannot be replayed."""
         if len(self._blocks) < 2:
             return None
-        # The first frames fill the pipeline, and it runs empty behind the last ones; neither count.
+        # While the first frames fill the pipeline and the last ones empty it, frame times do not count.
         frames = [needs for block in [*self._blocks, self._blocks[0]] for needs in block.needs]
         measured_ns = sum(block.span_ns for block in self._blocks[1:])
         message_ns = round(median(self._handed_ns)) if self._handed_ns else 0
@@ -170,7 +172,11 @@ class WhatIf:
         return Slowed(costs, count * LEAST_FRAMES, sum(plain_ns) / len(plain_ns) / LEAST_FRAMES / whole_ns)
 
     def _replayed(self, frames: Sequence[Mapping[str, Need]], slowed: str, message_ns: int) -> list[int]:
-        """Return the time of each LEAST_FRAMES presented frames but the first and the last."""
+        """Return the times in ns of each LEAST_FRAMES presented frames of a replay, except the first and the last.
+
+        `slowed`: name of the slowed stage; "" for none.
+        `message_ns`: time from the end of a job until the next job is handed over.
+        """
 
         def need(stage: str, frame: int) -> Need:
             found = frames[frame].get(stage, Need(0.0))
@@ -192,14 +198,14 @@ def _stage_cost(slowed_ns: Sequence[int], plain_ns: Sequence[int]) -> Cost:
 
 
 class RunEfficiencies:
-    """The shares of work in the time between the first and the last presented frame; no share exceeds 1.
+    """Computes the three efficiencies: work as a share of the time between first and last presented frame, at most 1.
 
-    Jobs are added in the order of their ends. A job may begin before that time or end after it. Such a job counts only
-    the CPU time that must lie within: its CPU time less the time that its cores had outside. Therefore the counted work
-    of a unit or of a set of cores fits into the time.
+    A job may begin before this time or end after it. Such a job counts only the CPU time that must lie within: its CPU
+    time less the time that its cores had outside. Therefore the counted work of a unit or of a set of cores fits into
+    the time.
 
-    A unit's work counts the CPU time of a job divided by the unit's threads. It also counts the busy time beyond the
-    CPU time, because a device of its own worked then while the threads slept.
+    A unit's work is the CPU time of its jobs divided by the unit's threads. Busy time beyond the CPU time is added,
+    because in it a device of the unit worked while the threads slept.
 
     `places`: cores and threads of each unit.
     """
@@ -227,13 +233,13 @@ class RunEfficiencies:
         self._book(settled, self._first_ns)
 
     def close(self) -> dict[str, float | None]:
-        """Return `efficiency`, `core_efficiency` and `machine_efficiency` of a report; None for one frame.
+        """Return `efficiency`, `core_efficiency` and `machine_efficiency` of a report; all are None for one frame.
+
+        `efficiency` is the work of the slowest unit, as a share of the time. `core_efficiency` is the CPU time of the
+        units that have only the cores of the fullest set, as a share of the time that this set had.
+        `machine_efficiency` is the CPU time of all units, as a share of the time that all cores had.
 
         Called after all jobs.
-
-        The first is the work of the slowest unit. The second is the CPU time on the fullest set of cores, of the units
-        that have no other cores. No division of the work avoids it. The third is the CPU time of all units on all
-        cores. Each is a share of the time that the unit or the cores had.
         """
         had_ns = self._last_ns - (self._first_ns or 0)
         if self._first_ns is None or had_ns <= 0:
@@ -262,8 +268,8 @@ class RunEfficiencies:
 class Reckoned(NamedTuple):
     """What bounded a whole run.
 
-    `budget`: ns of the critical path by kind and stage.
-    `taken`: for each stage, which stages had the core while its jobs lacked one.
+    `budget`: time of the critical path in ns, by kind and stage.
+    `taken`: for each stage, times without a core, and which stages had the core then.
     `figures`: `bottleneck`, `bound`, `efficiency`, `core_efficiency` and `machine_efficiency` of a report.
     """
 
@@ -273,7 +279,7 @@ class Reckoned(NamedTuple):
 
 
 class Reckoning:
-    """Takes the jobs of a run in order, with their waits explained.
+    """Takes the explained jobs of a run in order, and computes what bounded the run.
 
     `graph`, `settings`: graph and settings of the run.
     `places`: places of its units, as far as they are known.
@@ -285,7 +291,7 @@ class Reckoning:
         self.paths = Paths(graph, settings, timeline.downs, timeline.stalls)
         self.sharing = Sharing({unit: place.cores for unit, place in places.items()})
         self._budget = Budget(self.paths, self.sharing)
-        # as if each unit had a core of its own
+        # A unit whose place is not known counts as having a core of its own.
         own = {unit: Place((-1 - number,), 1) for number, unit in enumerate(graph.units)}
         self._efficiencies = RunEfficiencies({**own, **places})
         self._what_if = WhatIf(graph, settings, places)
@@ -293,7 +299,7 @@ class Reckoning:
 
     @property
     def bound(self) -> Mapping[str, Any] | None:
-        """The `bound` of a report, by the path so far; None until 63 frames were presented."""
+        """The `bound` of a report from the path so far; None for fewer than 63 presented frames."""
         return _bound(self._budget, self._unit_of, None).get("bound")
 
     def add(self, explained: ExplainedJob) -> None:

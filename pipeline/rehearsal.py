@@ -1,17 +1,19 @@
-"""Measures units before a run: what they need for a frame, and which placement has the shortest frames.
+"""Measures units before a run: their work for a frame (rehearsal), and the fastest placement (trial).
 
-The rehearsal measures what units need. Rule: frames go through in the order of a run, one at a time.
+The rehearsal measures the work of each unit for a frame. Rule: frames go through the stages in the order of a run, one
+frame at a time.
 
-Every frame goes through all stages before the next one, and through the slots of an edge in turn. That matters because
-the time of a stage depends on what it did last, on what its slot holds, and on how long it rested. Only time in which
-the unit had its cores counts, because others may use the machine meanwhile.
+Every frame goes through all stages before the next frame begins, and the slots of an edge are used in turn. That
+matters because the time of a stage depends on its last frame, on the content of its slot, and on its rest before. Only
+time in which the unit had its cores counts, because other programs may use the machine.
 
-The trial times placements with real frames. Rule: placements run in turns, a few frames each, the same frames.
+The trial measures the frame times of a few placements. Rule: placements run in turns, a few frames each, and all do the
+same frames.
 
-Running units are moved from the cores of one placement to those of the next, while frames go through them. A slice of
-frames takes a fraction of a second, so what slows the machine for a second slows all placements that are compared. From
-run to run the machine may differ by more than two placements do. Placements with other numbers of threads need
-processes of their own, which stand still while others have their turn.
+Running units are moved from the cores of one placement to the cores of the next, while frames go through them. A slice
+of frames takes a fraction of a second. Therefore a disturbance that lasts a second slows all placements alike. Between
+two runs, the machine may differ by more than two placements differ. Placements with other numbers of threads need
+processes of their own, which are idle while other placements have their turn.
 """
 
 from __future__ import annotations
@@ -41,14 +43,15 @@ from trilane.transport.messages import Done, Message, RunJob
 from trilane.transport.slots import edge_rule
 from trilane.unexpected_value import UnexpectedValue
 
-WARM_UP = 2  # frames that do not count; most edges have as many slots
-LIMIT_S = 0.5  # seconds after the warm-up from which no further frame is begun
+WARM_UP = 2  # first frames, which do not count; most edges have two slots
+LIMIT_S = 0.5  # seconds after the warm-up after which no further frame begins
 
 
 class Chain:
-    """The stages of `graph`, which must be a chain; the last stage is left out unless `whole`.
+    """Sends single frames through the stages of `graph`, which must be a chain.
 
-    `processes`: process of each unit, ready and without a job.
+    `processes`: for each unit, the processes to which it belongs; its process is ready and has no job.
+    `whole`: whether the last stage takes part.
     """
 
     def __init__(
@@ -62,7 +65,7 @@ class Chain:
         self._frames = self._jobs = 0
 
     def frame(self, number: int, rung: int = 0) -> dict[str, Done]:
-        """Let every stage do frame `number`, one stage after the other, and return their answers by stage.
+        """Let every stage do frame `number`, one stage after the other, and return the answers by stage.
 
         Raises UnitError when a stage fails or does not answer, and KeyboardInterrupt when interrupted.
         """
@@ -89,12 +92,15 @@ class Chain:
 
 
 def on_rungs(chain: Chain, frames: Sequence[int], rungs: int, follow: Sequence[str]) -> list[StageAlone]:
-    """Return the time that each stage of `follow` takes alone on each of `rungs` rungs of a ladder.
+    """Return the isolated time of each stage of `follow` on each rung of a ladder.
 
-    Each time is the median over `frames`. All frames go through one rung before the next, so that no frame follows
-    itself. With several frames, the first of each rung warms up. A stage is left out unless it takes less time on every
-    further rung. Stages are left out, for example, if nobody is on the screen in any of the frames. Raises as
-    `Chain.frame` does.
+    Each time is the median over `frames`. All frames are done on one rung before the next rung, so that no frame
+    follows itself. With several frames, the first frame of each rung warms up. If a further rung does not make a stage
+    faster, the stage is left out. An example is a scene with nobody on the screen in these frames.
+
+    `rungs`: number of rungs.
+
+    Raises as `Chain.frame` does.
     """
     medians: dict[str, list[float]] = {name: [] for name in follow}
     for rung in range(rungs):
@@ -110,10 +116,10 @@ def on_rungs(chain: Chain, frames: Sequence[int], rungs: int, follow: Sequence[s
 
 
 class Rehearsed(NamedTuple):
-    """Measured times.
+    """The results of a rehearsal.
 
     `times`: work of each unit, by number of threads.
-    `took_ns`: times of each frame in ns, by stage of the first pipeline.
+    `took_ns`: time of each frame in ns, by stage, with the settings of the first pipeline.
     """
 
     times: Times
@@ -123,11 +129,11 @@ class Rehearsed(NamedTuple):
 def rehearse(
     pipeline: Pipeline, variants: Sequence[Pipeline], frames: Sequence[int], assets: Assets, starter: UnitStarter
 ) -> Rehearsed:
-    """Measure what each unit needs for a frame; the caller removes the files that the last stage writes.
+    """Measure the work of each unit for a frame; the caller removes the files that the last stage writes.
 
-    `pipeline`: pipeline whose units are all measured, on `frames`.
-    `variants`: the same pipeline with other settings of some units; only these are measured again, between the other
-    stages.
+    `pipeline`: pipeline whose units are all measured.
+    `variants`: the same pipeline with other settings of some units; only these units are measured again.
+    `frames`: numbers of the frames that are done.
     `assets`, `starter`: arrays and fork server, as for a run.
 
     Raises TrilaneError when a unit cannot start or a stage fails, and KeyboardInterrupt when interrupted.
@@ -160,9 +166,10 @@ def rehearse(
 
 
 def timed(chain: Chain, frames: Sequence[int]) -> list[dict[str, Done]]:
-    """Return the answers of all stages to each of `frames` without the first WARM_UP.
+    """Return the answers of all stages for each frame that counts, by stage.
 
-    LIMIT_S holds for the frames that count. Of WARM_UP frames or fewer, only the last one counts.
+    The first WARM_UP frames do not count. If there are no more frames than that, the last one counts. After LIMIT_S no
+    further frame begins.
     """
     warm_up = min(WARM_UP, len(frames) - 1)
     for frame in frames[:warm_up]:
@@ -176,7 +183,10 @@ def timed(chain: Chain, frames: Sequence[int]) -> list[dict[str, Done]]:
 
 
 def works_of(pipeline: Pipeline, done: Sequence[Mapping[str, Done]]) -> dict[str, UnitWork]:
-    """Return the work of each unit for a frame: the sum over its stages of the median times in `done`."""
+    """Return the work of each unit for a frame: the sum over its stages of their median times in `done`.
+
+    `done`: for each frame, the answers of all stages.
+    """
     works = {}
     for unit, settings in pipeline.units.items():
         names = [stage.name for stage in pipeline.stages_of(unit)]
@@ -188,13 +198,13 @@ def works_of(pipeline: Pipeline, done: Sequence[Mapping[str, Done]]) -> dict[str
 
 
 def _took_ns(done: Done) -> int:
-    """Return how long a job took without the time in which it had no core, in ns."""
+    """Return the time of a job in ns, without the time in which it had no core."""
     return done.t_end_ns - done.t_begin_ns - done.preempted_ns
 
 
 SLICE: Final = 16  # frames of a placement in its turn
-SKIPPED: Final = 6  # first frames of a slice that do not count, as they were under way when the units were moved
-DRAIN: Final = 6  # frames behind the last slice, so that its own frames are not the last in the pipeline
+SKIPPED: Final = 6  # first frames of a slice, which do not count: they were in flight when the units were moved
+DRAIN: Final = 6  # frames after the last slice, so that the pipeline does not run empty during the slice
 PERIOD_NS: Final = 33_333_333
 HANG_NS: Final = 10_000_000_000
 
@@ -203,7 +213,11 @@ Cores = Mapping[str, tuple[int, ...]]
 
 
 class Group(NamedTuple):
-    """Placements that the processes of `pipeline` can have in turn; the cores in `pipeline` itself do not matter."""
+    """Placements that the same processes can have in turn.
+
+    `pipeline`: pipeline of these processes; its own cores do not matter.
+    `places`: cores of each unit, for each placement.
+    """
 
     pipeline: Pipeline
     places: Sequence[Cores]
@@ -227,11 +241,12 @@ def try_in_turns(
     starter: UnitStarter,
     is_enough: Callable[[Sequence[Round]], bool] = lambda _: False,
 ) -> list[Round]:
-    """Return a round for each of `windows`, or fewer once `is_enough` says that they are enough.
+    """Return the measured rounds: one for each of `windows`, or fewer if `is_enough` says that the rounds are enough.
 
-    `groups`: placements to try; each round begins with another one.
+    `groups`: placements to try; each round begins with another placement of a group.
     `windows`: for each round, the first of the SLICE frames that every placement does.
     `assets`, `starter`: arrays and fork server, as for a run.
+    `is_enough`: function that is called with the rounds so far.
 
     Raises TrilaneError when a unit cannot start or a stage fails, and KeyboardInterrupt when interrupted.
     """
@@ -253,7 +268,7 @@ def try_in_turns(
 
 
 class _Replaying(UnitProcesses):
-    """Units whose every slice does the same frames of the scene: those from `first` on."""
+    """Units that do the same SLICE frames of the scene in every slice. `first`: number of the first of them."""
 
     first = 0
 
@@ -281,9 +296,10 @@ class _Live:
         return list(self._processes.pids.values())
 
     def one_round(self, turn: int, first: int) -> list[float]:
-        """Return the frame time of each place in ns, on the frames from `first` on.
+        """Return the frame time of each placement in ns.
 
-        Each `turn` begins with another place.
+        `turn`: index of the placement that begins, modulo the number of placements.
+        `first`: number of the first frame that every placement does.
         """
         count = len(self._group.places)
         order = [(turn + number) % count for number in range(count)]
@@ -304,12 +320,12 @@ class _Live:
 
 
 class _Turns:
-    """The `trilane.scheduler.core.Clock` that moves the units to the next of `places` after each SLICE frames."""
+    """A `trilane.scheduler.core.Clock` that moves the units to the next placement after each SLICE frames."""
 
     def __init__(self, core: Core, clock: RealtimeClock, processes: UnitProcesses, places: Sequence[Cores]) -> None:
         self._core, self._clock, self._processes, self._places = core, clock, processes, places
         self._scheduler_unit = core.graph.stages[0].unit
-        self._begun: list[int] = []  # how many frames were presented when each place had its turn
+        self._begun: list[int] = []  # number of frames that were presented when each placement's turn began
 
     def wait(self, deadline_ns: int) -> tuple[int, tuple[Event, ...]]:
         presented = self._core.ledger.presented_count
@@ -326,7 +342,7 @@ class _Turns:
         self._clock.perform(now_ns, actions)
 
     def frame_ns(self) -> list[float]:
-        """Return the mean time between presented frames of each place in ns, without its first SKIPPED frames."""
+        """Return the mean frame time of each placement in ns, without the first SKIPPED frames of its slice."""
         presented_ns = self._core.ledger.presented_ns
         ends = [*self._begun[1:], SLICE * len(self._places)]
         spans = [(begin + SKIPPED, end) for begin, end in zip(self._begun, ends, strict=True)]

@@ -1,13 +1,12 @@
-"""The output of a run: its messages and its failure while it goes on, its record of steps and jobs, and its result.
+"""The output of a run: its messages, its failure, its record of steps and jobs, and its result.
 
-Rule: the first failure stands; the report also has every message. A result is plain data; a recording is written only
-where the caller asks for it.
+Rule: only the first failure counts; the result also has the messages. A result is plain data; a recording is written
+only if the caller asks for it.
 
-Stores the steps and jobs of a run, either in memory or in the run's journal. Rule: one of the two, never both.
-
-Memory is for a caller that runs a few frames and wants all of them. With a journal, nothing is kept that grows with the
-number of frames. Steps are written a few at a time, after the units have been told what follows from the last one.
-Written one by one they take three times as long, because the code that writes them is then never in the caches.
+Steps and jobs of a run are kept either in memory or in the run's journal, never in both. Memory is for a caller that
+runs a few frames and needs all of them. With a journal, no data is kept in memory that grows with the number of frames.
+Steps are written many at a time, after the actions of the last step were sent to the units. Written one by one, they
+would take three times as long, because the code that writes them would never be in the caches.
 """
 
 from __future__ import annotations
@@ -54,7 +53,7 @@ class Failure:
     """Why a run ended early.
 
     `message`: one sentence.
-    `exit_code`: exit code that the failure asks for.
+    `exit_code`: exit code of the program after this failure.
     """
 
     message: str
@@ -65,20 +64,19 @@ class Failure:
 class RunResult:
     """A finished run.
 
-    `report`: what the run measured; the caller adds the machine and the configuration.
+    `report`: measured figures; the caller adds the machine and the configuration.
     `requested`, `presented`: numbers of frames.
     `lost`, `dropped`: numbers of frames by cause.
     `pids`: process id of each unit.
     `startup_ms`: start-up time of each unit in ms.
-    `jobs`, `recording`: jobs and steps of a run without a journal. With a journal both are empty, and the journal has
-    them (`trilane.pipeline.journal.Worked`).
-    `metrics`: means of what each stage reported, over the jobs that reported it.
+    `jobs`, `recording`: jobs and steps of a run without a journal. With a journal both are empty, because the journal
+    has the jobs and steps.
+    `metrics`: mean of each metric of each stage, over the jobs that reported it.
     `rungs`: number of presented frames on each rung, for a run with a ladder of work.
     `rung_switches`: how often a frame had another rung than the frame before.
-    `messages`: texts of what went wrong on the way, such as a unit that died and was restarted.
+    `messages`: messages about problems during the run, such as a unit that died and was restarted.
     `interrupted`: whether a signal ended the run.
-    `failure`: set when a stage failed or a unit could not be kept alive; the other fields hold what was done until
-    then.
+    `failure`: failure that ended the run; None without one. The other fields cover the time until then.
     """
 
     report: RunMetrics
@@ -111,9 +109,10 @@ class UnitError(TrilaneError):
 
 
 class RunLog:
-    """The messages and the failure of a run; each function of `hears` is called with every message.
+    """The messages and the failure of a run.
 
-    `messages`: the first MOST_MESSAGES messages, in order.
+    `hears`: functions that are called with every message.
+    `messages`: the first MOST_MESSAGES messages, in order, and a note about further ones.
     `failure`: the run's first failure.
     """
 
@@ -137,18 +136,18 @@ class RunLog:
             hear(text)
 
     def fail(self, text: str, exit_code: int = 1) -> None:
-        """Note the failure, unless there was one before; the result shows it."""
+        """Note the failure of the run if it is the first."""
         self.failure = self.failure or Failure(text, exit_code)
 
     def fail_with(self, message: Failed) -> None:
-        """Say a stage's error and note it as the failure, unless there was one before."""
+        """Note a stage's error as failure and as message if it is the first failure."""
         if self.failure is None:
             self.fail(message.message, message.exit_code)
             self.say(message.message)
 
 
 def after_stderr(tail: str) -> str:
-    """Return the last line that a unit wrote to stderr as part of a sentence; empty if it wrote nothing."""
+    """Return the last line of a unit's stderr as part of a sentence; empty if it wrote nothing. `tail`: stderr tail."""
     lines = tail.splitlines()
     return f"it wrote last: {lines[-1]}" if lines else ""
 
@@ -161,7 +160,7 @@ PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 @dataclass(frozen=True)
 class JournalFile:
-    """Where a run writes its journal, and what else goes there.
+    """The journal file of a run, and further content for it.
 
     `path`: path of a file that does not exist yet.
     `facts`: facts of the journal's `Begun`.
@@ -192,14 +191,14 @@ class CapReadings(Protocol):
 
     @property
     def temperatures_c(self) -> Mapping[str, float]:
-        """The temperatures that the governor goes by, in degrees Celsius, by name."""
+        """The temperatures on which the governor's decisions depend, in degrees Celsius, by name."""
 
 
 class RunRecord(Protocol):
-    """Takes steps from the scheduler's loop through `add`.
+    """The record of a run, which the scheduler's loop fills through `add`.
 
     `recording`, `jobs`: part of the run that is in memory.
-    `failure`: why nothing more can be noted; None while all is well.
+    `failure`: error after which nothing more can be recorded; None without one.
     """
 
     recording: Recording
@@ -209,22 +208,22 @@ class RunRecord(Protocol):
     def failure(self) -> UnwrittenError | None: ...
 
     def begin(self, source: JobSource, pids: Callable[[], Mapping[str, int]]) -> None:
-        """Note that the loop begins. `pids`: function that returns the process id of each unit at any time."""
+        """Note that the loop begins. `pids`: function that returns the present process id of each unit."""
 
     def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
-        """Note a step of `core` whose actions were carried out; raises `failure` when there is one."""
+        """Record a step of `core` whose actions were carried out; raises `failure` if there is one."""
 
     def say(self, text: str) -> None:
-        """Note a message to a person."""
+        """Record a message to a person."""
 
     def reckoned(self, places: Placement) -> Reckoned:
-        """Return what bounded the whole run; called after the loop. `places`: places of the run's units.
+        """Return what bounded the whole run; called after the loop. `places`: cores and threads of the run's units.
 
-        Raises `failure` where what was noted is gone.
+        Raises `failure` if the recorded steps and jobs are gone.
         """
 
     def end(self, report: Mapping[str, Any]) -> None:
-        """Note that the run is over, with this report."""
+        """Record the end of the run, with its report."""
 
 
 class _KeptRun:
@@ -237,14 +236,14 @@ class _KeptRun:
         self._source: JobSource | None = None
 
     def begin(self, source: JobSource, pids: Callable[[], Mapping[str, int]]) -> None:  # noqa: ARG002 - a `RunRecord`
-        """Keep the source; jobs are read when the run is over, because units share the scheduler's core."""
+        """Keep the source. Jobs are read after the run, because units may share the scheduler's core."""
         self._source = source
 
     def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
         self.recording.add(now_ns, events, actions, core)
 
     def say(self, text: str) -> None:
-        """Do nothing: the log of the run keeps messages."""
+        """Do nothing, because the log of the run keeps the messages."""
 
     def reckoned(self, places: Placement) -> Reckoned:
         if self._source is not None:
@@ -253,15 +252,15 @@ class _KeptRun:
         return reckoned(recording.graph, recording.settings, places, records_of(recording, self.jobs))
 
     def end(self, report: Mapping[str, Any]) -> None:
-        """Do nothing: everything is in memory."""
+        """Do nothing, because everything is in memory."""
 
 
-#: A step, the records that follow from it, and how many of the jobs since the last writing had ended by then.
+#: A step, the records that follow from it, and the number of jobs that had ended by then since the last writing.
 _Step = tuple[Stepped, list[Accounted | Counted], int]
 
 
 class _JournaledRun:
-    """A record of the run in the journal of `file`; `recording` has no steps and `jobs` stays empty.
+    """A record of the run in the journal `file`. Its `recording` has no steps, and its `jobs` stay empty.
 
     `writer`: writer of that file.
     `caps`: governor that sets the units' duties; duties and temperatures are sampled.
@@ -310,11 +309,11 @@ class _JournaledRun:
             self._sample(now_ns, core)
 
     def _write(self) -> None:
-        """Write the notes since the last call; raises UnwrittenError when they cannot be written."""
+        """Write the steps and jobs since the last call; raises UnwrittenError if they cannot be written."""
         add, told = self._writer.add, 0
         jobs = self._source.ended() if self._source is not None else []
         for stopped in self._source.stopped() if self._source is not None else []:
-            add(stopped)  # before the end of the job that it made longer
+            add(stopped)  # before the record of the job that the stop made longer
         for step, follows, ended in self._steps:
             add(step)
             for record in (*follows, *jobs[told:ended]):
@@ -346,12 +345,12 @@ class _JournaledRun:
             self._writer.flush()
 
     def flush(self) -> None:
-        """Write everything that was noted to the file; raises UnwrittenError when it cannot be written."""
+        """Write everything that was recorded to the file; raises UnwrittenError if it cannot be written."""
         self._write()
         self._writer.flush()
 
     def _sample(self, now_ns: int, core: Core) -> None:
-        """Write the readings that are due, and flush so that whoever follows the journal sees them."""
+        """Write the readings that are due, and flush, so that readers of the journal see them."""
         self._flush_ns = now_ns + FLUSH_NS
         values: dict[str, float] = {}
         if self._caps is not None:
@@ -371,10 +370,13 @@ class _JournaledRun:
 def recorded(
     file: JournalFile | None, graph: Graph, settings: Settings, caps: CapReadings | None
 ) -> Iterator[RunRecord]:
-    """Yield the record of one run, which goes to `file`, or stays in memory without one.
+    """Yield the record of one run, in `file`, or in memory if `file` is None.
 
-    Everything up to the end of the run is in the file, however the run ends. Raises BadInputError when the file cannot
-    be made.
+    At the end everything is written to the file, however the run ended.
+
+    `caps`: governor that sets the units' duties, or None.
+
+    Raises BadInputError if the file cannot be made.
     """
     if file is None:
         yield _KeptRun(graph, settings)

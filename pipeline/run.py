@@ -1,9 +1,10 @@
-"""Runs a pipeline on this machine. Rule: whatever happens, the units' processes are gone when this returns.
+"""Runs a pipeline on this machine. Rule: whatever happens, the units' processes are gone when `run_pipeline` returns.
 
-With a journal, percentiles of more times than are kept come from the library ddsketch, within RELATIVE_ERROR of the
-exact ones. Masson, Rim, Lee, "DDSketch: A Fast and Fully-Mergeable Quantile Sketch with Relative-Error Guarantees",
-PVLDB 12 (2019). The bins grow by a constant factor, so each value is known within that factor. _BINS of them reach from
-a nanosecond to centuries; a bin is made when it gets a value.
+A run with a journal keeps at most MOST_EXACT times of each kind. After that, percentiles come from the library
+ddsketch, within RELATIVE_ERROR of the exact values. Masson, Rim, Lee, "DDSketch: A Fast and Fully-Mergeable Quantile
+Sketch with Relative-Error Guarantees", PVLDB 12 (2019). The sketch counts values in bins, and each bin is wider than
+the last by a constant factor. Therefore each value is known within that factor. _BINS bins reach from a nanosecond to
+centuries.
 """
 
 from __future__ import annotations
@@ -65,15 +66,15 @@ class DdSketch:
 
 
 HANG_NS = 10_000_000_000
-FRAMES_ON_RUNGS = 4  # on each rung; the first frame warms up
+FRAMES_ON_RUNGS = 4  # frames that measure each rung before the run; the first one warms up
 
 
 class ReportingGovernor(ClockGovernor, Protocol):
-    """A governor of a whole run, which also reports what it did."""
+    """The governor of a run, which also reports power, temperatures and caps."""
 
     @property
     def is_prompt(self) -> bool:
-        """Whether idle cores should stay awake for the next message."""
+        """Whether idle cores should stay awake, so that a message wakes a unit sooner."""
 
     @property
     def power_w(self) -> float | None:
@@ -81,10 +82,10 @@ class ReportingGovernor(ClockGovernor, Protocol):
 
     @property
     def temperatures_c(self) -> Mapping[str, float]:
-        """The temperatures that the governor goes by, in degrees Celsius, by name."""
+        """The temperatures on which the governor's decisions depend, in degrees Celsius, by name."""
 
     def report(self) -> dict[str, Any]:
-        """Return `caps` and `temperature_c` of the report."""
+        """Return the report's keys `caps` and `temperature_c`."""
 
 
 def run_pipeline(
@@ -111,32 +112,32 @@ def run_pipeline(
     """Run `frames` frames through the units of `pipeline`, and return the result.
 
     `policy`: sequential, pipelined, latest or deadline.
-    `fps`: rate that the frames are meant for, in frames a second; a longer frame time counts as a missed deadline.
-    `pace_fps`: rate at which frames are released, in frames a second. None releases them as fast as they are taken, or
-    at the rate `fps` under `latest` and `deadline`, which need one.
+    `fps`: target rate in frames a second. If frames have no deadline, a longer frame time counts as a missed deadline.
+    `pace_fps`: rate at which frames are released, in frames a second. None: under `latest` and `deadline` they are
+    released at the rate `fps`, under other policies as soon as they can be taken.
     `assets`: arrays that every stage may read.
     `hang_ns`: longest time of a job in ns; a unit whose job takes longer is restarted.
-    `latch_ms`: margin in ms by which the first stage should end before the second can take its frame; 0: it begins at
-    once.
-    `works`: work of each rung of a ladder in thousandths, the most first; used where frames are released at a rate. A
-    frame that would be late is given less work (`trilane.scheduler.policy`), and the first stage is told
+    `latch_ms`: margin in ms by which the first stage should end before the second can take its frame; 0: the first
+    stage begins at once.
+    `works`: work of each rung of a ladder in thousandths, the most first; it needs frames that are released at a rate.
+    A frame that would be late gets less work (`trilane.scheduler.policy`), and the first stage gets the rung
     (`SteppedStage`).
     `follow`: names of the stages whose time follows the work.
     `settings`: settings of the scheduler, which replace `frames` and the options above except `fps`.
-    `requests`: queue through which others ask for frames, at most `frames`; it is closed when this returns.
-    `controls`: queue of what others ask of the run, closed when this returns. At the run's end, the frames that it has
-    released count as requested.
-    `governor`: governor that holds the units to shares of the time, and adds what it did to the report.
-    `journal`: file for everything that happens, written while it happens, with nothing kept in memory. None keeps it
-    all, in `RunResult.recording` and `RunResult.jobs`.
+    `requests`: queue of frame requests, at most `frames` in sum; it is closed when this returns.
+    `controls`: requests to the run, closed when this returns. With `controls` or `requests`, only released frames count
+    as requested in the report.
+    `governor`: governor that holds the units to shares of the time, and adds caps and temperatures to the report.
+    `journal`: file that records the run while it goes on. With it, `RunResult.recording` and `RunResult.jobs` stay
+    empty; None: they have all steps and jobs.
     `starter`: fork server that was started earlier; None makes one for this run.
     `on_progress(presented, requested)`, `on_message(text)`: functions that are called from this thread.
 
-    SIGINT, SIGTERM, SIGHUP or SIGQUIT ends the run cleanly with its result marked `interrupted`; a second signal ends
-    the units at once. Before the first frame KeyboardInterrupt is raised instead.
+    SIGINT, SIGTERM, SIGHUP or SIGQUIT ends the run cleanly, and its result is `interrupted`. A second signal ends the
+    units at once. Before the first frame, a signal raises KeyboardInterrupt.
 
-    Raises BadInputError for an unknown policy and in a unit's own process. Raises TrilaneError, with the exit code of
-    the unit's error, when a unit cannot start; a failure after that is `RunResult.failure`.
+    Raises BadInputError for bad settings, and if a unit's process calls it. Raises TrilaneError, with the exit code of
+    the unit's error, if a unit cannot start; a later failure is in `RunResult.failure`.
     """
     refuse_in_a_unit()
     check_open_files()
@@ -188,7 +189,7 @@ def run_pipeline(
 
 
 def _add_caps(report: dict[str, Any], governor: ReportingGovernor | None) -> None:
-    """Add the governor's figures of the run, and the score of the energy that it modelled."""
+    """Add the governor's caps and temperatures to `report`, and the score of the modelled energy."""
     if governor is None:
         return
     report.update(governor.report())
@@ -268,9 +269,9 @@ class _Run:
         )
 
     def _mean_metrics(self) -> Mapping[str, Mapping[str, float]]:
-        """Return the mean of each figure that a stage reported, over the jobs that reported it.
+        """Return the mean of each metric of each stage, over the jobs that reported it.
 
-        `add_bytes` handles the bytes, so they are left out.
+        Counts of bytes are left out, because `add_bytes` reports them.
         """
         reported = self._clock.reported
         return {
@@ -304,7 +305,7 @@ def _settings(
 
 
 def _stepped(settings: Settings, works: tuple[int, ...], follow: tuple[str, ...]) -> Settings:
-    """Return the settings with the ladder if frames are released at a rate; otherwise none can be late."""
+    """Return the settings with the ladder if frames are released at a rate; without a rate no frame can be late."""
     return replace(settings, works=works, follow=follow) if works and settings.period_ns else settings
 
 

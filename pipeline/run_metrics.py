@@ -1,7 +1,7 @@
-"""Defines what a run measured as validated data: the keys of report.json for a run of any pipeline.
+"""The figures of a run as validated data: the keys of report.json for a run of any pipeline.
 
-Rule: the fields stand in the order of the file's keys, and an unknown key is an error. An optional field that was not
-set is left out of the file. Times are in ms, shares between 0 and 1.
+Rule: the fields have the order of the file's keys, and an unknown key is an error. An optional field that was not set
+is left out of the file. Times are in ms, shares from 0 to 1.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from trilane.pipeline.description import Model
 
-#: Keys of older reports: the times of stages measured alone, a second computation of the shares in `units`, and whether
-#: the core was compiled.
+#: Keys of older reports that nothing writes now: isolated times of stages, a second computation of the shares in
+#: `units`, and whether the core was compiled.
 GONE: Final = frozenset({"isolated_ms", "accounts", "scheduler_core"})
 
 
@@ -28,7 +28,7 @@ class Record(Model):
     @model_validator(mode="before")
     @classmethod
     def _leave_out_what_is_gone(cls, document: Any) -> Any:
-        """Leave out keys of older Trilanes that nothing writes now."""
+        """Return the document without the keys in GONE."""
         if not isinstance(document, dict):
             return document
         return {key: value for key, value in document.items() if key not in GONE}
@@ -40,10 +40,10 @@ class FrameCounts(Record):
     `requested`: number of frames that the run was asked for.
     `presented`: number of frames that reached the end of the last stage.
     `lost`: number of frames that were begun and not presented, because a unit died or a stage failed.
-    `lost_by_cause`: lost frames by `cause:unit`.
-    `dropped`: frames that the policy left out, by `edge:cause`.
-    `not_begun`: number of frames never taken because the run ended before; null in reports older than this count.
-    `skipped`: number of presented frames that took the pipeline's bypass; absent where it has none.
+    `lost_by_cause`: numbers of lost frames by `cause:unit`; `failed` has the stage in place of the unit.
+    `dropped`: numbers of dropped frames, by `edge:cause`.
+    `not_begun`: number of frames that were never taken because the run ended before; null in older reports.
+    `skipped`: number of presented frames that took the pipeline's bypass; absent if the pipeline has none.
     """
 
     requested: int
@@ -69,9 +69,9 @@ class FrameCounts(Record):
 
 
 class TimeSummary(Record):
-    """Statistics of times in ms: `mean`, percentiles `p50` to `p99`, and `max`; all null when there were none.
+    """Statistics of times in ms: `mean`, percentiles `p50` to `p99`, and `max`; all are null without times.
 
-    `samples`: number of times; null in reports older than this count. p90 needs 29 of them, p95 59, p99 299
+    `samples`: number of times; null in older reports. p90 needs 29 times, p95 59, p99 299
     (`trilane.scheduler.stats.samples_needed`).
     """
 
@@ -86,7 +86,7 @@ class TimeSummary(Record):
     @model_validator(mode="before")
     @classmethod
     def _know_nothing_of_no_times(cls, document: Any) -> Any:
-        """Replace what counts as 0 without a time, also in the files of an older Trilane."""
+        """Replace the zeros of a summary without times by null; older reports have such zeros too."""
         if not isinstance(document, dict) or document.get("samples") != 0:
             return document
         return {key: value if key == "samples" else None for key, value in document.items()}
@@ -111,9 +111,9 @@ class FrameTimes(TimeSummary):
 class XrBench(Record):
     """XRBench's scores (Kwon et al., MLSys 2023, section 3), 0 to 1.
 
-    `real_time`: score of how well frames kept their deadlines; null when no frame had one.
-    `qoe`: quality of experience, presented over requested frames.
-    `energy`: energy score; null where the power is not known.
+    `real_time`: score of how well frames kept their deadlines; null if no frame had a deadline.
+    `qoe`: quality of experience: presented frames divided by requested frames.
+    `energy`: energy score; null if the power is not known.
     """
 
     real_time: float | None
@@ -127,8 +127,8 @@ class MovedBytes(Record):
     `read`: bytes read from slots, shared assets and samples.
     `written`: bytes written into slots and files.
     `uploaded`, `read_back`: bytes moved into the GPU's memory, and out of it.
-    `least`: bytes that the frames needed.
-    `ratio`: sum of the first four over `least`; null where `least` is 0.
+    `least`: bytes that a frame needs, without copies.
+    `ratio`: sum of the first four divided by `least`; null if `least` is 0.
     """
 
     read: float
@@ -147,7 +147,7 @@ class MovedBytes(Record):
 class MovedInAll(MovedBytes):
     """Mean bytes that all stages together moved for a presented frame.
 
-    `gb_per_second`: moved bytes over the time of the run, in 1e9 bytes a second.
+    `gb_per_second`: all moved bytes divided by the time of the run, in 1e9 bytes a second.
     """
 
     gb_per_second: float | None
@@ -157,11 +157,11 @@ class StageTimes(Record):
     """Times of one stage.
 
     `unit`: name of the unit that ran the stage.
-    `jobs`: number of jobs that it ended.
-    `service_ms`: times of its jobs from begin to end; these include time in which another process had the core.
-    `wait_ms`: times from the arrival of a job's input to the job's begin.
-    `cpu_ms`: CPU times of its jobs over all threads of the unit; on the host clock.
-    `bytes`: bytes that it moved for a presented frame; absent where it does not count them.
+    `jobs`: number of the stage's jobs that have ended.
+    `service_ms`: times from a job's begin to its end, including time in which another process had the core.
+    `wait_ms`: times from when a job's input was there to the job's begin.
+    `cpu_ms`: CPU times of the jobs over all threads of the unit; on the host clock.
+    `bytes`: bytes that the stage moved for a presented frame; absent if it does not count them.
     """
 
     unit: str
@@ -176,12 +176,11 @@ class IdleShares(Record):
     """Why a unit did not work, as shares of the run's time.
 
     `starved`: share in which the unit had no input.
-    `blocked`: share in which it had input, but no free output slot, or the limit of frames in flight was reached.
-    `throttled`: share in which its cap held it.
-    `preempted`: share in which it had a job, but no core; null where the kernel does not say how long threads wait for
-    one.
-    `overhead`: share in which a job was on its way to it, it slept within a job, or its process was down.
-    `join`: share in which some inputs of a frame were there and others not; absent where no branches meet at it.
+    `blocked`: share in which the unit had input, but no free output slot, or the limit of frames in flight was reached.
+    `throttled`: share in which the unit's duty did not let it work.
+    `preempted`: share in which the unit had a job, but no core; null if the kernel does not count it.
+    `overhead`: share in which a job was on its way to the unit, the unit slept within a job, or its process was down.
+    `join`: share in which the unit had some inputs of a frame, but not all; absent if no branches meet at the unit.
     """
 
     starved: float
@@ -199,12 +198,12 @@ class UnitShares(Record):
 
     `busy`: share of the time in which a job ran.
     `idle`: the rest of the time, by cause.
-    `jobs`: number of jobs that it ended.
-    `restarts`: number of new processes after the first.
-    `cpu_s`: CPU time in seconds of all its threads in the run, including those that spin between jobs.
+    `jobs`: number of the unit's jobs that have ended.
+    `restarts`: number of the unit's processes after the first.
+    `cpu_s`: CPU time in seconds of all its threads in the run, including threads that spin between jobs.
     `cpu_in_jobs_s`: part of `cpu_s` within jobs.
     `pid`: process id of its last process.
-    `cores`: cores that it may use.
+    `cores`: numbers of the cores that the unit may use.
     `threads`: number of threads that its stages may use.
     `spin`: whether those threads may spin between jobs.
     """
@@ -224,8 +223,9 @@ class UnitShares(Record):
 class CoreShare(Record):
     """Use of a set of cores by the units that may run on `cores` and nowhere else.
 
+    `units`: names of these units.
     `cpu`: CPU time of the units as a share of the time that these cores had; at most 1.
-    `busy`: busy time of the units as a share of the same time; at most 1 where no unit has a device of its own.
+    `busy`: busy time of the units as a share of the same time; at most 1 if no unit has a device of its own.
     """
 
     cores: tuple[int, ...]
@@ -248,16 +248,16 @@ class UnitCap(Record):
 
 
 class Caps(Record):
-    """What held the units; all fields except `how` are present when a performance profile was asked for.
+    """The caps of the units. All fields except `how` are present only if a performance profile was requested.
 
     `how`: meaning of a cap on this clock, or a note that there was none.
-    `profile`: hardware profile whose corners and limits hold.
-    `performance_profile`: performance profile that was asked for.
+    `profile`: name of the hardware profile whose corners and limits were used.
+    `performance_profile`: name of the requested performance profile.
     `governor`: name of the rule that lowers and raises corners.
     `units`: cap of each unit, by name.
-    `power_w`: mean modelled power in watts; null when the run was too short for one.
-    `throttled_share`: share of the time in which a unit was below the corner that was asked for.
-    `first_throttled_s`: time in seconds at which that began first; null when it never did.
+    `power_w`: mean modelled power in watts; null if the run was too short.
+    `throttled_share`: share of the time in which a unit was below its requested corner.
+    `first_throttled_s`: time in seconds at which a unit was first below its requested corner; null if none was.
     """
 
     how: str
@@ -271,13 +271,13 @@ class Caps(Record):
 
 
 class Temperature(Record):
-    """Temperatures in degrees Celsius; all fields except `sensor` are present when the temperature was modelled.
+    """Temperatures in degrees Celsius. All fields except `sensor` are present only if temperatures were modelled.
 
-    `kind`: how the temperature was modelled.
+    `kind`: how the temperatures were modelled.
     `device_end`: temperature of the device's body at the end of the run.
     `device_max`: highest temperature of the device's body.
-    `junction_max`: highest temperature of any unit.
-    `sensor`: temperature of this machine's hottest sensor at the end of the run; null where the system shows none.
+    `junction_max`: highest temperature of any unit's junction.
+    `sensor`: temperature of this machine's hottest sensor at the end of the run; null if the system has no sensor.
     """
 
     kind: str = ""
@@ -288,10 +288,10 @@ class Temperature(Record):
 
 
 class ProcessorState(Record):
-    """The state of the run's cores as the kernel shows it; a field is null where the kernel does not show it.
+    """The state of the run's cores; a field is null if the kernel does not show it.
 
-    `clock_begin_ghz`, `clock_end_ghz`: clock of the fastest core before the first frame and after the last, in GHz.
-    `throttles`: how often heat slowed a core down in between.
+    `clock_begin_ghz`, `clock_end_ghz`: clock of the fastest core in GHz, before the first and after the last frame.
+    `throttles`: how often heat slowed a core between the two.
     """
 
     clock_begin_ghz: float | None = None
@@ -300,7 +300,7 @@ class ProcessorState(Record):
 
 
 class SlowedCost(Record):
-    """What it costs when jobs take longer by `Slowed.by`, found by replaying the run (`trilane.pipeline.reckoning`).
+    """The cost if jobs take longer by the share `Slowed.by`, from replays of the run (`trilane.pipeline.reckoning`).
 
     `cost`: growth of the frame time, as a share.
     `cost_low`, `cost_high`: bounds of the 95 % interval of `cost`, from the scatter over the run's frames; null for
@@ -313,16 +313,16 @@ class SlowedCost(Record):
 
 
 class PathShare(SlowedCost):
-    """A unit or stage that bounded the run, or a part of the critical path that belongs to none.
+    """A unit, a stage or another owner of time, with its share of the critical path.
 
-    `trilane.pipeline.critical_path` finds the path. The inherited costs are those of slowing its jobs; they are absent
-    where the path alone says what bounded the run.
+    `trilane.pipeline.critical_path` finds the path. The inherited fields are costs of slowing this unit or stage. They
+    are absent if the bound was found from the path alone.
 
-    `name`: name of the unit or stage, or of time that is neither's, such as `overhead`.
+    `name`: name of the unit or stage, or of time that belongs to neither, such as `overhead`.
     `share`: its share of the path.
     `share_low`, `share_high`: bounds of the 95 % interval of `share`, from the scatter of this run's frames; null for
     fewer than 51 frames.
-    `rivals`: names whose cost, or without costs whose share, may be as large.
+    `rivals`: other names whose cost may be as large; without costs, names whose share may be as large.
     """
 
     name: str
@@ -340,8 +340,8 @@ class PathShare(SlowedCost):
 class PathShares(Record):
     """The largest parts of the critical path.
 
-    `unit`: unit with the largest share, or time that belongs to no unit.
-    `stage`: stage with the largest share; null where no stage is on the path.
+    `unit`: unit with the largest share, or another owner of time if its share is larger.
+    `stage`: stage with the largest share; null if no stage is on the path.
     """
 
     unit: PathShare
@@ -349,17 +349,17 @@ class PathShares(Record):
 
 
 class FramesBehind(Record):
-    """How many frames a newest frame was behind the job that took it: `mean` and `max` over such jobs."""
+    """By how many frames the newest frame was older than the frame of the job that took it: `mean` and `max`."""
 
     mean: float
     max: int
 
 
 class NewestTaken(Record):
-    """The newest frames that jobs took from one stream.
+    """Ages of the frames that inputs of the newest frame took from one stream.
 
-    `age_ms`: times from the sampling of such a frame to the hand-over of the job that took it.
-    `frames_behind`: distances from such a frame to the frame of the job.
+    `age_ms`: times from the sampling of a taken frame to the hand-over of the job that took it.
+    `frames_behind`: distances from a taken frame to the frame of the job.
     """
 
     age_ms: TimeSummary
@@ -367,12 +367,12 @@ class NewestTaken(Record):
 
 
 class Slowed(Record):
-    """What slowing each stage costs, by replays of the run.
+    """The cost of slowing each stage, from replays of the run.
 
     `by`: share by which all jobs of a stage take longer.
     `frames`: number of the run's frames that were replayed.
     `over_measured`: frame time of a replay without a slower stage, divided by the frame time of the run.
-    `is_trusted`: whether the costs say what bounded the run: the replay is near the run, and a stage costs something.
+    `is_trusted`: whether the costs decide the bound: the replay is near the run, and slowing a stage costs something.
     `costs`: cost of each stage.
     """
 
@@ -384,13 +384,15 @@ class Slowed(Record):
 
 
 class Bound(PathShares):
-    """What bounded the frame time: what costs most when slowed or, without a replay, has the largest share of the path.
+    """The unit and the stage that bounded the frame time, because slowing them costs most.
 
-    `unit`: the unit; its name is the report's `bottleneck`.
-    `stage`: the stage; null where no stage bounded the run.
-    `path`: largest parts of the path; absent where they have the same names.
-    `stages`: share of each stage in the path, the largest first; absent in reports of an older Trilane.
-    `slowed`: what slowing each stage costs; absent where the run was not replayed.
+    If no replay can be trusted, the largest shares of the critical path decide.
+
+    `unit`: unit that bounded the run; its name is the report's `bottleneck`.
+    `stage`: stage that bounded the run; null if no stage did.
+    `path`: largest parts of the path; absent if they have the same names.
+    `stages`: share of each stage in the path, the largest first; absent in older reports.
+    `slowed`: cost of slowing each stage; absent if the run was not replayed.
     """
 
     path: PathShares | None = None
@@ -399,25 +401,25 @@ class Bound(PathShares):
 
 
 class PolicyMetrics(Record):
-    """What a run measured of its policy, so that runs of two policies can be compared.
+    """The figures by which runs of two policies can be compared.
 
-    `frames`: counts of frames by what became of them.
+    `frames`: counts of frames: presented, lost, dropped or not begun.
     `frame_time_ms`: times between presented frames.
     `latency_ms`: times from a frame's sampling, or release, to the end of the stage that the pipeline names.
     `fps`: presented frames a second; null for fewer than two.
-    `fps_low`, `fps_high`: bounds of the 95 % interval of `fps`, from that of the mean frame time; null when there are
-    too few frames.
+    `fps_low`, `fps_high`: bounds of the 95 % interval of `fps`, from the interval of the mean frame time; null if there
+    are too few frames.
     `deadline_misses`: number of frames presented after their deadline, or of frame times above the target.
     `stages`: times of each stage, in the order of the pipeline.
-    `bytes`: bytes that the stages moved for a presented frame, over all stages that count them; absent where none does.
+    `bytes`: bytes that all stages moved for a presented frame; absent if no stage counts them.
     `units`: shares of each unit.
     `efficiency`: work of the slowest unit's jobs, as a share of the time between the first and the last presented
     frame; null for fewer than two.
     `core_efficiency`: the same share for the fullest cores.
     `machine_efficiency`: the same share for all cores of the run.
-    `bottleneck`: name of what bounded the frame time: a unit, `other programs`, `release`, `overhead`, or `held`; null
-    without a path.
-    `bound`: unit and stage that bounded it, what slowing them costs, and their shares of the critical path.
+    `bottleneck`: name of the bound of the frame time: a unit, or another owner of time, such as `other programs`,
+    `release`, `overhead` or `held`; null without a path.
+    `bound`: unit and stage that bounded the frame time, costs of slowing them, and their shares of the critical path.
     `core_shares`: use of each set of cores that a unit has, and of all cores; on the host clock.
     `policy`: policy of the scheduler.
     """
@@ -443,23 +445,23 @@ class PolicyMetrics(Record):
     @field_validator("fps")
     @classmethod
     def _know_no_rate_of_one_frame(cls, fps: float | None, known: ValidationInfo) -> float | None:
-        """Replace the 0 of a run that presented fewer than two frames, also in the files of an older Trilane."""
+        """Replace the 0 of a run that presented fewer than two frames by null; older reports have such a 0 too."""
         frames = known.data.get("frames")
         return fps if frames is None or frames.presented > 1 else None
 
 
 class RunMetrics(PolicyMetrics):
-    """All that a run measured.
+    """All figures of a run.
 
     `clock`: `host`, measured on this machine, or `virtual`, computed from a hardware profile.
     `duration_s`: time in seconds from the first job to the end of the run.
-    `percentiles`: whether percentiles are exact, or which come from a sketch and within what error; on the host clock.
+    `percentiles`: whether percentiles are exact, or which ones come from a sketch, and its error; on the host clock.
     `xrbench`: XRBench's scores.
     `edge`: edge rule of the scheduler.
     `idle_cores`: whether cores without work stayed awake; on the host clock.
-    `other_programs`: share of other programs in the time of the run's cores; null where a unit died.
-    `processor`: clock and throttling of the run's cores; null in virtual time and in reports of an older Trilane.
-    `streams`: age of the newest frames that jobs took from a stream, by the stream's stage.
+    `other_programs`: share of other programs in the time of the run's cores; null if a unit died.
+    `processor`: clock and throttling of the run's cores; null in virtual time and in older reports.
+    `streams`: ages of the newest frames that jobs took from a stream, by the name of the stage that writes it.
     `caps`, `temperature_c`: caps and temperatures of a capped run.
     """
 
@@ -477,5 +479,5 @@ class RunMetrics(PolicyMetrics):
 
 
 def metrics_of(ledger_report: Mapping[str, Any]) -> RunMetrics:
-    """Validate `Ledger.report()` with what the run added to it; raises ValueError naming a wrong or unknown key."""
+    """Return the figures from the keys of `Ledger.report()` and further keys; raises ValueError for a wrong key."""
     return RunMetrics.model_validate(ledger_report)

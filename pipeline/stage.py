@@ -1,11 +1,10 @@
 """The interface of a stage to the process that runs it, and the base class of stages that get named arrays.
 
-Rule: a stage sees its slots, its settings and its unit only.
+Rule: a stage sees only its slots, its settings and its unit.
 
-Stages whose slots hold named arrays: where each array lies in a slot, and the base class of such a stage.
-
-Rule: an array is a view of the slot's memory, never a copy. Each begins on its own cache line. The types of all ports
-are known before a slot is made, so that a stage and its readers find the same places.
+The slots of a stage with ports contain named arrays. Rule: an array is a view of the slot's memory, never a copy. Each
+array begins on its own cache line. The types of all ports are known before a slot is made, so that a stage and its
+readers use the same offsets.
 """
 
 from __future__ import annotations
@@ -28,32 +27,32 @@ T = TypeVar("T")
 
 
 class Skip(dict[str, float]):
-    """What `Stage.run` returns, in place of other metrics, for a frame that takes the pipeline's bypass.
+    """The metrics that `Stage.run` returns for a frame that takes the pipeline's bypass.
 
-    Only the stage at which `Pipeline.bypass` begins may return it.
+    Only the stage at which `Pipeline.bypass` begins may return a `Skip`.
     """
 
 
 class Stage(Protocol):
     """One stage inside a unit's process, made by a `StageFactory`.
 
-    The stage at the end of `Pipeline.bypass` takes frames from two edges. Its `inputs` holds the slots of its own edge,
-    then those of the edge on which the bypass begins.
+    The stage at the end of `Pipeline.bypass` takes frames from two edges. Its `inputs` are the slots of its own edge,
+    then the slots of the edge on which the bypass begins.
     """
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
         """Take every slot of the stage's edges; called once, before the first job. Allocate here, never later."""
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
-        """Do `frame` from `inputs[slot_in]` to `outputs[slot_out]`, and return metrics for the log, often none.
+        """Do `frame` from `inputs[slot_in]` to `outputs[slot_out]`, and return metrics by name, often none.
 
-        The first stage of a pipeline has no input, the last no output. The header of the output slot already holds the
-        frame's number and sampling time. Where both edges have the same header, it already holds all of the input's
-        fields.
+        The first stage of a pipeline has no input, and the last has no output; the slot is then None. The header of the
+        output slot already has the frame's number and sampling time. If both edges have the same header, it already has
+        all fields of the input.
         """
 
     def close(self) -> None:
-        """Release what the stage holds; files are completed and renamed here."""
+        """Release the stage's resources; files are completed and renamed here."""
 
 
 class JoiningStage(Protocol):
@@ -65,31 +64,31 @@ class JoiningStage(Protocol):
     def run(self, frame: int, slots_in: tuple[int | None, ...], slot_out: int | None) -> Mapping[str, float]:
         """Do `frame`, as `Stage.run`.
 
-        `slots_in`: slot of each input; None for an input that takes the newest frame, while there is none.
+        The header of the output slot already has the frame's number and the sampling time of the oldest input. Inputs
+        that take the newest frame do not count for this time. The header has no other fields of the inputs.
 
-        The header of the output slot already holds the frame's number. It also holds the sampling time of the oldest
-        input; inputs that take the newest frame do not count. It holds no other fields of the inputs.
+        `slots_in`: slot of each input; None for an input that takes the newest frame, while there is none.
         """
 
     def close(self) -> None:
-        """Release what the stage holds, as `Stage.close`."""
+        """Release the stage's resources, as `Stage.close`."""
 
 
 class SteppedStage(Stage, Protocol):
     """The first stage of a pipeline whose frames may be given less work (`run_pipeline`'s `works`)."""
 
     def step_to(self, rung: int) -> None:
-        """Give frames the work of `rung` from now on; called before `run` whenever the rung, at first 0, changes."""
+        """Give frames the work of `rung` from now on; called before `run` when the rung, first 0, has changed."""
 
 
 class SkippingStage(Stage, Protocol):
     """The stage at which a pipeline's bypass begins. Its `run` may return a `Skip`."""
 
     def forget(self) -> None:
-        """Do not skip the next frame because of what earlier frames brought to the bypass's end.
+        """Forget the results that earlier frames brought to the bypass's end; the next frame must not rely on them.
 
-        Called before `run` for the first frame. Called again whenever the unit at the bypass's end was restarted, or a
-        frame did not skip and was lost or dropped before the bypass's end.
+        Called before `run` for the first frame. Called again after the unit at the bypass's end was restarted, and
+        after a frame that did not skip was lost or dropped before the bypass's end.
         """
 
 
@@ -99,7 +98,7 @@ class UnitContext:
 
     `name`: name of the unit.
     `settings`: cores and threads of the unit.
-    `assets`: arrays that the run was given, read-only.
+    `assets`: arrays of the run that every stage may read; read-only.
     """
 
     name: str
@@ -109,9 +108,9 @@ class UnitContext:
     _devices: set[str] = field(default_factory=set)
 
     def shared(self, key: str, make: Callable[[], T]) -> T:
-        """Return what `make` returned, which is called once per `key` in this process.
+        """Return the object that `make` returns; `make` is called once per `key` in this process.
 
-        An example is the context with which two stages draw.
+        An example is the OpenGL context with which two stages draw.
         """
         if key not in self._shared:
             self._shared[key] = make()
@@ -121,7 +120,8 @@ class UnitContext:
     def use_device(self, name: str) -> None:
         """Note that hardware other than the unit's cores does its work, such as a graphics card.
 
-        A job whose threads sleep then counts as busy, because the device works; otherwise it would count as idle.
+        With a device, a job whose threads sleep counts as busy, because the device works. Without one, it counts as
+        idle.
         """
         self._devices.add(name)
 
@@ -132,10 +132,12 @@ class UnitContext:
 
 
 class StageFactory(Protocol):
-    """The kind of function that `PipelineStage.factory` names."""
+    """A function that builds a stage in the unit's process; `PipelineStage.factory` names it."""
 
     def __call__(self, settings: Mapping[str, Any], unit: UnitContext) -> Stage | JoiningStage:
-        """Return the built stage; everything slow or fallible happens here.
+        """Return the built stage. Do all slow work, and all work that may fail, here.
+
+        `settings`: `PipelineStage.settings`.
 
         Raises BadInputError or MissingPartError.
         """
@@ -143,17 +145,17 @@ class StageFactory(Protocol):
 
 LINE = 64  # bytes of a cache line, and of the widest vector register
 Arrays = Mapping[str, NDArray[Any]]
-#: The types of the ports of a stream, by name, as `u8 256x256x3`; the name of a lone port may be empty.
+#: The types of the ports of a stream, such as `u8 256x256x3`, by the port's name; a single port may have an empty name.
 Ports = Mapping[str, str]
 
 
 def payload_bytes(ports: Mapping[str, PortType]) -> int:
-    """Return the bytes that the ports take up in a slot."""
+    """Return the size in bytes of a slot with these ports."""
     return sum(-(-port.payload_bytes // LINE) * LINE for port in ports.values())
 
 
 def views(payload: U8, ports: Mapping[str, PortType]) -> dict[str, NDArray[Any]]:
-    """Return the array of each port in a slot. Raises ValueError when the slot is too small."""
+    """Return the array of each port in a slot, as views of `payload`. Raises ValueError if the slot is too small."""
     found: dict[str, NDArray[Any]] = {}
     start = 0
     for name, port in ports.items():
@@ -166,7 +168,12 @@ def views(payload: U8, ports: Mapping[str, PortType]) -> dict[str, NDArray[Any]]
 
 
 class PortRead(Model):
-    """What a port of a stage reads. `stream`: place of the stream among the stage's inputs; `port`: its port."""
+    """The input of a port of a stage.
+
+    `name`: name of the stage's port.
+    `stream`: index of the stream among the stage's inputs.
+    `port`: name of the stream's port.
+    """
 
     name: str
     stream: int
@@ -174,9 +181,10 @@ class PortRead(Model):
 
 
 class PassedPorts(Model):
-    """The slots from which the stage takes frames that come by a bypass; they are counted after its own slots.
+    """The slots of frames that come to the stage by a bypass; their numbers follow those of the stage's own slots.
 
-    `behind`: number of slots of the stage's own stream. `ports`: ports in the slots of the bypass.
+    `behind`: number of slots of the stage's own stream.
+    `ports`: ports in the slots of the bypass.
     """
 
     behind: int
@@ -191,9 +199,9 @@ class PortedSettings(Model):
     `run_folder`: folder of the run.
     `joins`: whether the stage is a `trilane.pipeline.stage.JoiningStage`.
     `reads`: ports of the stage, in the order of the file.
-    `streams`: ports of each stream that it reads.
-    `writes`: ports that it writes; empty where nobody reads it and the file says none.
-    `keys`: the stage's keys that only its kind of stage has.
+    `streams`: ports of each stream that the stage reads.
+    `writes`: ports that the stage writes; empty if no stage reads it and the file states none.
+    `keys`: keys of the file that only this kind of stage has.
     `bypass`: ports of the bypass that ends at the stage; None without one.
     """
 
@@ -209,16 +217,17 @@ class PortedSettings(Model):
 
 
 class Read(NamedTuple):
-    """A port that a stage reads: its name, and its type."""
+    """A port that a stage reads."""
 
     name: str
     type: PortType
 
 
 class PortedStage:
-    """A `trilane.pipeline.stage.Stage` or `JoiningStage` that gets arrays. A subclass writes `work`.
+    """A `Stage` or `JoiningStage` that gets arrays. A subclass implements `work`.
 
-    `reads`: ports that it reads. `writes`: types of the ports that it writes, by name.
+    `reads`: ports that it reads.
+    `writes`: types of the ports that it writes, by name.
     """
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
@@ -233,7 +242,7 @@ class PortedStage:
 
     @property
     def sampled_ns(self) -> int:
-        """The time on CLOCK_MONOTONIC at which the frame in work was sampled; 0 where no input says it."""
+        """The time in ns on CLOCK_MONOTONIC at which the present frame was sampled; 0 for a stage without inputs."""
         taken = [of[slot] for of, slot in zip(self._headers, self._slots, strict=True) if slot is not None]
         return min((int(header["t_sampled_ns"]) for header in taken), default=0)
 
@@ -249,7 +258,10 @@ class PortedStage:
         self.ready()
 
     def _views(self, place: int, packet: Packet, ports: Mapping[str, PortType]) -> Mapping[str, NDArray[Any] | None]:
-        """Return the arrays of a slot; of one that comes by the bypass, those ports that its writer has too."""
+        """Return the arrays of a slot by port; None for a port that the writer of a slot on the bypass does not have.
+
+        `place`: number of the slot.
+        """
         passed = self.settings.bypass
         if passed is None or place < passed.behind:
             return _read_only(views(packet.payload, ports))
@@ -265,24 +277,22 @@ class PortedStage:
         return self.work(frame, arrays, {} if slot_out is None else self._outputs[slot_out])
 
     def ready(self) -> None:
-        """Prepare what the first frame needs; called once, when the slots are there."""
+        """Prepare for the first frame; called once, after the views of all slots are made."""
 
     def work(self, frame: int, arrays: Sequence[NDArray[Any] | None], outputs: Arrays) -> Mapping[str, float]:
-        """Do a frame, and return metrics.
-
-        A `trilane.pipeline.stage.Skip` sends the frame to the bypass that begins at the stage.
+        """Do a frame, and return metrics by name; a `Skip` sends the frame to the bypass that begins at the stage.
 
         `arrays`: array of each of `reads`, read-only; None if there is no newest frame yet, or if the frame took a
         bypass that lacks the port.
-        `outputs`: array of each of `writes`, to be filled; empty where nobody reads the stage.
+        `outputs`: array of each of `writes`, to be filled; empty if no stage reads this one.
         """
         raise NotImplementedError
 
     def forget(self) -> None:
-        """Do not send the next frame to a bypass because of earlier frames."""
+        """Forget earlier frames: the next frame must not take the bypass because of them (`SkippingStage.forget`)."""
 
     def close(self) -> None:
-        """Release what the stage holds."""
+        """Release the stage's resources."""
 
 
 def _types(ports: Ports) -> dict[str, PortType]:

@@ -1,8 +1,7 @@
-"""Prepares the surroundings of a run: checks before it, cores and processes to restore, and other programs' share.
+"""Prepares the surroundings of a run: checks, cores, memory and processes, and the share of other programs.
 
-Rule: a check that raises has started nothing, so nothing has to be undone. Whatever happens, cores, memory and
-processes are afterwards as they were before. The kernel counts CPU time. All of it that is not the run's own belongs to
-other programs.
+Rule: a check raises before anything is started. Whatever happens, cores, memory and processes are the same after a run
+as before. CPU time of the run's cores that is not the run's own belongs to other programs.
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ from trilane.pipeline.run_metrics import ProcessorState
 from trilane.pipeline.unit_processes import UnitProcesses
 from trilane.pipeline.unit_starter import UnitStarter
 
-#: Number of files and sockets that a run holds open, with room for a unit that is restarted.
+#: Number of files and sockets that a run keeps open, with room for a restarted unit.
 LEAST_FILES = 96
 
 
 def refuse_in_a_unit() -> None:
-    """Raise BadInputError if a unit is importing the module of its stages, as that would start units without end."""
+    """Raise BadInputError if a unit is importing the module of its stages, because that would start units endlessly."""
     spec = sys.modules["__main__"].__spec__
     if spec is not None and spec.name == fork_server.__name__:
         found = "run_pipeline was called while a unit imported its stages"
@@ -49,7 +48,7 @@ def check_open_files() -> None:
 
 
 def check_cores(pipeline: Pipeline) -> None:
-    """Raise BadInputError for cores that the units could not get."""
+    """Raise BadInputError if a unit has a core that this process may not use."""
     here = machine.here.cores()
     for unit, settings in pipeline.units.items():
         if absent := set(settings.cores).difference(here):
@@ -65,9 +64,9 @@ def check_positive(**values: float | None) -> None:
 
 
 class OtherPrograms:
-    """Counts the time that other programs have of some cores, from its creation on.
+    """Counts the CPU time of other programs on some cores, from its creation on.
 
-    `cores`: numbers of the cores that count.
+    `cores`: numbers of these cores.
     `pids`: processes that belong to the run, besides this one.
     """
 
@@ -77,9 +76,9 @@ class OtherPrograms:
         self._begin_s, self._before_s = time.monotonic(), self._others_s()
 
     def share(self) -> float:
-        """Return the others' share of the time of the cores, at most 1.
+        """Return the share of other programs in the time of the cores, at most 1.
 
-        The kernel counts in steps of 10 ms, so under 0.1 s the share says little.
+        The kernel counts in steps of 10 ms, so the share of less than 0.1 s is inexact.
         """
         had_s = max(time.monotonic() - self._begin_s, 1e-9) * len(self._cores)
         return min(max(self._others_s() - self._before_s, 0.0) / had_s, 1.0)
@@ -91,10 +90,12 @@ class OtherPrograms:
 
 
 def beside_units(cores: Sequence[int], pids: Mapping[str, int]) -> Callable[[Mapping[str, int]], float | None]:
-    """Count the time that other programs have of `cores` from now on; `pids` are the units' processes.
+    """Count the CPU time of other programs on `cores` from now on, and return a function that returns their share.
 
-    Return a function that takes the units' present processes and returns the others' share. It returns None if a unit
-    has died in between, because its CPU time is then unknown.
+    The function takes the units' present process ids. It returns None if a unit has died, because its CPU time is then
+    unknown.
+
+    `pids`: process id of each unit now.
     """
     try:
         others = OtherPrograms(cores, [*pids.values()])
@@ -110,7 +111,7 @@ def beside_units(cores: Sequence[int], pids: Mapping[str, int]) -> Callable[[Map
 
 
 def processor_of(cores: Sequence[int]) -> Callable[[], ProcessorState]:
-    """Look at the clock and the throttling of `cores` now. Return a function that looks again and gives both."""
+    """Read clock and throttling of `cores` now; return a function that reads them again and returns the state."""
     clock, throttles = machine.here.core_clock_ghz(cores), machine.here.throttles(cores)
 
     def state() -> ProcessorState:
@@ -123,10 +124,10 @@ def processor_of(cores: Sequence[int]) -> Callable[[], ProcessorState]:
 
 
 def busy_s(stat: str, cores: Sequence[int]) -> float:
-    """Return how many seconds `cores` were not idle since the system began, including steal time.
+    """Return for how many seconds `cores` were not idle since the system's start, including steal time.
 
-    `stat`: text of /proc/stat (proc_stat(5)): cpuN user nice system idle iowait irq softirq steal guest guest_nice. The
-    guests' time is also counted in user and nice.
+    `stat`: text of /proc/stat (proc_stat(5)): cpuN user nice system idle iowait irq softirq steal guest guest_nice.
+    User and nice contain the guests' time, so it is not added.
     """
     names = {f"cpu{core}" for core in cores}
     rows = [line.split() for line in stat.splitlines()]
@@ -136,12 +137,12 @@ def busy_s(stat: str, cores: Sequence[int]) -> float:
 
 
 Processes = TypeVar("Processes", bound=UnitProcesses)
-SWITCH_S = 0.0002  # seconds for which another thread of this process keeps the interpreter at most
+SWITCH_S = 0.0002  # longest time in seconds for which another thread of this process keeps the interpreter
 
 
 @contextlib.contextmanager
 def on_cores(cores: tuple[int, ...]) -> Iterator[None]:
-    """Run the scheduler on `cores` inside the `with` block, off the cores of the other units."""
+    """Run this process on `cores` inside the `with` block, away from the cores of other units."""
     before = machine.here.cores()
     os.sched_setaffinity(0, cores)
     try:
@@ -154,8 +155,8 @@ def on_cores(cores: tuple[int, ...]) -> Iterator[None]:
 def prompt_answers() -> Iterator[None]:
     """Make the scheduler answer at once inside the `with` block.
 
-    It then waits neither for another unit's time slice on its core, nor for a thread that draws a progress bar. It does
-    not wait for garbage collection either, because a run makes no garbage in cycles.
+    It waits neither for another unit's time slice on its core, nor for a thread that draws a progress bar. Garbage
+    collection is off, because a run makes no reference cycles.
     """
     switch_s, collects = sys.getswitchinterval(), gc.isenabled()
     sys.setswitchinterval(SWITCH_S)
@@ -174,9 +175,10 @@ def prompt_answers() -> Iterator[None]:
 def unit_processes(
     pipeline: Pipeline, assets: Assets, starter: UnitStarter | None, kind: type[Processes]
 ) -> Iterator[Processes]:
-    """Yield processes of `kind`, none of them started, with the memory that they map.
+    """Yield `UnitProcesses` for the pipeline, with shared memory, but without a started process.
 
-    A fork server is made unless the caller gives one as `starter`.
+    `starter`: fork server; None makes one.
+    `kind`: class of the result.
     """
     with contextlib.ExitStack() as stack:
         used = starter or stack.enter_context(UnitStarter(pipeline.preload))

@@ -1,12 +1,11 @@
 """Turns the journal of a run into frames, jobs, waits and idle time.
 
-Rule: no other module interprets a journal's events. The scheduler's own parts tell what it knew: its source says which
-frames are released and wait (policy.py). Its record of a frame says when the frame was sampled and how long it
-took (state.py).
+Rule: no other module interprets a journal's events. The timeline uses parts of the scheduler: its source says which
+frames are released and wait (policy.py), and its state of a frame has the sampling time and the latency (state.py).
 
 A frame waits before the first stage from its release on. It waits before another stage from the step in which the
-scheduler heard that the stage before had ended; where branches meet, the last of those stages. The wait ends when the
-frame is handed to a unit, dropped or lost. A track knows where the frames are (tracks.py).
+scheduler heard of its input; if branches meet, of the last input. The wait ends when the frame is handed to a unit,
+dropped or lost. A track knows before which stages the frames wait (tracks.py).
 """
 
 from __future__ import annotations
@@ -44,10 +43,10 @@ class Presented(NamedTuple):
 
     `release_ns`: time of its release.
     `end_ns`: end of its last job.
-    `interval_ns`: time since the end of the frame presented before it; None for the first, and if a viewer held the
-    run between the two: a pause is no slow frame.
-    `latency_ns`: time from its sampling to the end of the stage that the pipeline names; None for a frame that this
-    stage does not take.
+    `interval_ns`: time since the end of the frame presented before it. None for the first frame, and if a viewer held
+    the run between the two, because that is no slow frame.
+    `latency_ns`: time from its sampling to the end of the stage that the pipeline names; None if that stage does not
+    take the frame.
     `skips`: whether it took the bypass.
     `rung`: rung of its work.
     """
@@ -64,7 +63,9 @@ class Presented(NamedTuple):
 class Gone(NamedTuple):
     """A frame that was not presented.
 
-    `frame`: its number; UNKNOWN where it cannot be told.
+    `frame`: its number; UNKNOWN if the journal does not show it.
+    `at_ns`: time at which the frame was counted as gone.
+    `kind`: `lost` or `dropped`.
     `cause`: key of the cause in the report.
     """
 
@@ -76,18 +77,18 @@ class Gone(NamedTuple):
 
 
 class EndedJob(NamedTuple):
-    """A job that has ended, as the scheduler has heard."""
+    """A job of whose end the scheduler has heard. `event`: event with its times."""
 
     handed: Handed
     event: JobDone
 
 
 class ExplainedJob(NamedTuple):
-    """A job in the journal with its times, and why it waited.
+    """A job in the journal with its times, and the causes of its wait.
 
-    `figures`: numbers that its stage reported of it, by name.
-    `waits_ns`: ns of each cause of its wait, without zeros; they sum to `job.begin_ns - job.ready_ns`.
-    `behind`: job that its unit did the longest during the wait; None without one.
+    `figures`: metrics of its stage for this job, by name.
+    `waits_ns`: time of each cause of its wait, without zeros; the times add up to `job.begin_ns - job.ready_ns`.
+    `behind`: job that its unit did for the longest part of the wait; None without one.
     `after`: jobs whose end the scheduler heard of in the step that handed this job over.
     `presented`: the presented frame, for the job that presents it.
     `rung`: rung of the frame's work.
@@ -111,7 +112,7 @@ class ExplainedJob(NamedTuple):
 
     @property
     def cause(self) -> str:
-        """The cause of most of its wait; "" where it did not wait."""
+        """The cause of the longest part of its wait; "" if it did not wait."""
         return max(self.waits_ns, key=self.waits_ns.__getitem__, default="")
 
 
@@ -130,26 +131,26 @@ class Down(NamedTuple):
     end_ns: int
 
 
-#: What a record means. An `EndedJob` comes from the step that heard of the end, an `ExplainedJob` from its record.
+#: A fact that a record adds. An `EndedJob` comes from the step that heard of it, an `ExplainedJob` from its record.
 Fact = EndedJob | Presented | Gone | ExplainedJob | IdleSlice
 
 
 class Timeline:
-    """Takes the records of a run in order: `add` returns what each means, and `end` returns the rest.
+    """Takes the records of a run in order: `add` returns the facts of a record, and `end` the last idle slices.
 
     `graph`, `settings`: graph and settings of the run.
-    `waits`: whether to explain the waits of jobs; this takes longer than everything else.
-    `idle`: whether to cut idle time into slices, which come in the order of their ends.
+    `waits`: whether to explain the waits of jobs; this takes longer than all other work.
+    `idle`: whether to return idle time as slices, in the order of their ends.
     `kept`: number of jobs and changes of each unit that are kept to explain a wait.
 
-    `start_ns`: time at which the last unit got ready; None before.
+    `start_ns`: time at which the last unit became ready; None before.
     `is_over`: whether the run is over.
-    `span`: time from the step in which the last unit got ready to the step that finished the run; None until the end,
-    and for a run that never started.
-    `presented`: number of frames that reached the end.
+    `span`: time from the step in which the last unit became ready to the step that finished the run; None until the
+    end, and for a run that never started.
+    `presented`: number of presented frames.
     `skipped`: number of presented frames that took the bypass.
-    `downs`: last times in which a unit was down after its start, in the order of their ends.
-    `stalls`: last times in which the scheduler itself did not run, in their order.
+    `downs`: latest times in which a unit was down after its start, in the order of their ends.
+    `stalls`: latest times in which the scheduler itself did not run, in order.
     """
 
     def __init__(
@@ -165,7 +166,7 @@ class Timeline:
         self.stalls: deque[Span] = deque(maxlen=kept)
         self._track = track_of(graph, settings)
         self._first = graph.stages[0].name
-        self._lost: deque[GoneFrame] = deque()  # those whose cause was not counted yet
+        self._lost: deque[GoneFrame] = deque()  # lost frames whose cause was not counted yet
         self._counts: dict[tuple[str, str], int] = {}
         self._requested = settings.frames
         self._ended: dict[Key, tuple[Handed, JobDone, Presented | None]] = {}
@@ -332,7 +333,7 @@ class Timeline:
             self._track.start(self._now_ns)
 
     def _on_died(self, event: UnitDied) -> None:
-        """Note that the unit is down; its frames are lost or wait again, as the scheduler says."""
+        """Note that the unit is down; its frames are lost or wait again (`fates`)."""
         unit = self.units[event.unit]
         unit.fall(self._now_ns, is_gone=True)
         for job, is_lost in fates([handed.job for handed in unit.held], {self._first}):
@@ -343,7 +344,7 @@ class Timeline:
         unit.held.clear()
 
     def _finish(self, kind: OutcomeKind) -> None:
-        """Note that the run is over. Frames in flight are lost if it was aborted or given up.
+        """Note that the run is over. If it was aborted or a unit was given up, the frames in flight are lost.
 
         Frames that are dropped in this step are counted after it.
         """
@@ -357,6 +358,6 @@ class Timeline:
             unit.held.clear()
 
     def _lose(self, frame: int) -> None:
-        """Note that the frame is lost; the next count says why."""
+        """Note that the frame is lost; the next `Counted` has the cause."""
         if (gone := self._track.lose(frame, self._now_ns)) is not None:
             self._lost.append(gone)

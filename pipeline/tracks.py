@@ -1,8 +1,8 @@
 """Follows the frames in flight of a run by its journal, along a chain or through a graph.
 
-In a graph, a second scheduler takes the run's events and says what becomes of each frame. A chain's journal may be
-older than this scheduler, so its jobs alone decide. Frames of a chain do not overtake each other: where several wait,
-the oldest are dropped.
+For a graph, a second scheduler takes the run's events and decides about each frame. A chain's journal may come from an
+older scheduler, so only the jobs in it decide. Frames of a chain do not overtake each other: if several wait, the
+oldest are dropped.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ UNKNOWN: Final = -1  # the number of a frame that is gone and cannot be told fro
 
 
 class Gone(NamedTuple):
-    """A frame that left the track unpresented. `frame`: its number, or UNKNOWN; `release_ns`: time of its release."""
+    """A frame that was lost or dropped. `frame`: its number, or UNKNOWN. `release_ns`: time of its release."""
 
     frame: int
     release_ns: int
 
 
 class Track(Protocol):
-    """Takes what happens to the frames of a run, in order.
+    """Follows the frames of a run; its methods are called in the order of the journal.
 
     `frames`: frames in flight that are not yet presented, by number.
     """
@@ -50,7 +50,7 @@ class Track(Protocol):
     def frames(self) -> Mapping[int, FrameState]: ...
 
     def step(self, now_ns: int, events: tuple[Event, ...]) -> None:
-        """Note a step of the scheduler; called before what follows from its events."""
+        """Note a step of the scheduler; called before the methods for its events and actions."""
 
     def start(self, now_ns: int) -> None:
         """Note that the last unit got ready."""
@@ -66,7 +66,7 @@ class Track(Protocol):
         """The number of frames that were in flight, or were dropped before."""
 
     def begin(self, job: Job, now_ns: int) -> int:
-        """Note that a job is handed out, and return when the scheduler heard that the job's input was there."""
+        """Note that a job is handed to its unit; return the time at which the scheduler heard of the job's input."""
 
     def end(self, job: Job, event: JobDone, now_ns: int) -> FrameState | None:
         """Note that a job has ended; return its frame if the job presents it."""
@@ -87,10 +87,9 @@ class Track(Protocol):
         """Return the frames that wait for a stage, the oldest first."""
 
     def late(self, unit: str) -> list[str]:
-        """Return the stages that the unit waits for.
+        """Return the stages for whose work the unit waits while it has some inputs of a frame, but not all.
 
-        A stage of the unit has some inputs of a frame, but not all. The oldest such frame lacks the work of these
-        stages.
+        They are the stages that have not done the oldest such frame. Without such a frame the list is empty.
         """
 
 
@@ -181,22 +180,22 @@ class ChainTrack:
         return Gone(UNKNOWN, now_ns)
 
     def late(self, _unit: str) -> list[str]:
-        """Return none: no stage of a chain joins anything."""
+        """Return an empty list, because no stage of a chain has several inputs."""
         return []
 
     def _turn_away(self, frame: int, release_ns: int, cause: DropCause) -> None:
         self._turned_away[cause].append((frame, release_ns))
 
     def _frame(self, number: int, now_ns: int) -> FrameState:
-        """Return a frame in flight; where the journal lacks its begin, make one that is known from now on."""
+        """Return a frame in flight; if the journal lacks its begin, make it now."""
         if (frame := self.frames.get(number)) is None:
             frame = self.frames[number] = FrameState(now_ns, NEVER)
         return frame
 
     def _take(self, frame: int, now_ns: int) -> int:
-        """Note that the frame is in flight from now on, and return its release time."""
+        """Take the frame out of the source, and return its release time."""
         for released in self._source.queue:
-            if released[0] == frame:  # others may come first: a frame dropped in this step is counted after it
+            if released[0] == frame:  # frames before it may still be here: drops of this step are counted after it
                 self._source.queue.remove(released)
                 return released[1]
         return self._source.take(now_ns)[1]
@@ -219,7 +218,7 @@ class GraphTrack:
         self._left: list[FrameLeft] = []
         self._core.ledger.left = self._left
         self._named = self._core.flow.stage_named
-        self._heard_ns: dict[int, dict[int, int]] = {}  # of each frame, by the stage's position
+        self._heard_ns: dict[int, dict[int, int]] = {}  # by the frame's number and the stage's position
         self._gone: dict[str, deque[Gone]] = {}
         self._presented: dict[int, FrameLeft] = {}
 
@@ -280,7 +279,7 @@ class GraphTrack:
         return frame
 
     def give_back(self, _job: Job) -> None:
-        """Do nothing: the second scheduler knows."""
+        """Do nothing, because the second scheduler has taken the event."""
 
     def lose(self, _frame: int, _now_ns: int) -> Gone | None:
         return None

@@ -1,7 +1,7 @@
-"""Explains what a unit did: cuts its idle time into slices with causes, and each wait of a job into causes.
+"""Explains the past of a unit: divides its idle time into slices with causes, and each wait of a job into causes.
 
-Rule: at any time a unit has a job or is idle for one cause. The timeline (timeline.py) says whether it had a job and
-whether its process was up. The core notes after each step why the unit had no job.
+Rule: at any time a unit has a job, or is idle for one cause. The timeline (timeline.py) says whether the unit had a job
+and whether its process was up. The core's accounts say why the unit had no job.
 
 Every nanosecond from a job's `ready_ns` to its `begin_ns` has one cause, the first of these that holds:
 - busy: the unit did another job;
@@ -13,8 +13,8 @@ Every nanosecond from a job's `ready_ns` to its `begin_ns` has one cause, the fi
 - preempted: the job was handed over, but the unit had no core;
 - overhead: the job was handed over and on its way.
 
-The history is bounded: it keeps the last `kept` jobs and changes of each unit. A wait that reaches further back is
-`unknown` there.
+The history is bounded: it keeps the last `kept` jobs and changes of each unit. The earlier part of a longer wait is
+`unknown`.
 """
 
 from __future__ import annotations
@@ -31,16 +31,16 @@ from trilane.scheduler.ledger import JobRecord
 BUSY, PREEMPTED, OVERHEAD = "busy", "preempted", "overhead"
 THROTTLED, JOIN = "throttled", "join"
 _OF_ALL: Final = {ledger.STARVED: "starved", ledger.BLOCKED: "blocked", ledger.THROTTLED: THROTTLED}
-#: What the ledger's account says about why a unit has no job.
+#: The cause of a unit's time without a job, by the ledger's account.
 NAMES: Final = {**_OF_ALL, ledger.JOIN: JOIN}
-#: Why a unit is idle; where branches of a graph meet, also for JOIN.
+#: The causes of idle time; in a graph where branches meet, JOIN is a further cause.
 IDLE_CAUSES: Final = (*_OF_ALL.values(), PREEMPTED, OVERHEAD)
-#: The cause of a unit that has neither a job nor a noted cause; the sums lack its time, which shows the gap.
+#: The cause of the time in which a unit has neither a job nor a noted cause. It is in no sum, so that a gap is visible.
 UNEXPLAINED = "unexplained"
 LOST, DOWN, HELD, UNKNOWN = "lost", "down", "held", "unknown"
-#: Why a job waits.
+#: The causes of a job's wait.
 WAIT_CAUSES: Final = (BUSY, LOST, DOWN, THROTTLED, NAMES[ledger.BLOCKED], HELD, PREEMPTED, OVERHEAD, UNKNOWN)
-#: What the account of a unit without this job means for the job, once the scheduler has heard of the job's input.
+#: The cause of a job's wait by the account of its unit, after the scheduler has heard of the job's input.
 MEANING: Final = {**NAMES, ledger.ASSIGNED: OVERHEAD, ledger.STARVED: HELD, ledger.JOIN: HELD}
 KEPT: Final = 4096
 
@@ -63,10 +63,10 @@ class Handed(NamedTuple):
 
 
 class IdleSlice(NamedTuple):
-    """A piece of time in which no job ran on the unit.
+    """A time in which no job ran on the unit, for one cause.
 
-    `preempted_ns`: part of it in which the unit had no core.
-    `late`: for JOIN, the stages whose work was not there when it began, joined by commas.
+    `preempted_ns`: part of this time in which the unit had no core.
+    `late`: for JOIN, the stages whose work was missing when the slice began, joined by commas.
     """
 
     unit: str
@@ -80,10 +80,10 @@ class IdleSlice(NamedTuple):
 class UnitHistory:
     """The recent past of one unit.
 
-    `kept`: number of last jobs and of last changes that are remembered to explain waits.
+    `kept`: number of last jobs and of last changes that are kept to explain waits.
     `held`: jobs that the unit has, the running one first.
     `account`: account of the ledger that gets the unit's time without a job.
-    `late`: stages that it waits for, joined by commas, while `account` is JOIN.
+    `late`: stages for whose work the unit waits, joined by commas, while `account` is JOIN.
     `is_up`: whether the unit's process is up and ready, and no kill is under way.
     `stopped_ns`: last time at which its process was seen stopped by a signal; 0: never.
     """
@@ -104,9 +104,9 @@ class UnitHistory:
     # its process
 
     def rise(self, now_ns: int) -> int | None:
-        """Note that the process is up, and return since when it was down; None if it was not up before.
+        """Note that the process is up; return the time since which it was down, or None if it was not up before.
 
-        A process that is to be ended does not come up.
+        Nothing is noted while a kill of the process is under way.
         """
         if self._is_ending:
             return None
@@ -115,9 +115,9 @@ class UnitHistory:
         return down_ns
 
     def fall(self, now_ns: int, *, is_gone: bool) -> None:
-        """Note that the process is gone or is to be ended.
+        """Note that the process is gone (`is_gone`), or that the scheduler kills it.
 
-        If it was up and had a job, the time since the hand-over of that job counts as lost.
+        If the process was up and had a job, the time since the hand-over of that job counts as lost.
         """
         if self.is_up:
             if self.held:
@@ -138,9 +138,11 @@ class UnitHistory:
         self._change(now_ns)
 
     def explain(self, job: JobRecord, heard_ns: int) -> tuple[dict[str, int], JobRecord | None]:
-        """Return the wait of the unit's next job in ns by cause, and the job that the unit did the longest meanwhile.
+        """Return (wait of the unit's next job in ns by cause, job that the unit did for the longest part of the wait).
 
-        Causes with 0 ns are left out. `heard_ns`: time at which the scheduler heard of the job's input.
+        Causes with 0 ns are left out. The second value is None if the unit did no other job.
+
+        `heard_ns`: time at which the scheduler heard of the job's input.
         """
         others = list(self._during(job.ready_ns, job.begin_ns))
         waits_ns = self._waits(job, heard_ns, others)
@@ -159,13 +161,13 @@ class UnitHistory:
 
     @property
     def _known_from_ns(self) -> int:
-        """The time from which on everything is kept; 0: nothing was dropped yet."""
+        """The time in ns from which on all jobs and changes are kept; 0: all are kept."""
         firsts = [self._jobs[0].begin_ns] if len(self._jobs) == self._jobs.maxlen else []
         firsts += [self._changes[0][0]] if len(self._changes) == self._changes.maxlen else []
         return max(firsts, default=0)
 
     def _during(self, begin_ns: int, end_ns: int) -> Iterator[JobRecord]:
-        """Yield the unit's jobs that ran between two times, the last first."""
+        """Yield the unit's jobs that ran between two times, the latest first."""
         for job in reversed(self._jobs):
             if job.end_ns <= begin_ns:
                 return
@@ -173,7 +175,7 @@ class UnitHistory:
                 yield job
 
     def _waits(self, job: JobRecord, heard_ns: int, others: list[JobRecord]) -> dict[str, int]:
-        """Return the wait of `job` by cause. `others`: the unit's jobs during the wait, the last first."""
+        """Return the wait of `job` in ns by cause. `others`: the unit's jobs during the wait, the latest first."""
         found = dict.fromkeys(WAIT_CAUSES, 0)
         known_ns = min(max(self._known_from_ns, job.ready_ns), job.begin_ns)
         found[UNKNOWN] = known_ns - job.ready_ns
@@ -193,7 +195,7 @@ class UnitHistory:
         return {cause: ns for cause, ns in found.items() if ns}
 
     def _add_not_handed(self, found: dict[str, int], begin_ns: int, end_ns: int, heard_ns: int) -> None:
-        """Add the causes of a piece of time before a job was handed over, in which the unit did no other job."""
+        """Add the causes of a time to `found`: the job was not handed over yet, and the unit did no other job."""
         if end_ns <= begin_ns:
             return
         explained_ns = 0
@@ -205,7 +207,7 @@ class UnitHistory:
         found[OVERHEAD] += end_ns - begin_ns - explained_ns
 
     def _causes(self, begin_ns: int, end_ns: int) -> Iterator[tuple[str, int, int]]:
-        """Yield (cause, begin, end) over a piece of time, the last first; time before the first change is left out."""
+        """Yield (cause, begin in ns, end in ns), the latest first; time before the first change is left out."""
         for since_ns, cause in reversed(self._changes):
             if since_ns < end_ns:
                 yield cause, max(since_ns, begin_ns), end_ns
@@ -222,14 +224,11 @@ class UnitHistory:
 
     @property
     def cut_until_ns(self) -> int:
-        """The earliest time at which a slice still to come can end, while the unit has a job."""
+        """The earliest possible end in ns of the next slice, while the unit has a job."""
         return self._cut_ns
 
     def note_idle(self, now_ns: int, cause: str) -> Iterator[IdleSlice]:
-        """Set the cause of the idle time from now on.
-
-        If the cause changes, yield the rest of the slice before.
-        """
+        """Set the cause of the idle time from `now_ns` on; if it changes, yield the rest of the slice before."""
         if cause != self._idle_cause:
             if self._idle_cause and now_ns > self._cut_ns:
                 yield IdleSlice(self.name, self._idle_cause, self._cut_ns, now_ns, late=self._idle_late)
@@ -237,9 +236,9 @@ class UnitHistory:
             self._idle_late = self.late if cause == JOIN else ""
 
     def cut(self, job: JobRecord) -> Iterator[IdleSlice]:
-        """Yield the piece between the job before and this one.
+        """Yield the idle slice between the unit's last job and this job.
 
-        Only a slice of overhead is cut: during any other slice the unit has no job.
+        Only overhead has such slices: during any other cause the unit has no job.
         """
         if self._idle_cause == OVERHEAD:
             if job.begin_ns > self._cut_ns:
@@ -249,11 +248,11 @@ class UnitHistory:
 
 
 class IdleCutter:
-    """Cuts the idle time of `units` into slices, in the order of their ends, during a run or after it.
+    """Divides the idle time of `units` into slices, in the order of their ends, during a run or after it.
 
-    For each step the caller calls `settle` and then `step`. It then calls `account` for each account noted after the
-    step, and `job` for each job whose end the step heard. After the last step it calls `end`. `settle` and `end` return
-    the slices that are known by then.
+    For each step the caller calls `settle` and then `step`. After that it calls `account` for each account that follows
+    the step, and `job` for each job of whose end the scheduler heard in the step. After the last step it calls `end`.
+    `settle` and `end` return the slices that are complete.
     """
 
     def __init__(self, units: Iterable[UnitHistory]) -> None:
@@ -263,7 +262,7 @@ class IdleCutter:
         self._count = 0
 
     def settle(self) -> list[IdleSlice]:
-        """Note how the last step left each unit, and return the slices that end before all later ones."""
+        """Note the state of each unit after the last step, and return the slices that end before all later slices."""
         if self._now_ns is None:
             return []
         until_ns = NEVER
@@ -277,15 +276,15 @@ class IdleCutter:
         self._now_ns = now_ns
 
     def account(self, since_ns: int, unit: UnitHistory, account: int) -> None:
-        """Note that the time of `unit` without a job goes to `account` from `since_ns` on.
+        """Note that the unit's time without a job goes to `account` from `since_ns` on.
 
-        `since_ns` is the time of the last step, or of an earlier release that this step handled late.
+        `since_ns`: time of the last step, or of an earlier release that this step handled late.
         """
         if account == ledger.ASSIGNED and self._now_ns is not None and since_ns < self._now_ns:
             self._hold(unit.note_idle(since_ns, OVERHEAD))
 
     def job(self, unit: UnitHistory, job: JobRecord) -> None:
-        """Note a job whose end the last step heard; a unit's jobs come in the order in which it did them."""
+        """Note a job of whose end the last step heard; a unit's jobs come in the order of their ends."""
         self._hold(unit.cut(job))
 
     def end(self) -> list[IdleSlice]:
@@ -308,5 +307,5 @@ class IdleCutter:
 
 
 def _overlap(other: JobRecord, job: JobRecord) -> int:
-    """Return how many ns of the wait of `job` the unit spent on `other`."""
+    """Return the time in ns that the unit spent on `other` while `job` waited."""
     return min(other.end_ns, job.begin_ns) - max(other.begin_ns, job.ready_ns)

@@ -1,9 +1,9 @@
-"""A unit's process: what it gets at its start, its stages on their slots, and the loop that answers messages.
+"""A unit's process: its `UnitSpec`, its stages with their slots, and the loop that answers messages.
 
-Rule: one message, one answer; an error is an answer, never silence. Slots are bound once, before the first job. Headers
-are passed on here; no stage has to think of them.
+Rule: each message has one answer, and an error is an answer too. Slots are bound once, before the first job. The loop
+copies the headers from input to output; the stages need not.
 
-A process gets its `UnitSpec` as one JSON document: plain data, and descriptors by number.
+A process gets its `UnitSpec` as one JSON document of plain data and numbers of descriptors.
 """
 
 from __future__ import annotations
@@ -59,10 +59,11 @@ class UnitSpec(Model):
     `settings`: settings of the unit.
     `scheduler_cores`: cores of the scheduler.
     `run_cores`: cores of all units.
-    `stages`: stages of this unit; messages name a stage by its place in this list.
-    `module_folders`: folders that are put before the module search path.
+    `stages`: stages of this unit; messages name a stage by its index in this list.
+    `module_folders`: folders that come first in the module search path.
     `edges`: regions with their descriptors, by the edge's name.
-    `inputs`, `outputs`: edges of each stage that has any.
+    `inputs`: names of the input edges of each stage that has inputs.
+    `outputs`: name of the output edge of each stage that has one.
     `may_skip`: name of the stage at which the pipeline's bypass begins, or "".
     """
 
@@ -82,11 +83,11 @@ class UnitSpec(Model):
 
     @property
     def fds(self) -> list[int]:
-        """The descriptors that the process needs, with their numbers in this process."""
+        """The numbers, in this process, of the descriptors that the unit's process needs."""
         return [*self.job_pipe, self.assets_fd, *(edge.fd for edge in self.edges.values())]
 
     def renumbered(self, number_of: Mapping[int, int]) -> UnitSpec:
-        """Return the same spec with the number `number_of[n]` for each descriptor n."""
+        """Return the same spec, with descriptor n replaced by `number_of[n]`."""
         edges = {name: edge.model_copy(update={"fd": number_of[edge.fd]}) for name, edge in self.edges.items()}
         return self.model_copy(
             update={
@@ -97,11 +98,11 @@ class UnitSpec(Model):
         )
 
 
-WAKE_UP_NS = 150_000  # a sleep ends about this much late
+WAKE_UP_NS = 150_000  # about how much too late a sleep ends
 
 
 class BoundStage:
-    """A stage with its slots."""
+    """A stage that is bound to its slots."""
 
     def __init__(
         self,
@@ -116,9 +117,9 @@ class BoundStage:
     ) -> None:
         """Bind `stage` to its slots.
 
-        `pace_ns`: least time in ns for which a job is held.
-        `unit`: context of the unit that it runs on.
-        `may_skip`: whether a bypass begins at it.
+        `pace_ns`: least time of a job; a shorter job waits until its end.
+        `unit`: context of the unit that runs the stage.
+        `may_skip`: whether a bypass begins at the stage.
         `join`: inputs of a `JoiningStage`; `inputs` is then empty.
         """
         self.name, self._pace_ns, self._may_skip = name, pace_ns, may_skip
@@ -134,12 +135,12 @@ class BoundStage:
     def run(
         self, frame: int, slot_in: int, slot_out: int, epoch: int, fresh: bool = False, rung: int = 0
     ) -> Mapping[str, float]:
-        """Do the job, hold it until its pace has passed, and return the stage's metrics.
+        """Do the job, wait until its pace has passed, and return the stage's metrics; a `Skip` if the frame skips.
 
-        The metrics are a `Skip` if the frame skips. A slot is -1 where the stage has no such edge.
-
-        `fresh`: whether the stage must ignore what earlier frames left behind.
-        `rung`: rung of the frame's work, which the first stage is told.
+        `slot_in`, `slot_out`: slots of the job; -1 if the stage has no input or no output.
+        `epoch`: epoch of the output edge, for the packet's header.
+        `fresh`: whether the stage must not rely on what earlier frames brought to the end of the bypass.
+        `rung`: rung of the frame's work; the first stage gets it.
 
         Raises TrilaneError for a `Skip` of a stage that may not skip.
         """
@@ -170,14 +171,17 @@ class BoundStage:
 
     @property
     def works_asleep(self) -> bool:
-        """Whether the job goes on while its threads sleep.
+        """Whether a job counts as busy while its threads sleep.
 
-        It goes on if hardware other than the cores does its work, or if it is held to the pace of a chip.
+        It does if a device works for the job, or if the stage has a pace, which models the time of a chip.
         """
         return self._pace_ns > 0 or self._unit.has_device
 
     def sampled_ns(self, slot_in: int, slot_out: int) -> int:
-        """Return when a stage that reads no frame by number sampled the frame of its last job; 0 for other stages."""
+        """Return the time in ns at which the stage sampled the frame of its last job.
+
+        It is 0 for a stage that takes frames from another stage by number.
+        """
         if not self._is_first or (slot_in >= 0 and self._join is None):
             return 0
         return int(self._outputs[slot_out].header["t_sampled_ns"]) if slot_out >= 0 else self._sampled_ns
@@ -187,7 +191,7 @@ class BoundStage:
 
 
 class Join:
-    """The inputs of a stage that takes several slots for a job.
+    """The inputs of a `JoiningStage`, which takes one slot of each input for a job.
 
     `inputs`: slots of each input.
     """
@@ -199,30 +203,30 @@ class Join:
 
     @property
     def is_source(self) -> bool:
-        """Whether no input tells which frame the stage does."""
+        """Whether all inputs take the newest frame, so that the stage's frames come from the source."""
         return not self._by_frame
 
     def slots(self, packed: int) -> tuple[int | None, ...]:
-        """Return the slot of each input that `Job.slot_in` has packed; None where there is no frame."""
+        """Return the slot of each input from `packed`, a `Job.slot_in`; None for an input without a frame."""
         return tuple(slot if slot >= 0 else None for slot in unpacked(packed, len(self.inputs)))
 
     def sampled_ns(self, slots: Sequence[int | None], now_ns: int) -> int:
-        """Return when the oldest input of the job's own frame was sampled; `now_ns` for a source."""
+        """Return the sampling time in ns of the oldest input by frame; `now_ns` if all inputs take the newest frame."""
         found = [int(self.inputs[place][slots[place] or 0].header["t_sampled_ns"]) for place in self._by_frame]
         return min(found, default=now_ns)
 
 
 def hold_until(end_ns: int) -> None:
-    """Wait until `end_ns` of CLOCK_MONOTONIC, not at all if that has passed: sleep first, then watch the clock."""
+    """Wait until `end_ns` of CLOCK_MONOTONIC: sleep for most of the time, then spin."""
     while (left_ns := end_ns - time.monotonic_ns()) > 0:
         if left_ns > WAKE_UP_NS:
             time.sleep((left_ns - WAKE_UP_NS) / NS_PER_S)
 
 
 def _header_copier(inputs: list[Packet], outputs: list[Packet]) -> Callable[[int, int], None]:
-    """Return a function that copies the header from an input slot to an output slot.
+    """Return a function of (input slot, output slot) that copies the header from one to the other.
 
-    If the headers differ, it copies only the frame's fields.
+    If the edges have different headers, it copies only FRAME_FIELDS.
     """
     if inputs and outputs and inputs[0].header.dtype != outputs[0].header.dtype:
         return lambda slot_in, slot_out: _copy_fields(inputs[slot_in].header, outputs[slot_out].header)
@@ -246,6 +250,7 @@ def _bytes_of(packet: Packet) -> U8:
 def serve(raw_spec: dict[str, Any], number_of: Mapping[int, int]) -> int:
     """Build the unit's stages, answer messages until Close, and return the process's exit code.
 
+    `raw_spec`: a `UnitSpec` as JSON values.
     `number_of`: number in this process of each descriptor that the spec names.
     """
     spec = UnitSpec.model_validate(raw_spec).renumbered(number_of)
@@ -293,9 +298,9 @@ def _answer(spec: UnitSpec, link: Link, counters: HardwareCounters | NoCounters)
 
 @contextlib.contextmanager
 def building_cores(spec: UnitSpec) -> Iterator[None]:
-    """Let this thread use every core of the run while the stages are built, so that the unit is ready sooner.
+    """Let this thread use every core of the run inside the `with` block, so that the unit's stages are built sooner.
 
-    Afterwards it and every thread that was started meanwhile are back on the unit's own cores.
+    At the end this thread, and every thread that was started in the block, gets only the unit's own cores.
     """
     before = _threads()
     os.sched_setaffinity(0, spec.run_cores)
@@ -309,12 +314,12 @@ def building_cores(spec: UnitSpec) -> Iterator[None]:
 
 
 def _threads() -> set[int]:
-    """Return the threads of this process, by the kernel's numbers."""
+    """Return the kernel's ids of this process's threads."""
     return {int(task.name) for task in Path(TASKS).iterdir()}
 
 
 def build_stages(spec: UnitSpec) -> list[BoundStage]:
-    """Return the unit's stages on their slots, in the order of `spec.stages`; raises what their factories raise."""
+    """Return the unit's stages, bound to their slots, in the order of `spec.stages`; raises what a factory raises."""
     sys.path[:0] = map(str, spec.module_folders)
     unit = UnitContext(spec.unit, spec.settings, map_assets(spec.assets_fd))
     stages = [factory_named(stage.factory)(stage.settings, unit) for stage in spec.stages]
@@ -368,7 +373,11 @@ def _close(unit: str, link: Link, stages: Iterable[BoundStage]) -> int:
 
 
 def _fail(link: Link, job_id: int, where: str, error: Exception) -> int:
-    """Answer with one sentence, and return the exit code; the traceback goes to stderr, whose end the parent keeps."""
+    """Send the error as one sentence, and return its exit code. The traceback goes to stderr.
+
+    `job_id`: id of the failed job; BUILDING or CLOSING outside a job.
+    `where`: place of the error, for the sentence.
+    """
     traceback.print_exception(error)
     known = isinstance(error, TrilaneError)
     text = str(error) if known else f"{where}: {type(error).__name__}: {error}"
@@ -377,6 +386,6 @@ def _fail(link: Link, job_id: int, where: str, error: Exception) -> int:
     if (is_of_memory or job_id == BUILDING) and (short := shortage()):
         said = error.what if isinstance(error, MissingPartError) else text
         text, code = f"{where}: memory is short: {short}; it failed with: {said}", 1
-    sentence = " ".join(text.split()).encode(errors="replace")  # a file's name may hold bytes that are no text
+    sentence = " ".join(text.split()).encode(errors="replace")  # a file's name may contain bytes that are no text
     link.job_pipe.send(Failed(job_id, code, sentence[:MAX_TEXT].decode(errors="ignore")))
     return code

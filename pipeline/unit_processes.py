@@ -1,8 +1,9 @@
-"""Starts, hears and ends the units' processes, one by one or all before and after a run.
+"""Starts the units' processes, receives their messages, and ends them.
 
-Rule: what was started here is ended here, and its end is always noticed. The time limits for starts and ends are here.
+Rule: every process that is started here is ended here, and its end is always noticed. This file has the time limits for
+starts and ends.
 
-A unit's messages come over its link, its stderr over a pipe, and its end over a pidfd; one poller waits for all.
+A unit's messages come over its link, its stderr over a pipe, and its end over a pidfd; one poller waits for all three.
 """
 
 from __future__ import annotations
@@ -44,12 +45,12 @@ from trilane.transport.messages import (
 
 TAIL_BYTES = 8192
 END_S = 2.0
-#: How long the fork server may take to say how a unit ended; it does so at once.
+#: Longest wait for a unit's exit code from the fork server, which sends it at once.
 CODE_MS = 200
 
 
 class UnitMessage(NamedTuple):
-    """A message of a unit; `message` is None when the unit's process has ended."""
+    """A message of a unit. `message`: None if the unit's process has ended."""
 
     unit: str
     message: Message | None
@@ -65,7 +66,7 @@ class _Process:
         os.set_blocking(stderr_fd, False)
 
     def read_stderr(self) -> bool:
-        """Keep the last bytes that were written; return False when the pipe is closed."""
+        """Read all available bytes and keep the last TAIL_BYTES; return False if the pipe is closed."""
         with contextlib.suppress(BlockingIOError):
             while chunk := os.read(self.stderr_fd, TAIL_BYTES):
                 self.tail = (self.tail + chunk)[-TAIL_BYTES:]
@@ -75,11 +76,11 @@ class _Process:
     def kill(self) -> None:
         self.is_killed_here = True
         with contextlib.suppress(ProcessLookupError):
-            # Through a pidfd the signal can never reach another process that was given the same number.
+            # With a pidfd, the signal cannot reach another process that has got the same process id.
             signal.pidfd_send_signal(self.pidfd, signal.SIGKILL)
 
     def wait(self) -> None:
-        """Wait until the process has ended, and kill the processes that it started, which are in its process group."""
+        """Wait until the process has ended, and kill the processes that it started, by its process group."""
         poller = select.poll()  # select(2) takes no descriptor above 1023
         poller.register(self.pidfd, select.POLLIN)
         poller.poll()
@@ -87,7 +88,10 @@ class _Process:
             os.killpg(self.pid, signal.SIGKILL)
 
     def killed_by(self) -> int:
-        """Return the signal from elsewhere that has ended the process; 0 for none, or if no fork server knows it."""
+        """Return the number of the signal that ended the process, but 0 for a signal of this class.
+
+        It is 0 too if no signal ended the process, or if the fork server is gone.
+        """
         poller = select.poll()
         poller.register(self.code_fd, select.POLLIN)
         if self.is_killed_here or not poller.poll(CODE_MS):
@@ -101,12 +105,14 @@ class _Process:
 
 
 class UnitProcesses:
-    """Starts, hears and ends the processes of the units of `pipeline`, whose edges have `regions`.
+    """The processes of the units of `pipeline`.
 
-    `assets_fd`: descriptor of the arrays that every unit may read.
-    `stderr_tails`: last text that each ended unit wrote, by unit.
-    `signals`: number of the signal that ended a unit, by unit; 0 for none.
-    `places`: place of each stage among those of its unit, as messages use it.
+    `regions`: memory of each edge, by the edge's name.
+    `assets_fd`: descriptor of the assets.
+    `starter`: fork server.
+    `stderr_tails`: end of the stderr of each ended process, by unit.
+    `signals`: number of the signal from elsewhere that ended a process, by unit; 0 for none.
+    `places`: index of each stage among the stages of its unit, as in messages.
     """
 
     def __init__(
@@ -139,9 +145,9 @@ class UnitProcesses:
             self._register(fd, partial(_swallow, fd))
 
     def start(self, unit: str) -> None:
-        """Start a fresh process for the unit; raises TrilaneError or OSError.
+        """Start a new process for the unit; raises TrilaneError or OSError.
 
-        `Ready`, `Failed` or the end of the process follows.
+        The next message of the unit is `Ready`, `Failed` or the end of the process.
         """
         with contextlib.ExitStack() as undo:
             folder = SocketFolder()
@@ -166,12 +172,12 @@ class UnitProcesses:
         self._register(process.pidfd, partial(self._end, process))
 
     def connected(self, unit: str) -> None:
-        """Remove the name of the unit's socket, which a connected unit no longer needs."""
+        """Remove the file of the unit's socket, which a connected unit no longer needs."""
         if unit in self._live:
             self._live[unit].release_folder()
 
     def send(self, unit: str, message: Message) -> None:
-        """Send `message` to the unit; does nothing for a unit that is gone or does not read.
+        """Send `message` to the unit; nothing is sent to a unit that is gone or does not read.
 
         The scheduler notices such a unit by the end of its process, or by its deadline.
         """
@@ -184,14 +190,14 @@ class UnitProcesses:
             self._live[unit].kill()
 
     def move(self, unit: str, cores: tuple[int, ...]) -> None:
-        """Bind every thread of the unit to `cores`, from now until its process ends."""
+        """Restrict every thread of the unit to `cores`, until its process ends."""
         with contextlib.suppress(ProcessLookupError, FileNotFoundError):  # `listen` hears of its end
             for thread in (machine.here.proc / f"{self._live[unit].pid}/task").iterdir():
                 with contextlib.suppress(ProcessLookupError):  # the thread has ended meanwhile
                     os.sched_setaffinity(int(thread.name), cores)
 
     def listen(self, timeout_ms: int) -> list[UnitMessage]:
-        """Return what came within the time, or at once when something waits. A unit's messages come before its end."""
+        """Return the next messages, after at most `timeout_ms`; a unit's last messages come before its end."""
         messages: list[UnitMessage] = []
         for fd, _ in self._poller.poll(timeout_ms / 1000):
             messages += self._reactions[fd]()
@@ -205,7 +211,7 @@ class UnitProcesses:
         return messages
 
     def why_ended(self, unit: str) -> str:
-        """Return the end of a sentence that says why a unit ended: its signal, what it wrote last, a lack of memory."""
+        """Return the end of a sentence about a unit's death: its signal, its last line of stderr, a lack of memory."""
         number = self.signals.get(unit, 0)
         killed = f"it was killed by signal {number}" if number else ""
         ends = (killed, after_stderr(self.stderr_tails.get(unit, "")), ended_by_system())
@@ -217,7 +223,7 @@ class UnitProcesses:
         return {unit for unit, process in self._live.items() if is_stopped(process.pid)}
 
     def renew_starter(self) -> str:
-        """Make sure that a fork server answers; return why it had to be replaced, else "". Raises OSError."""
+        """Replace the fork server if it does not answer; return the reason, or "" if it answers. Raises OSError."""
         return self._starter.renew()
 
     def close(self) -> None:
@@ -236,7 +242,7 @@ class UnitProcesses:
             self.listen(50)
 
     def _job_messages(self, process: _Process) -> list[UnitMessage]:
-        """Return the next message of the job pipe, if there is one; while more wait, the pipe stays readable."""
+        """Return the next message of the job pipe, if any; the pipe stays readable while more messages wait."""
         try:
             message = process.link.job_pipe.receive()
         except MessageError as error:
@@ -322,9 +328,9 @@ POLL_MS = 200
 
 
 def start_units(processes: UnitProcesses, units: Iterable[str], interrupts: Interrupts) -> dict[str, float]:
-    """Start every unit, wait until it is bound to its slots, and return how many ms each unit took.
+    """Start every unit, wait until all are ready, and return the start-up time of each unit in ms.
 
-    Raises UnitError when a unit cannot start, and KeyboardInterrupt when interrupted.
+    Raises UnitError if a unit cannot start, and KeyboardInterrupt if interrupted.
     """
     started_s = {}
     for unit in units:
@@ -359,7 +365,7 @@ def listen_before_run(processes: UnitProcesses, interrupts: Interrupts) -> list[
 
 
 def close_units(processes: UnitProcesses, log: RunLog, interrupts: Interrupts) -> None:
-    """Let the stages complete their files and the processes end.
+    """Tell the units to close, and wait until their stages have completed their files and their processes have ended.
 
     `UnitProcesses.close` kills a process that does not end.
     """

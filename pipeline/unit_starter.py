@@ -1,7 +1,7 @@
-"""The parent's end of the fork server. Rule: it starts units, and leaves no process when it is closed.
+"""The parent's end of the fork server. Rule: it starts units, and leaves no process behind when it is closed.
 
 Units outlive the server. A server that has ended or was stopped is replaced. The caller calls `renew` from time to
-time, so that a fresh server has imported what units need before the next unit is wanted.
+time, so that a new server has imported its modules before the next unit must start.
 """
 
 from __future__ import annotations
@@ -24,22 +24,23 @@ from trilane.pipeline.fork_server import THREAD_LIMITS
 if TYPE_CHECKING:
     from trilane.pipeline.unit_loop import UnitSpec
 
-ANSWER_S = 60.0  # the modules to preload may come from a slow disk
+ANSWER_S = 60.0  # longest wait for an answer; the modules to preload may come from a slow disk
 LOOK_S = 0.1  # between two looks at a fork server that has not answered
 CLOSE_S = 5.0
-NOTICE_S = 0.2  # a fork server ends at most this many seconds after its call fails or its socket closes
+NOTICE_S = 0.2  # longest time from a failed call or a closed socket to the end of the fork server
 TAIL_BYTES = 8192
-DESCRIPTORS = 2  # that come with a unit's process id
+DESCRIPTORS = 2  # number of descriptors that come with a unit's process id
 SERVER = "the fork server, which every unit comes from,"
-SERVERS = 3  # number of servers that are asked for one unit before it counts as not startable
+SERVERS = 3  # number of servers that are tried for one unit
 
 
 class StartedUnit(NamedTuple):
-    """A unit's process; its owner closes the descriptors.
+    """A unit's process. The caller closes the descriptors.
 
+    `pid`: process id.
     `pidfd`: descriptor that is readable when the process has ended.
-    `lifeline`: descriptor that keeps the process alive: it ends when this is closed, or when this process ends.
-    `code_fd`: descriptor through which the process's exit code comes, as text, soon after its end. It is negative for
+    `lifeline`: descriptor whose closing kills the process; the end of this process closes it too.
+    `code_fd`: pipe from which the exit code can be read as text soon after the process's end. The code is negative for
     a signal, and empty if the fork server has ended.
     """
 
@@ -54,14 +55,18 @@ class _ServerError(Exception):
 
 
 class ForkedCall:
-    """A call that runs in a process of a fork server of `starter`, and answers to the pipe `reads`."""
+    """A call of a function in a process forked by the server of `starter`.
+
+    `function`: function as `module:name`.
+    `reads`: end of the pipe from which its result is read.
+    """
 
     def __init__(self, starter: UnitStarter, function: str, reads: int) -> None:
         self._starter, self._function, self._reads = starter, function, reads
         self._is_open = True
 
     def result(self) -> Any | None:
-        """Return the function's result, once; None when it failed, its process died, or no answer came in time.
+        """Return the function's result; None if it failed, its process died, or no answer came in time. Call it once.
 
         If the call's fork server had to be replaced, the call is made once more.
         """
@@ -74,7 +79,7 @@ class ForkedCall:
         return json.loads(answer) if answer else None
 
     def _answer(self) -> bytes:
-        """Return all bytes until the pipe's end, the time limit, or the end of the fork server."""
+        """Return all bytes until the pipe is closed, the time limit is over, or the fork server has ended."""
         answer = b""
         poller = select.poll()  # select(2) takes no descriptor above 1023
         poller.register(self._reads, select.POLLIN)
@@ -96,9 +101,9 @@ class ForkedCall:
 
 
 class UnitStarter:
-    """A fork server that imports the modules `preload` while the caller goes on.
+    """A fork server that imports the modules `preload` in the background.
 
-    Close it when its units have ended. Raises OSError when no process can be made.
+    Close it when its units have ended. Raises OSError if no process can be made.
     """
 
     def __init__(self, preload: Sequence[str] = ()) -> None:
@@ -131,14 +136,16 @@ class UnitStarter:
             pass_fds=[theirs.fileno()],
             # One thread for each library: a fork copies only the thread that forks.
             env={**os.environ, **dict.fromkeys(THREAD_LIMITS, "1")},
-            # Ctrl-C then reaches the parent alone, which decides what is finished first.
+            # Ctrl-C then reaches only the parent, which decides what is finished first.
             process_group=0,
         )
 
     def renew(self, wait_s: float = 0.0) -> str:
-        """Replace a fork server that has ended or was stopped, and return why; "" for one that is well.
+        """Replace a fork server that has ended or was stopped, and return the reason; "" if it runs.
 
-        `wait_s`: time to wait for its end, in seconds. Raises OSError when no process can be made.
+        `wait_s`: longest time to wait for its end, in seconds.
+
+        Raises OSError if no process can be made.
         """
         why = self.trouble(wait_s)
         if why:
@@ -146,7 +153,7 @@ class UnitStarter:
         return why
 
     def trouble(self, wait_s: float = 0.0) -> str:
-        """Return why the fork server answers no more, after at most `wait_s` seconds; "" if it may still answer."""
+        """Return why the fork server no longer answers, after at most `wait_s` seconds; "" if it may still answer."""
         try:
             code = self._server.wait(wait_s)
         except subprocess.TimeoutExpired:
@@ -158,9 +165,9 @@ class UnitStarter:
         self._launch()
 
     def start(self, spec: UnitSpec, stderr_fd: int) -> StartedUnit:
-        """Return a process for the unit, which writes to `stderr_fd`.
+        """Return a new process for the unit. `stderr_fd`: descriptor that becomes its stderr.
 
-        Raises TrilaneError when no fork server answers at all.
+        Raises TrilaneError if the unit cannot be started.
         """
         spec_fd = os.memfd_create(f"trilane:spec:{spec.unit}", os.MFD_CLOEXEC)
         try:
@@ -180,7 +187,7 @@ class UnitStarter:
         raise TrilaneError(f"unit {spec.unit} could not be started: {why}")
 
     def _ask(self, spec: UnitSpec, fds: Sequence[int]) -> StartedUnit:
-        """Return the unit's process, with `fds` for its spec and stderr; after an error no process is left."""
+        """Return the unit's process; after an error none is left. `fds`: descriptors of its spec and its stderr."""
         self._has_units = True
         settings = spec.settings
         request = {"unit": spec.unit, "cores": settings.cores, "threads": settings.threads, "fds": spec.fds}
@@ -218,13 +225,13 @@ class UnitStarter:
         return b"", []
 
     def call(self, function: str) -> ForkedCall:
-        """Call `module:name`, which takes no argument and returns JSON values, in a process of its own."""
+        """Call the function `module:name` in a process of its own; it takes no argument and returns JSON values."""
         return ForkedCall(self, function, self.send_call(function))
 
     def send_call(self, function: str) -> int:
-        """Ask for the call, and return the end of the pipe to which it answers.
+        """Request the call, and return the end of the pipe from which its result is read.
 
-        Without a fork server the pipe ends empty.
+        Without a fork server the pipe is closed without a result.
         """
         reads, writes = os.pipe2(os.O_CLOEXEC)
         try:
@@ -250,7 +257,7 @@ class UnitStarter:
             self._server.wait()
 
     def _why(self) -> str:
-        """Return why the server does not answer: how it was killed or stopped, else the last line that it wrote."""
+        """Return why the server does not answer: the signal that killed or stopped it, or its last line of stderr."""
         trouble = self.trouble(NOTICE_S)
         if trouble and self._server.returncode not in range(1, 256):
             return trouble
@@ -268,7 +275,7 @@ class UnitStarter:
 
 
 def is_stopped(pid: int) -> bool:
-    """Return whether a signal stopped the process; False for a process that is gone."""
+    """Return whether the process is stopped by a signal; False for a process that is gone."""
     try:
         stat = (machine.here.proc / f"{pid}/stat").read_text(encoding="ascii", errors="replace")
     except OSError:

@@ -1,16 +1,16 @@
-"""Chooses what runs next, drops what waits in vain, and hands jobs to units.
+"""Chooses which job runs next, drops frames that wait in vain, and hands jobs to units.
 
 Rule: only dirty units are looked at, in the order in which they were marked. `Choice` asks about the present state and
 changes nothing.
 
-A frame is dropped when the stage that it waits for is considered, and not before. The policy says which frames are
-dropped: those that must be late, or those that a newer frame has made stale.
+A frame is dropped only when a step looks at the stage that the frame waits for. The policy says which frames are
+dropped: frames that must be late, or frames that a newer frame has made stale.
 
 A frame must be late if even the earliest end of its last stage is past its deadline. While service times stay as they
 were lately, this bound is never later than the real end. Therefore no frame is given up that could be in time. At every
 stage older frames go first. A frame begins at a stage after the older frames' work there, or after its own work at the
-stages before, whichever ends later. A frame that has not reached the beginning of a bypass is assumed to do what the
-last frame there did.
+stages before, whichever ends later. A frame that has not reached the beginning of a bypass is assumed to take it if the
+last frame there took it.
 
 In a graph whose branches meet, a frame can become stale only until one of its branches has begun it (flow.py).
 """
@@ -44,7 +44,7 @@ def earliest_completion_ns(
     `stages`: all stages, with the estimates of service times.
     `frames`: frames in flight, by number.
     `todo`: bits of the stages that the frame has yet to do.
-    `bypass`: bypass that every frame takes that has not reached its beginning yet; None: no such frame takes one.
+    `bypass`: bypass that each frame before its beginning is assumed to take; None: no such frame takes a bypass.
     """
     older = [state.todo for number, state in frames.items() if number < frame]
     skipped, skips = 0, 0
@@ -66,7 +66,7 @@ def earliest_completion_ns(
 
 
 def _done_of_running(now_ns: int, stage: StageState) -> int:
-    """Return how much of the stage's running job is over in ns, by the estimate of its length."""
+    """Return how long the stage's running job has run in ns, at most the estimate of its length; 0 if none runs."""
     queue = stage.unit.queue
     if not queue or queue[0].stage != stage.name:
         return 0
@@ -74,10 +74,10 @@ def _done_of_running(now_ns: int, stage: StageState) -> int:
 
 
 class Choice:
-    """Answers questions about stages, source and frames of a core, as they are now."""
+    """Answers questions about the present state of a core's stages, source and frames."""
 
     def __init__(self, settings: Settings, policy: Policy, source: Source, flow: Flow) -> None:
-        """Keep what the choice depends on: the run's settings and policy, its source and its frames in flight."""
+        """Keep the run's settings and policy, its source and its frames in flight (`flow`)."""
         self._policy, self._source, self._flow = policy, source, flow
         self._stages, self._frames, self._bypass = flow.stages, flow.frames, flow.bypass
         self._stage_named, stages = flow.stage_named, flow.stages
@@ -98,7 +98,7 @@ class Choice:
         return sink is None or bool(sink.free) or (sink.rule.yields and self.can_claim(stage, sink))
 
     def can_claim(self, stage: StageState, sink: EdgeSlots) -> bool:
-        """Return whether the stage may write to one of its slots."""
+        """Return whether an output slot of the stage is free, or can be taken from a waiting frame."""
         if self._flow.is_chain:
             return sink.can_claim()
         return sink.can_claim(lambda frame: self._flow.must_stay(stage, frame))
@@ -120,8 +120,8 @@ class Choice:
     def latch_from_ns(self, now_ns: int) -> int:
         """Return when the first stage may begin its next frame; only for a run that latches.
 
-        The time is NEVER while one of its frames waits for the second stage. Otherwise it is so late that the first
-        stage is expected to end `latch_ns` before the second stage's unit is free.
+        The time is NEVER while the first stage works, or a frame waits for the second stage. Otherwise the first stage
+        is expected to end `latch_ns` before the second stage's unit is free.
         """
         first, second = self._stages[0], self._stages[1]
         edge = first.output
@@ -191,8 +191,8 @@ class _LateFrames:
     """Drops waiting frames of a run.
 
     `policy`: policy that says which frames are dropped.
-    `flow`, `source`: where frames wait.
-    `choice`: knows whether a frame must be late.
+    `flow`, `source`: frames in flight, and released frames that are not in flight yet.
+    `choice`: object that says whether a frame must be late.
     """
 
     def __init__(self, policy: Policy, flow: Flow, source: Source, choice: Choice) -> None:
@@ -216,7 +216,7 @@ class _LateFrames:
                 self._flow.drop_waiting(stage, slot, DropCause.LATE)
 
     def _drop_stale(self, stage: StageState) -> None:
-        """Drop the frames that could go to the stage, but the newest and those that another branch has begun."""
+        """Drop the frames that the stage could take, except the newest and frames that another branch has begun."""
         line, edge, flow = stage.waiting, stage.input, self._flow
         if flow.is_chain or edge is None:
             while len(line) > 1:
@@ -242,7 +242,7 @@ class _LateFrames:
                 self._source.drop_late_head()
 
     def _expect_less(self) -> None:
-        """Lower the estimates, as nothing is in the way of a frame, and they alone make it late."""
+        """Lower all estimates: no other frame is in the way, so only estimates that are too high make a frame late."""
         for stage in self._flow.stages:
             stage.lower_estimate()
 
@@ -258,8 +258,8 @@ class Assignment:
         `policy`: policy that says which frames are given up, and how far ahead jobs are handed out.
         `hang_ns`: longest time of a job in ns.
         `flow`, `source`: frames in flight and frames to come, which this class moves.
-        `choice`: what could run next.
-        `ledger`: ledger for the reasons why units have no job.
+        `choice`: object that says what could run next.
+        `ledger`: ledger that gets the reasons why units have no job.
         """
         self._hang_ns = hang_ns
         self._flow, self._source, self._choice, self._ledger = flow, source, choice, ledger
@@ -275,8 +275,8 @@ class Assignment:
     def assign(self, now_ns: int, released_ns: int, actions: list[Action]) -> None:
         """Hand jobs to the dirty units, as `Dispatch` in `actions`, until each is full or has nothing to run.
 
-        `released_ns`: time at which the first frame that this step released was due; now if it released none. If a unit
-        had no input before, it has waited for the scheduler since that time.
+        `released_ns`: time at which the first frame that this step released was due; `now_ns` if it released none. If
+        the first stage's unit was starved, the ledger counts its new job as assigned from this time on.
         """
         dirty, is_fed = self._flow.dirty, self._is_fed
         for unit in dirty:  # a dispatch may append to it, even a unit looked at before
@@ -296,14 +296,14 @@ class Assignment:
         dirty.clear()
 
     def _feed(self, now_ns: int) -> None:
-        """Put the released frames in flight, for several stages without inputs."""
+        """Put the released frames in flight, so that they wait in the lines of the stages without inputs."""
         while self._source.queue and not self._choice.is_full():
             if self._newest:
                 self._source.keep_newest()
             self._admit(now_ns)
 
     def _feed_stage(self, stage: StageState, now_ns: int) -> None:
-        """Let a source without a rate have a frame for a stage of several without inputs, which could begin one."""
+        """Put frames in flight until one waits for the stage, if the stage has no inputs and could begin a frame."""
         if stage.before or not (stage.output is None or self._choice.can_claim(stage, stage.output)):
             return
         while not stage.waiting and not self._source.is_empty and not self._choice.is_full():
@@ -328,16 +328,16 @@ class Assignment:
                 self._late.drop(stage, now_ns)
             if self._choice.can_begin(stage, now_ns):
                 runnable.append(stage)
-        if self._drops and not self._flow.is_chain:  # what was dropped for one stage may have waited for another
+        if self._drops and not self._flow.is_chain:  # a frame dropped for one stage may have waited for another stage
             runnable = [stage for stage in unit.stages if self._choice.can_begin(stage, now_ns)]
         if len(runnable) > 1:
             return self._choice.preferred(runnable, now_ns)
         return runnable[0] if runnable else None
 
     def _prepare(self, unit: UnitState, now_ns: int) -> None:
-        """Feed the unit's stages of a graph, and drop what waits for them in vain, before the policy chooses.
+        """Put frames in flight for the unit's stages, and drop frames that wait for them in vain.
 
-        A stage may drop what another of the unit could take.
+        This happens before the policy chooses, because one stage may drop a frame that another stage could take.
         """
         if self._is_fed:
             for stage in unit.stages:

@@ -1,36 +1,37 @@
 """The scheduler (which job runs where, and when), and the loop that every driver runs.
 
 Rule: the core is pure. It knows the time only from `step`, and does no I/O. One loop serves all clocks; drivers differ
-in their `Clock` alone.
+only in their `Clock`.
 
 Theory of operation. A driver calls `step` with the time and the events since the last step. The core answers with
 actions to do now and with the time at which it wants to be asked again. The same steps give the same answers, so a run
 can be replayed from its events alone. One step does five things, in this order:
-- Each event moves slots, frames and units.
-- When the alarm has gone off, units whose deadline or hold is over are killed, started again or let work.
+- Each event changes the state of slots, frames and units.
+- When the alarm has gone off, a unit whose deadline has passed is killed or started again. A unit whose pause for its
+  duty is over may work again.
 - The source releases the frames that are due.
 - Every dirty unit is handed jobs until its queue is full or nothing can run.
-- With no frame in flight and none to come, the run is finished.
+- If no frame is in flight and none is to come, the run is finished.
 
 Slots. Between two stages lies an edge with a fixed number of slots (transport/slots.py). A job holds its input slot and
 its output slot from dispatch until it is done. Therefore a stage can begin only when a frame waits before it and a slot
 is free behind it. Nothing else holds back the stages before a slow one.
 
-Bypass. A frame may skip the stages between two others, when the first of these says so. It keeps its slot, waits there
-for the second, and overtakes no frame (flow.py).
+Bypass. A frame may skip the stages between two stages of a chain, if the first of the two says so. The frame keeps its
+slot, waits in it for the second stage, and overtakes no other frame (flow.py).
 
-Dirty units. A step looks only at units for which something has changed. The unit's own job ended, a frame came to one
-of its stages, a slot got free behind one, or its life or duty changed. Whoever changes such a thing calls `mark_dirty`.
-A dispatch may make a unit dirty that this step has already looked at; the step then looks at it again.
+Dirty units. A step looks only at units for which something has changed: the unit's own job ended, a frame came to one
+of its stages, a slot became free behind one of its stages, or its life or duty changed. Code that makes such a change
+calls `mark_dirty`. A dispatch may make a unit dirty that this step has already looked at; the step then looks at it
+again.
 
-The alarm is a time before which no unit's deadline or hold can be over (`next_alarm_ns`). It is found by asking all
-units, and only when it has gone off or was reset. Events that put a deadline off leave the alarm as it is, so it may go
-off too early.
+The alarm is a time before which no unit's deadline passes and no unit's pause ends (`next_alarm_ns`). A new alarm is
+computed from all units only after the old one has gone off or was reset. An event that moves a deadline to a later time
+does not change the alarm, so the alarm may go off too early.
 
 Dispatch ahead and leading. A unit holds its next job while one runs, so that no message delay lies between them. A
-policy that wants the newest frame hands the next job over only `lead_ns` before the running one should end. Latching
-does the same for the first stage. This stage begins so late that its sample is still new when the second stage can take
-it.
+policy with a lead hands the next job over only `lead_ns` before the running job should end. Latching delays the first
+stage: it begins so late that its sample is still new when the second stage can take it.
 """
 
 from __future__ import annotations
@@ -92,7 +93,10 @@ from trilane.scheduler.state import (
 
 
 class Core:
-    """The state machine of one run. Raises ValueError for an unknown policy or edge."""
+    """The state machine of one run.
+
+    Raises ValueError for an unknown policy or edge, and for settings that do not fit the policy or the graph.
+    """
 
     def __init__(self, graph: Graph, settings: Settings, books: Books | None = None) -> None:
         self.graph, self.settings = graph, settings
@@ -138,9 +142,9 @@ class Core:
         }
 
     def step(self, now_ns: int, events: tuple[Event, ...] = ()) -> Decision:
-        """Take the events and the time, and return what to do; times never go back.
+        """Take the events and the time, and return what to do.
 
-        Events after the finish are ignored.
+        `now_ns` must not decrease from step to step. Events after the finish are ignored.
 
         Raises KeyError for an unknown unit or stage, and UnitLifeError for an event that cannot happen to a unit now.
         Raises ValueError for a frame that skips where no bypass begins.
@@ -175,7 +179,7 @@ class Core:
         return self.ledger.report(clock=clock, requested=asked, not_begun=asked - self.source.left)
 
     def _release(self, now_ns: int) -> int:
-        """Release the frames that are due, and return since when the first was due; now if none was."""
+        """Release the frames that are due. Return the time at which the first was due, or `now_ns` if none was."""
         due_ns = self.source.due_ns
         if not self.source.advance(now_ns):
             return now_ns
@@ -196,7 +200,7 @@ class Core:
         return next_ns
 
     def _reset_alarm(self) -> None:
-        """Let this step ask all units again, because a deadline or a hold was set."""
+        """Let this step compute the alarm from all units again, because a unit's deadline or pause was set."""
         self.alarm_ns = 0
 
     def _set_alarm(self, at_ns: int) -> None:
@@ -267,7 +271,7 @@ class Core:
                 each.estimate_ns = ladder.service_ns(each.position, ladder.rung)
 
     def _begin_next(self, unit: UnitState) -> None:
-        """Begin the unit's next job, if it holds one, as its last job is over."""
+        """Note that the unit's last job is over, so that its next job begins now if it holds one."""
         unit.head_since_ns = self.now_ns
         unit.deadline_ns = self.now_ns + self._hang_ns if unit.queue and unit.life == READY else NEVER
 
@@ -380,20 +384,20 @@ class Core:
 
 
 class Clock(Protocol):
-    """The world around the core: it knows the time, hears what happens and does what the core says."""
+    """A driver's side of the loop: it tells the time, returns events and carries out the core's actions."""
 
     def wait(self, deadline_ns: int) -> tuple[int, tuple[Event, ...]]:
-        """Wait until something happens or the deadline comes; return the time and what has happened.
+        """Wait until something happens or the deadline comes; return the time in ns and the events.
 
-        Times never go back. It may return without an event at any time.
+        The returned times must not decrease. The method may return without an event at any time.
 
-        `deadline_ns`: latest time of return; NEVER: without an event the core has nothing to do. The first call of a
-        run has NEVER. It must return the first events: a `UnitReady` for each unit that is up.
+        `deadline_ns`: latest time of return; NEVER: wait for an event. The first call of a run gets NEVER, and must
+        return a `UnitReady` for each unit that is up.
         """
         ...
 
     def perform(self, now_ns: int, actions: tuple[Action, ...]) -> None:
-        """Do what the core answered at `now_ns`: one action or more."""
+        """Carry out the actions, at least one, that the core returned at `now_ns`."""
         ...
 
 
@@ -401,7 +405,7 @@ class Recorder(Protocol):
     """Takes the steps of a run, such as `trilane.scheduler.recording.Recording`."""
 
     def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
-        """Add a step of `core` that has just been taken, and whose actions were performed."""
+        """Add the step that `core` has just taken, after its actions were performed."""
         ...
 
 

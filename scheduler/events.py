@@ -2,10 +2,10 @@
 
 Rule: events and actions are plain tuples of numbers and short strings. All times are integer nanoseconds of the
 driver's clock, counted from 0. NEVER stands for a time that does not come or is not set, in every file of the
-scheduler. A slot is -1 where a stage has no such edge.
+scheduler. The slot of an input or output that a stage does not have is -1.
 
-A reason says why a run ended, or why a frame was lost or dropped. It is a kind and where it happened, so nobody parses
-a string. `str()` of each is its key in the report and in messages.
+A reason says why a run ended, or why a frame was lost or dropped. It consists of a kind and a place, so that no code
+parses a string. `str()` of a reason is its key in the report and in messages.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class OutcomeKind(StrEnum):
 
 
 class Outcome(NamedTuple):
-    """How a run ended. `unit`: unit that could not be kept alive, for GAVE_UP alone."""
+    """How a run ended. `unit`: unit that was given up, only for GAVE_UP."""
 
     kind: OutcomeKind
     unit: str = ""
@@ -69,14 +69,14 @@ class Loss(NamedTuple):
 
 
 class DropCause(StrEnum):
-    """Why a waiting frame was taken out.
+    """Why a waiting frame was dropped.
 
     - STALE: a newer frame took its place.
     - LATE: it could not be in time.
-    - POOL: an edge had no other slot.
-    - QUEUE_FULL: it was turned away before the first stage.
+    - POOL: a newer frame needed its slot, because no slot of the edge was free.
+    - QUEUE_FULL: too many frames waited before the first stage when it was released.
     - TIMEOUT: it waited too long before the first stage.
-    - EVERY: no stage at an end of the graph takes it, by `StageSpec.every`.
+    - EVERY: by `StageSpec.every`, no stage without readers takes it.
     """
 
     STALE = "stale"
@@ -88,9 +88,9 @@ class DropCause(StrEnum):
 
 
 class Drop(NamedTuple):
-    """A reason to drop a frame.
+    """Why and where a frame was dropped.
 
-    `edge`: place of the drop, as `producer->consumer`; names of the last stages for EVERY.
+    `edge`: place of the drop, as `producer->consumer`; for EVERY, names of the stages without readers.
     """
 
     edge: str
@@ -112,8 +112,9 @@ class Job(NamedTuple):
 
     `slot_in`: index of the input slot; for several inputs, the result of `packed`. If a bypass ends at the stage, the
     slots of the bypassed edge are counted after those of the input edge.
-    `fresh`: whether the stage must ignore what earlier frames left behind; set for the stage at which the bypass
-    begins.
+    `epoch`: epoch of the output edge, or of the input edge without one; it grows when a unit at the edge dies.
+    `fresh`: whether the stage must not rely on what earlier frames brought to the end of the bypass. Only a job of the
+    stage at which the bypass begins can be fresh.
     `rung`: rung of the frame's work (policy.py).
     """
 
@@ -138,9 +139,9 @@ class JobDone(NamedTuple):
     """A unit has finished a job.
 
     `t_sampled_ns`: time at which the frame was sampled, from its header; 0 except from the first stage.
-    `preempted_ns`: part of the job in which the unit had no core.
-    `asleep_ns`: part of the job in which nothing of the unit worked.
-    `preempted_before_ns`: time in which the unit had no core between the job before and this one.
+    `preempted_ns`: time within the job in which the unit had no core.
+    `asleep_ns`: time within the job in which the unit slept and no device of its own worked.
+    `preempted_before_ns`: time between the unit's last job and this one in which the unit had no core.
     `skips`: whether the frame takes the bypass; False except from the stage at which the bypass begins.
     """
 
@@ -367,7 +368,7 @@ class Graph:
             self._check_bypass(names, self.bypass)
 
     def _check_inputs(self) -> None:
-        """Raise UnexpectedValue for inputs that cannot be."""
+        """Raise UnexpectedValue for inputs that are not earlier stages, repeat or are too many; for `every` below 1."""
         known: set[str] = set()
         for stage in self.stages:
             if stage.inputs is None:
@@ -406,7 +407,7 @@ class Graph:
         return tuple(names[names.index(self.bypass[0]) + 1 : names.index(self.bypass[1])])
 
     def inputs_of(self, index: int) -> tuple[Input, ...]:
-        """Return what stage `index` reads, in a chain too."""
+        """Return what stage `index` reads; in a chain, the stage before it."""
         given = self.stages[index].inputs
         if given is not None:
             return given
@@ -427,7 +428,7 @@ class Graph:
         return f"{name}->{','.join(readers)}"
 
     def written(self) -> dict[str, Any]:
-        """Return the graph as JSON values, which `recording.graph_of` reads; those of a chain leave out the inputs."""
+        """Return the graph as a JSON object, which `recording.graph_of` reads; a chain leaves out default values."""
         if self.is_chain and not self.from_release:
             stages = [{"name": stage.name, "unit": stage.unit} for stage in self.stages]
             return {"stages": stages, "edges": self.edges, "latency_to": self.latency_to, "bypass": self.bypass}
@@ -451,7 +452,7 @@ class Settings:
     `policy`: name of the scheduling policy.
     `period_ns`: time between releases of frames; 0: a frame is released as soon as it can be taken.
     `arrivals_ns`: release times from the start, instead of a period.
-    `asked`: whether `FrameRequest` alone releases frames.
+    `asked`: whether only `FrameRequest` releases frames.
     `latch_ns`: margin by which a frame's first stage is expected to end before the second can take it. The first stage
     begins that late so that its sample is newer and waits less.
     `deadline_ns`: longest time from a frame's release to its presentation.

@@ -1,29 +1,29 @@
 """Moves frames through the slots. Rule: each frame leaves here once, counted as presented, dropped or lost.
 
-It moves frames and slots on request, and notes which units each change concerns (`mark_dirty`).
+Each change marks the units that it concerns as dirty (`mark_dirty`).
 
-Several readers. What a stage writes waits in one slot for all who read it; nothing is copied. A stage with several
-inputs begins a frame when each of them has it. Frames keep their order on every edge, so the oldest of each line is
-then the same frame.
+Several readers. The output of a stage waits in one slot for all its readers; nothing is copied. A line is the queue of
+slots that wait for one reader. A stage with several inputs begins a frame when each of them has it. Frames keep their
+order on every edge, so the oldest frames of all these lines are then the same frame.
 
 Dropped everywhere. A frame that is dropped or lost leaves all lines, because a stage that joins branches would wait for
-it in vain. A job that has begun it goes on, and what the job writes is thrown away. A frame that one branch has begun
-is not dropped as stale on another. Otherwise two branches would choose different frames, and hardly any pair would
+it in vain. A job that has begun the frame goes on, but its output is thrown away. A frame that one branch has begun is
+not dropped as stale on another branch. Otherwise two branches would choose different frames, and hardly any pair would
 meet.
 
-Side work. Only inputs of the newest frame take the work of some stages, so no picture waits for it. A frame that such a
-stage leaves out is dropped there alone, and is not counted. A frame that is dropped after it was presented is not
-counted either.
+Side work. The output of some stages is read only by inputs of the newest frame, so no picture waits for it. If such a
+stage leaves out a frame, the frame is dropped only there, and is not counted. A frame that is dropped after it was
+presented is not counted either.
 
-A bypass is the way past some stages of a chain. A frame on it overtakes none. The frame's slot goes back to the edge on
-which the frame waited. The stage at which the bypass begins says of each frame whether it skips (`JobDone.skips`). The
-slot of such a frame waits in the second line of the edge behind that stage, for the stage at which the bypass ends.
-That stage takes frames from two sides. It takes the oldest frame. It takes a frame that skips only when no older frame
-is still on its way to the stage.
+A bypass leads frames past some stages of a chain. A frame on the bypass overtakes no other frame. The stage at which
+the bypass begins says for each frame whether it skips (`JobDone.skips`). The slot of a frame that skips waits in the
+second line of that stage's output edge, and goes back to that edge. The stage at which the bypass ends takes frames
+from this line and from its own input edge, the oldest first. It takes a frame that skips only when no older frame is
+still on its way to the stage.
 
 A frame that skips relies on what an earlier frame, which did not skip, left at the bypass's end. The earlier frame may
-be lost or dropped before it gets there, or the unit at the end may be started again. In these cases the next job at the
-bypass's begin is `fresh`.
+be lost or dropped before it gets there, or the unit at the end may be started again. In these cases the next job of the
+stage at which the bypass begins is `fresh`.
 """
 
 from __future__ import annotations
@@ -39,8 +39,9 @@ SKIPPING = 1  # line of the frames that skip, on the edge at which a bypass begi
 
 
 class Bypass:
-    """The way past the stages between `begin` and `end`; a frame that takes it has its slot on `edge`, behind `begin`.
+    """The way past the stages between `begin` and `end`.
 
+    `edge`: output edge of `begin`; it has the slots of the frames on the bypass.
     `must_be_fresh`: whether the next job of `begin` must be fresh.
     `was_taken`: whether the last frame of `begin` took the bypass.
     """
@@ -102,8 +103,8 @@ def side_of(stage: StageState, slot_in: int) -> tuple[EdgeSlots | SourceLine, in
 def stale_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
     """Return the slot of the oldest frame that waits for the stage on the bypass, if it is stale; else -1.
 
-    The frame is stale if a newer waiting frame could go as soon. A frame that skips never makes a frame stale that did
-    not skip, because it may need that frame. The slot counts as `Job.slot_in` does.
+    The frame is stale if a newer waiting frame could go as soon. A skipping frame never makes a frame stale that does
+    not skip, because it may rely on that frame. The slot counts as `Job.slot_in` does.
     """
     own, bypassed = stage.input, stage.bypassed
     if own is None or bypassed is None or not bypassed.lines[SKIPPING]:
@@ -117,7 +118,7 @@ def stale_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
 
 
 def _parts(stage: StageState, frame: int, newer: int, frames: Mapping[int, FrameState]) -> bool:
-    """Return whether a frame between `frame` and `newer`, which wait to skip, is still on its way to the stage."""
+    """Return whether a frame between the skipping frames `frame` and `newer` is still on its way to the stage."""
     return any(frame < number < newer and state.position < stage.position for number, state in frames.items())
 
 
@@ -129,7 +130,8 @@ class Flow:
     `rung`: rung of the work of frames that are admitted from now on.
     `gone`: frames that were dropped or lost while jobs worked on them, until these jobs end.
     `aside`: number of frames in flight that are presented, so that only side work is left.
-    `source_lines`: where frames wait for each stage without inputs, if there are several such stages.
+    `source_lines`: pairs of a stage without inputs and the line of its waiting frames. It is empty if the only such
+    stage takes its frames from the source itself.
     """
 
     def __init__(self, graph: Graph, ledger: Ledger, drops: bool) -> None:
@@ -236,20 +238,20 @@ class Flow:
         return packed(slots)
 
     def must_stay(self, behind: StageState, frame: int) -> bool:
-        """Whether a frame behind a stage is not dropped for a newer one, because another branch has begun it.
+        """Return whether no newer frame may replace a frame behind a stage, because another branch has begun it.
 
-        If only side work waits for the frame there, the side work leaves it out, and the frame goes on elsewhere.
+        If only side work waits for the frame there, it may be replaced: the side work leaves it out.
         """
         state = self.frames[frame]
         return self._is_awaited(behind, state) and bool(state.begun & self.main & ~(behind.before | behind.bit))
 
     def _is_awaited(self, behind: StageState, state: FrameState) -> bool:
-        """Whether a reader of the stage waits for the frame, and a picture for the reader."""
+        """Return whether a reader of the stage that is no side work waits for the frame."""
         waiting = state.todo & ~state.begun & self.main
         return any(waiting & reader.bit for reader in behind.readers)
 
     def is_held(self, before: StageState, frame: int) -> bool:
-        """Whether a frame that waits for a stage is not dropped as stale, because another branch has begun it."""
+        """Return whether another branch has begun a frame that waits for a stage, so that the frame is never stale."""
         return bool(self.frames[frame].begun & self.main & ~before.before)
 
     def pass_on(self, stage: StageState, job: Job, end_ns: int) -> None:
@@ -280,7 +282,7 @@ class Flow:
                 self._leave(job.frame)
 
     def _commit_to_next(self, stage: StageState, sink: EdgeSlots, job: Job, state: FrameState, end_ns: int) -> None:
-        """Let the slot of a chain's frame wait for the next stage, or for the stage at which the bypass ends."""
+        """Let the job's output slot wait for the next stage of a chain, or for the stage at which the bypass ends."""
         state.position = place = stage.position + 1
         state.ready_ns[place] = end_ns
         bypass = self.bypass
@@ -294,7 +296,7 @@ class Flow:
             self.dirty.append(self.stages[place].unit)
 
     def _commit(self, stage: StageState, sink: EdgeSlots, slot: int, state: FrameState, end_ns: int) -> None:
-        """Let the slot wait for the readers of its frame."""
+        """Let the output slot wait for the readers that have yet to do its frame."""
         readers = [(line, reader) for line, reader in enumerate(stage.readers) if state.todo & reader.bit]
         if sink.newest:
             self._written[stage.position, slot] = state
@@ -308,7 +310,7 @@ class Flow:
             self.drop(replaced, stage, DropCause.STALE)
 
     def _present(self, frame: int, state: FrameState, end_ns: int) -> None:
-        """Note that a stage without readers has done the frame; the last of them presents it."""
+        """Note that a stage without readers has done the frame. The last such stage presents the frame."""
         if state.todo & self._ends:
             return
         state.is_presented = True
@@ -322,7 +324,7 @@ class Flow:
         self.mark_roots_dirty()
 
     def _leave(self, frame: int) -> None:
-        """Note that nothing is left to do for the frame."""
+        """Take a frame out of flight for which nothing is left to do; it counts as dropped if it was not presented."""
         state = self.frames.pop(frame)
         if state.is_presented:
             self.aside -= 1
@@ -332,7 +334,7 @@ class Flow:
         self.mark_roots_dirty()
 
     def mark_roots_dirty(self) -> None:
-        """Note that another frame may be put in flight."""
+        """Mark the units of the stages without inputs as dirty, because another frame may be put in flight."""
         self.dirty += self._root_units
 
     def _take_bypass(self, bypass: Bypass, job: Job) -> bool:
@@ -372,7 +374,7 @@ class Flow:
     def drop(self, frames: list[int], behind: StageState, cause: DropCause, before: StageState | None = None) -> None:
         """Drop frames that waited behind a stage, and count them.
 
-        `before`: stage that they waited for; None: all readers of what the stage `behind` writes.
+        `before`: stage for which the frames waited; None: all readers of the stage `behind`.
         """
         for frame in frames:
             self._count_drop(frame, behind, before, cause)
@@ -393,7 +395,7 @@ class Flow:
             self.drop([frame], stage.inlets[0].producer or stage, cause, stage)
 
     def _leave_out(self, stage: StageState, frame: int) -> None:
-        """Let a stage of side work, and those that read it, leave out a frame."""
+        """Let a stage of side work, and all stages that depend on it, leave out a frame."""
         state = self.frames.get(frame)
         if state is None or not state.todo & ~state.begun & stage.bit:
             return
@@ -407,7 +409,7 @@ class Flow:
         self._mark_all_dirty()
 
     def mark_lost(self, frame: int, loss: Loss) -> None:
-        """Count a frame in flight as lost, if it is not yet presented; its slots, if it has any, are not freed here."""
+        """Take a frame out of flight, and count it as lost if it was not presented; its slots are not freed here."""
         state = self.frames.pop(frame)
         if state.is_presented:
             self.aside -= 1
@@ -418,13 +420,13 @@ class Flow:
         self._tell_bypass(state)
 
     def reclaim(self, unit: UnitState, loss: Loss) -> None:
-        """Give the slots of a unit whose process is gone back to their edges, under a new epoch.
+        """Give back the slots of a unit whose process is gone, and begin a new epoch of its edges.
 
-        `fates` says which of its frames are lost; the others wait again.
+        `fates` says which of the unit's frames are lost; the others wait again.
         """
         judged = fates(unit.queue, {stage.name for stage in unit.stages if stage.input is None})
         unit.queue.clear()
-        for job, is_lost in (*judged[:1], *reversed(judged[1:])):  # the last first: each goes before those that wait
+        for job, is_lost in (*judged[:1], *reversed(judged[1:])):  # the last first: each frame goes to its line's head
             if is_lost or job.frame in self.gone:
                 self.free_slots(job)
                 if job.frame in self.frames:
@@ -518,7 +520,7 @@ class Flow:
         self._tell_bypass(state)
 
     def _forget(self, frame: int, state: FrameState) -> None:
-        """Take a frame that is gone out of all lines; in a chain it waits in one alone, and has left that."""
+        """Take a frame that is gone out of all lines; in a chain it has left its only line already."""
         if self.is_chain:
             return
         if state.jobs:
@@ -540,4 +542,4 @@ class Flow:
         if not gone.skips and gone.position <= bypass.end.position:
             bypass.must_be_fresh = True
         if gone.skips or bypass.edge.lines[SKIPPING]:
-            self.mark_dirty(bypass.end.unit)  # the frame waited there, or what waits there may have waited for it alone
+            self.mark_dirty(bypass.end.unit)  # the frame waited there, or a frame that waits there waited for it

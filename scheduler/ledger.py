@@ -1,15 +1,14 @@
-"""Accounts for the time of the units: each nanosecond is busy or idle for one stated cause, and these sum to the run.
+"""Accounts for the time of each unit: every nanosecond of the run is busy, or idle for one stated cause.
 
 - busy: a job runs.
 - starved: the unit has no input.
 - blocked: the unit has input, but no free output slot, or the limit of frames in flight is reached.
-- throttled: the cap holds the unit.
+- throttled: the unit has input and a free slot, but its duty does not let it work yet.
 - preempted: the unit has a job, but no core.
 - overhead: a job is assigned but does not run (messages, scheduling, sleep), or the unit is down.
 - join: the unit has some inputs of a frame, but not all; only in a graph where branches meet.
 
-On the virtual clock no unit is preempted here: units on one core are one unit to the scheduler, and
-trilane.hw_profiles.application divides its share.
+
 """
 
 from __future__ import annotations
@@ -50,8 +49,8 @@ class JobRecord(NamedTuple):
 
     `ready_ns`: time at which its input was there.
     `preempted_ns`, `asleep_ns`, `preempted_before_ns`: as in `JobDone`.
-    `cpu_ns`: CPU time of all its unit's threads in the job; 0 in journals older than this field; on the virtual clock
-    its service time.
+    `cpu_ns`: CPU time of all its unit's threads in the job; 0 in journals older than this field. On the virtual clock,
+    the service time without preemption.
     """
 
     stage: str
@@ -68,7 +67,7 @@ class JobRecord(NamedTuple):
 
 
 class _NewestBook:
-    """How old the frames were that inputs of the newest frame took from one stream."""
+    """Ages of the frames of one stream that inputs with `latest` took."""
 
     def __init__(self, sketch: Callable[[], Sketch] | None) -> None:
         self.age, self.behind = Samples(sketch), Counter[int]()
@@ -93,7 +92,7 @@ class _UnitBook:
         self.restarts = 0
 
     def add_job(self, begin_ns: int, end_ns: int, preempted_ns: int, asleep_ns: int, preempted_before_ns: int) -> None:
-        """Book a job, and the time before it in which the unit had it, did no other job and had no core."""
+        """Book a job. Time before it counts as preempted if the unit held it, did no other job and had no core."""
         self.jobs += 1
         last_end_ns = self.last_end_ns
         if preempted_before_ns and begin_ns > (held_from_ns := max(last_end_ns, self.since_ns)):
@@ -148,12 +147,14 @@ class _StageBook:
 class Ledger:
     """The accounts of a run, written by the core alone; times in ns of the run's clock.
 
-    `presented_count`, `skipped`: number of presented frames, and of those that took the bypass.
+    `presented_count`: number of presented frames.
+    `skipped`: number of presented frames that took the bypass.
     `rungs`: number of presented frames on each rung of work.
     `rung_switches`: how often a frame had another rung than the frame before.
-    `left`: list that gets every frame that leaves the run; None: none is kept.
-    `presented_frames`, `presented_ns`, `lateness_ns`: numbers, times and lateness of the presented frames in order;
-    filled only for a run that keeps all values.
+    `left`: list that gets every frame that leaves the run; None: these frames are not kept.
+    `presented_frames`, `presented_ns`: numbers and times of the presented frames, in order; filled only for a run that
+    keeps all values.
+    `lateness_ns`: lateness of the presented frames that have a deadline, in order; filled under the same condition.
     """
 
     def __init__(self, graph: Graph, books: Books | None = None) -> None:
@@ -243,7 +244,7 @@ class Ledger:
     def hold(self, is_held: bool) -> None:
         """Note whether somebody holds the run from now on.
 
-        A time between frames that contains a pause is no frame time.
+        A time between two presented frames is no frame time if the run was held in it.
         """
         self._is_held, self._was_held = is_held, True
 
@@ -259,6 +260,7 @@ class Ledger:
     ) -> None:
         """Book a presented frame.
 
+        `end_ns`: time of its presentation.
         `latency_ns`: its latency; below 0 if the frame does not go through the stage at which the latency ends.
         `deadline_ns`: time of its deadline; NEVER without one.
         `skipped`: whether it took the bypass.

@@ -1,18 +1,20 @@
 """The least period of a graph, from the times of its stages: the maximum ratio of a cycle (max-plus algebra).
 
-A job begins when other jobs have ended: those that it reads, the one before it on its stage, and those that free its
+A job waits for other jobs: the jobs whose output it reads, the stage's job before it, and the jobs that free its output
 slot. If the jobs of a cycle of such waits take w ns, and the cycle ends s frames later, no period below w / s is
 possible. The bound is the largest ratio of all cycles. The work of a unit for one frame counts as a cycle, and the
-period of the source as another. With constant times and one stage on each unit the bound is reached. Where stages share
-a unit, their order may cost more.
+period of the source as another. With constant times and one stage on each unit the bound is reached. If stages share a
+unit, their order may make the period longer.
 
 If frames can take a bypass, the bound ignores the slots. The period of a run may then be longer than the bound.
 
-With `every` a stage takes one frame of several, so each job of a whole hyperperiod counts by itself. Inputs of the
-newest frame hold back nobody. A rule that replaces waiting frames (triple, orphan) holds back nobody either.
+With `every` a stage takes one frame of several. The pattern of the jobs repeats after a hyperperiod, the least common
+multiple of these distances, and each job of a hyperperiod counts by itself. An input of the newest frame delays no
+writer. An edge whose rule replaces waiting frames (triple, orphan) delays none either.
 
-Rule: all is exact, in whole ns and fractions. Newton's method finds the ratio. Each step searches a positive cycle for
-the ratio so far (Bellman and Ford). The ratio of that cycle is the next one, until no such cycle is left.
+Rule: the arithmetic is exact, in whole ns and fractions. Newton's method finds the ratio. Each step searches a cycle
+with a larger ratio than the present one (Bellman and Ford), and takes over its ratio. The search ends when no such
+cycle is left.
 """
 
 from __future__ import annotations
@@ -26,7 +28,7 @@ from typing import Final, NamedTuple
 from trilane.scheduler.events import Graph
 from trilane.transport.slots import MAX_SLOTS, edge_rule
 
-#: Jobs of a hyperperiod from which on only units and the source count, because the search would take long.
+#: Most jobs of a hyperperiod for which cycles are searched. With more, only the units and the source bound the period.
 MOST_JOBS: Final = 4096
 LEAST_SLOTS: Final = 2
 NO_SHARES: Final[Mapping[str, Fraction]] = {}
@@ -49,9 +51,12 @@ class Bound:
 
 
 class _Arc(NamedTuple):
-    """A wait between two jobs of a hyperperiod, by their places. `stream`: stage whose slot is waited for; "" for none.
+    """A wait of the job `to` for the job `job`, both indices in `_Waits.stages`.
 
-    The job `to`, `tokens` hyperperiods later, begins `ns` after the job `job` or later.
+    The job `to` of the hyperperiod `tokens` later begins at least `ns` after the begin of `job`.
+
+    `stream`: stage for whose slot the job waits; "" for another wait.
+    `in_flight`: whether the job waits because of the limit of frames in flight.
     """
 
     job: int
@@ -63,7 +68,10 @@ class _Arc(NamedTuple):
 
 
 class _Waits:
-    """The waits of a graph between the jobs of one hyperperiod; all but those for slots stay the same."""
+    """The waits between the jobs of one hyperperiod of a graph.
+
+    Waits for slots are computed for given numbers of slots; the others are computed once.
+    """
 
     def __init__(self, graph: Graph, times_ns: Mapping[str, int], in_flight: int) -> None:
         self.graph, self.times_ns = graph, times_ns
@@ -71,7 +79,7 @@ class _Waits:
         self.periods = _periods(graph)
         self.hyperperiod = lcm(*self.periods.values())
         self.is_small = sum(self.hyperperiod // period for period in self.periods.values()) <= MOST_JOBS
-        self.stages: list[str] = []  # of each job
+        self.stages: list[str] = []  # the stage of each job
         self._place: dict[tuple[str, int], int] = {}
         self._fixed: list[_Arc] = []
         if self.is_small:
@@ -85,7 +93,7 @@ class _Waits:
             self._fixed = [*self._of_frames(), *(self._of_flight(in_flight) if in_flight else ())]
 
     def arcs(self, slots: Mapping[str, int]) -> list[_Arc]:
-        """Return all waits, in the order of what is waited for. `slots`: slots of each stream that holds back."""
+        """Return all waits, sorted by `_Arc.job`. `slots`: number of slots of each stream that can delay its writer."""
         found = [*self._fixed]
         for name, count in slots.items():
             for reader in self.frame_readers(name):
@@ -108,7 +116,7 @@ class _Waits:
                         yield self._arc(each.stage, frame, name, frame)
 
     def _of_flight(self, in_flight: int) -> Iterator[_Arc]:
-        """Yield the waits of the first stages for the frames in flight."""
+        """Yield the waits of stages without inputs that come from the limit of frames in flight."""
         read = self.graph.streams
         ends = [name for name in self.names if name not in read]
         roots = [
@@ -121,10 +129,12 @@ class _Waits:
     def _behind(
         self, reader: str, writer: str, count: int, step: int, stream: str = "", in_flight: bool = False
     ) -> Iterator[_Arc]:
-        """Yield the waits of `writer` for `reader`, which holds at most `count` places.
+        """Yield the waits of `writer` for one of `count` places (slots, or frames in flight) that `reader` frees.
 
-        The reader's frames f, f + q, ... take them all, if nobody has ended. So the frame of the writer that follows
-        the last of them waits for f. `step`: distance from that last frame to the next one.
+        If the reader takes every q-th frame, its frames f, f + q, ..., f + (count - 1) q fill all places. Therefore the
+        writer's next frame waits until the reader has ended f.
+
+        `step`: distance from the last of these frames to the next frame, in frames.
         """
         period, own = self.periods[reader], self.periods[writer]
         for frame in range(0, self.hyperperiod, period):
@@ -138,7 +148,7 @@ class _Waits:
 
 
 def _periods(graph: Graph) -> dict[str, int]:
-    """Return the distance between the frames that each stage takes."""
+    """Return the distance between the frames that each stage takes, in frames, by the stage's name."""
     found: dict[str, int] = {}
     for index, stage in enumerate(graph.stages):
         found[stage.name] = lcm(stage.every, *(found[one.stage] for one in graph.inputs_of(index) if not one.latest))
@@ -156,8 +166,8 @@ def period_bound(
 
     `times_ns`: time of a job of each stage.
     `in_flight`: limit of frames in flight; 0: none.
-    `source_ns`: period of the source; 0: it is always ready.
-    `shares`: for each stage that some frames skip, the share of the frames that it does.
+    `source_ns`: period of the source in ns; 0: the source is always ready.
+    `shares`: for each stage that some frames skip, the share of frames that do not skip it.
     """
     return _bound(_Waits(graph, times_ns, in_flight), _slots(graph), source_ns, shares)
 
@@ -185,7 +195,7 @@ def _bound(
 
 
 def _of_units(waits: _Waits, shares: Mapping[str, Fraction]) -> Iterator[Bound]:
-    """Yield the work of each unit for one frame."""
+    """Yield for each unit the bound that its work for one frame sets."""
     for unit in waits.graph.units:
         names = tuple(stage.name for stage in waits.graph.stages if stage.unit == unit)
         each = {name: shares.get(name, 1) * Fraction(waits.times_ns[name], waits.periods[name]) for name in names}
@@ -203,10 +213,10 @@ def _of_cycle(waits: _Waits, cycle: Sequence[_Arc], period_ns: Fraction) -> Boun
 
 
 def _positive_cycle(jobs: int, arcs: Sequence[_Arc], ratio: Fraction) -> list[_Arc]:
-    """Return a cycle that takes longer than `ratio` ns for each hyperperiod, or none.
+    """Return a cycle that takes longer than `ratio` ns for each hyperperiod, or an empty list.
 
-    `jobs`: number of jobs. `arcs`: waits, by the place of the job that is waited for, so that most of them are passed
-    in one round.
+    `jobs`: number of jobs.
+    `arcs`: waits, sorted by `_Arc.job`, so that one round of the search follows most of them.
     """
     weights = [(arc.job, arc.to, arc.ns * ratio.denominator - arc.tokens * ratio.numerator) for arc in arcs]
     begin, before = [0] * jobs, [-1] * jobs
@@ -222,7 +232,10 @@ def _positive_cycle(jobs: int, arcs: Sequence[_Arc], ratio: Fraction) -> list[_A
 
 
 def _circle(arcs: Sequence[_Arc], before: Sequence[int]) -> list[_Arc]:
-    """Return a cycle of the arcs by which jobs were last put off, or none. `before`: such an arc of each job, or -1."""
+    """Return a cycle among the arcs in `before`, or an empty list.
+
+    `before`: index of the arc that delayed each job last, or -1.
+    """
     seen = [-1] * len(before)
     for first in range(len(before)):
         job = first
@@ -241,12 +254,12 @@ def _circle(arcs: Sequence[_Arc], before: Sequence[int]) -> list[_Arc]:
 def fewest_slots(
     graph: Graph, times_ns: Mapping[str, int], given: Collection[str] = (), in_flight: int = 0
 ) -> list[int]:
-    """Return slots of each stream, in the order of `graph.edges`: two, or the fewest that do not lengthen the period.
+    """Return the number of slots of each stream, in the order of `graph.edges`: at least two, and no more than needed.
 
-    If any stream with more than two slots had one slot fewer, the period would be longer.
+    The slots do not make the period longer. If any stream with more than two slots had one fewer, it would be longer.
 
     `times_ns`, `in_flight`: as in `period_bound`.
-    `given`: streams whose rule stays as it is in `graph`.
+    `given`: names of the streams whose rule stays as it is in `graph`.
     """
     waits, held = _Waits(graph, times_ns, in_flight), _slots(graph)
     rules = {name: edge_rule(rule).slots for name, rule in zip(graph.streams, graph.edges, strict=True)}

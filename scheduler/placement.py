@@ -1,31 +1,32 @@
 """Places for units on cores: every way to place them, the predicted frame time of each, and the choice.
 
-Cores, places and needs of units are plain data. In the list of placements, one stands for all that differ only by an
-exchange of equal cores.
+Cores, places and needs of units are plain data. Placements that differ only by an exchange of equal cores count as one
+placement.
 
-Rule: measured times alone decide, by one formula; nothing is tried here. The formula is not exact. Where real frames
-can be had, they decide between the few placements that it cannot tell apart.
+Rule: measured times decide, by one formula; nothing is tried here. The formula is not exact. If real frames can be run,
+their measured times decide between the few placements that the formula cannot tell apart.
 
 A placement gives each unit cores and threads. Its frame time is predicted from each unit's `UnitWork`: the time that
 the unit needs for a frame, and the time that it takes on each core. Let T be the frame time. In a pipelined run these
-hold:
+conditions hold:
 
 - *A unit does one job at a time.* Its jobs of a frame take at most T.
-- *A core does one thing at a time.* The time that all units need on it is at most T. A unit with one thread and several
-  cores *floats*: the kernel runs it where there is room. For every set of cores, the work that cannot go elsewhere is
-  at most what these cores can do in T, less what the kernel misses. By Hall's condition the work can be divided exactly
-  if this holds for all sets.
-- *Each of a job's parallel regions waits for its slowest thread.* Let others have core c for the share o(c) of the
-  time. A job of several threads goes on only while all its cores are free. If the others come independently, this share
-  of the time is the product of 1 - o(c) over its cores. The job takes that much longer, and at most T too.
-- *Siblings* of one physical core together do `SIBLINGS` times the work that one does alone.
+- *A core does one thing at a time.* The time that all units need on a core is at most T. A unit with one thread and
+  several cores *floats*: the kernel runs it on any core that is free. For every set of cores, the work that cannot go
+  to other cores is at most what the set can do in T. From this the share is subtracted that the kernel fails to use. By
+  Hall's condition the work can be divided exactly if this holds for all sets.
+- *Each of a job's parallel regions waits for its slowest thread.* Let other units have core c for the share o(c) of the
+  time. A job of several threads goes on only while all its cores are free. If the other units come independently, this
+  share of the time is the product of 1 - o(c) over its cores. The job's time divided by this share is at most T.
+- *Siblings* are cores of one physical core. Together they do `SIBLINGS` times the work that one of them does alone.
 
-The least such T is the answer. A sequential run has one stage at work at any time: T is the sum, and nothing waits.
+The prediction is the least T that meets these conditions. In a sequential run one stage works at any time. Its T is the
+sum of all jobs' times.
 
 A floating unit that has one core to itself *stays* there, because the kernel moves a thread only when it has to wait.
 
 Every job of a unit on a shared core costs one more change of threads. A floating unit that does not stay is moved once
-a frame. The time that the scheduler takes on its cores counts like work that nothing waits for.
+a frame. The scheduler's time counts as work on its cores, but no job waits for it.
 """
 
 from __future__ import annotations
@@ -40,10 +41,10 @@ FULL: Final = 1000
 
 
 class CpuCore(NamedTuple):
-    """A core.
+    """A core of this machine, as the kernel counts cores.
 
-    `number`: number by which the system counts it.
-    `physical`: number of the physical core, the same for siblings.
+    `number`: number of the core.
+    `physical`: number of its physical core, the same for siblings.
     `permille`: speed in thousandths, 1000 for the fastest core.
     """
 
@@ -76,9 +77,9 @@ class Place(NamedTuple):
     threads: int
 
 
-#: The place of each unit.
+#: The place of each unit, by the unit's name.
 Placement = Mapping[str, Place]
-#: The work of each unit by number of threads; a unit can have no other number of threads.
+#: The work of each unit, by its name and its number of threads. A unit can have only the listed numbers of threads.
 Times = Mapping[str, Mapping[int, UnitWork]]
 
 
@@ -89,16 +90,14 @@ def shared_cores(placement: Placement) -> set[int]:
 
 
 def has_own_cores(unit: str, placement: Placement) -> bool:
-    """Return whether no other unit has one of its cores; only then may its threads spin between jobs."""
+    """Return whether the unit shares none of its cores; only then may its threads spin between jobs."""
     return not shared_cores(placement) & set(placement[unit].cores)
 
 
 def busiest_core_ns(placement: Placement, core_ns: Mapping[str, float]) -> float:
-    """Return the work of the busiest core for a frame in ns.
+    """Return the time in ns of a frame's work on the busiest core, if floating units are divided as evenly as possible.
 
-    No division of the work among the units' cores avoids it.
-
-    `core_ns`: time that each unit takes of each of its cores, or of all together where it floats.
+    `core_ns`: time in ns that each unit takes on each of its cores; for a floating unit, on all its cores together.
     """
     floating = [place.cores for place in placement.values() if place.threads < len(place.cores)]
     sets = {frozenset([core]) for place in placement.values() for core in place.cores}
@@ -114,22 +113,24 @@ def busiest_core_ns(placement: Placement, core_ns: Mapping[str, float]) -> float
 def share_ns(cores: tuple[int, ...], core_ns: float, floats: bool, these: frozenset[int]) -> float:
     """Return the part of a load that must be done on `these` cores, in ns.
 
-    The load takes `core_ns` of each of `cores`, or of all together if it floats.
+    The load takes `core_ns` on each of `cores`. If it floats, it takes `core_ns` on all of them together.
     """
     if floats:
         return core_ns if these.issuperset(cores) else 0.0
     return core_ns * len(these.intersection(cores))
 
 
-#: Most cores with which a unit may float; with more, there is a core for each unit.
+#: Most cores of a run in which units may float. A run with more cores has a core for each unit.
 MOST_FLOATING: Final = 4
 
 
 def placements(cores: Sequence[CpuCore], times: Times, fixed: Placement) -> Iterator[Placement]:
-    """Yield every way to place the units of `times`, one for all that differ only by an exchange of equal cores.
+    """Yield each placement of the units of `times`; those that differ only by an exchange of equal cores count as one.
 
-    Two cores are equal when they have the same speed and the same users, and equal siblings. Of equal cores the lowest
-    number is taken. A unit with one thread has one core, or floats between two of the same speed.
+    Cores are equal if they have the same speed, the same users and equal siblings. The core with the lowest number
+    stands for all equal cores. A unit with one thread has one core, or floats between two cores of the same speed.
+
+    `fixed`: places of units that stay where they are.
     """
     users: dict[int, frozenset[str]] = {core.number: frozenset() for core in cores}
     for unit, place in fixed.items():
@@ -149,7 +150,7 @@ def placements(cores: Sequence[CpuCore], times: Times, fixed: Placement) -> Iter
 
 
 def _forms(works: Mapping[int, UnitWork], most: int) -> Iterator[tuple[int, int]]:
-    """Yield the threads and cores that a unit may have."""
+    """Yield the numbers (threads, cores) that a unit may have. `most`: number of cores of the run."""
     for threads in works:
         if threads <= most:
             yield threads, threads
@@ -161,17 +162,21 @@ def _equally_fast(cores: Sequence[CpuCore], chosen: Sequence[int]) -> bool:
     return len({core.permille for core in cores if core.number in chosen}) == 1
 
 
-#: The units that have each core.
+#: The units that have each core, by the core's number.
 _Users = Mapping[int, frozenset[str]]
-#: A core's speed and users, and the same for all cores, grouped by physical core.
+#: A core's speed and users.
 _CoreSignature = tuple[int, tuple[str, ...]]
+#: The signatures of all cores, grouped by physical core.
 _Signature = tuple[tuple[_CoreSignature, ...], ...]
 
 
 def _choices(
     cores: Sequence[CpuCore], users: _Users, unit: str, count: int
 ) -> Iterator[tuple[dict[int, frozenset[str]], tuple[int, ...]]]:
-    """Yield the users after `unit` was given `count` cores, and those cores, once for each choice that differs."""
+    """Yield each choice of `count` cores for `unit` as (users of each core after the choice, chosen cores).
+
+    Choices that differ only by an exchange of equal cores count as one.
+    """
     states = [dict(users)]
     for _ in range(count):
         different: dict[_Signature, dict[int, frozenset[str]]] = {}
@@ -203,30 +208,31 @@ def _siblings(cores: Sequence[CpuCore], core: CpuCore, users: _Users) -> tuple[_
 
 
 def _signature(cores: Sequence[CpuCore], users: _Users) -> _Signature:
-    """Return what stays the same when equal cores are exchanged: the multiset of physical cores."""
+    """Return a value that an exchange of equal cores does not change: the sorted signatures of physical cores."""
     groups: dict[int, list[_CoreSignature]] = {}
     for core in cores:
         groups.setdefault(core.physical, []).append(_own_signature(core, users))
     return tuple(sorted(tuple(sorted(group)) for group in groups.values()))
 
 
-#: Assumed: work of two threads on the siblings of a physical core, over the work of one thread alone.
+#: Assumed: work of two threads on the siblings of a physical core, divided by the work of one thread alone.
 SIBLINGS: Final = 1.25
-#: Assumed: the cost of a change of threads, with the first-level cache, and of a move, with a second-level cache of 2
-#: MiB at 8 GB/s. A simulated fair scheduler moved floating units 0.5 to 1.2 times a frame
-#: (docs/decisions/placement.md).
+#: Assumed cost of a change of threads on a core, with the refill of the first-level cache.
 CHANGE_NS: Final = 30_000
+#: Assumed cost of a move to another core, with the refill of a second-level cache of 2 MiB at 8 GB/s. A simulated fair
+#: scheduler moved floating units 0.5 to 1.2 times a frame (docs/decisions/placement.md).
 MOVE_NS: Final = 250_000
-#: Assumed share of what several cores can do for floating units. The kernel moves a waiting thread to a core that has
-#: just become idle, but hardly ever a running one. So a core may idle while a unit that has no other core waits.
+#: Assumed share of the time of several cores that floating units can use. The kernel moves a waiting thread to a core
+#: that has just become idle, but hardly ever a running one. Therefore a core may idle while a unit waits for another
+#: core.
 ROOM_USED: Final = 0.9
 #: Time that the scheduler takes for a job, measured as CPU time of its process (docs/decisions/placement.md).
 SCHEDULER_NS: Final = 100_000
-LEAST_FREE: Final = 1e-9  # free share of a core below which it counts as none
+LEAST_FREE: Final = 1e-9  # least free share of a unit's cores, so that a full core is no division by 0
 
 
 class Rules(NamedTuple):
-    """The rules of the run that the frame time depends on.
+    """Properties of the run that change the frame time of a placement.
 
     `first`: unit on whose cores the scheduler runs.
     `sequential`: whether one stage works at a time.
@@ -237,17 +243,17 @@ class Rules(NamedTuple):
 
 
 def frame_ns(placement: Placement, cores: Sequence[CpuCore], times: Times, rules: Rules) -> int:
-    """Return the predicted time from a frame to the next, in ns."""
+    """Return the predicted frame time in ns."""
     model = _Model(placement, cores, times, rules)
     return model.sum_ns() if rules.sequential else model.pipelined_ns()
 
 
 class _Load(NamedTuple):
-    """What a unit, or the scheduler, needs of its cores for a frame.
+    """The work of a unit, or of the scheduler, for a frame on its cores.
 
     `serial_ns`: time that the unit needs for its jobs.
-    `core_ns`: time that it takes of each core, or of all together where it `floats`.
-    `work_ns`: the same time if siblings did not slow each other.
+    `core_ns`: time that it takes on each of its cores; if it `floats`, on all of them together.
+    `work_ns`: `core_ns` without the slowing of siblings by each other.
     """
 
     cores: tuple[int, ...]
@@ -257,17 +263,14 @@ class _Load(NamedTuple):
     floats: bool
 
     def on(self, core: int) -> float:
-        """Return what the unit needs of one core in ns; for a floating unit, an even part."""
+        """Return the time in ns that the load takes on `core`; a floating load is divided evenly."""
         if core not in self.cores:
             return 0.0
         return self.core_ns / len(self.cores) if self.floats else self.core_ns
 
 
 def _settled(placement: Placement) -> Placement:
-    """Return `placement` with each floating unit that has one core to itself on that core alone.
-
-    Such a unit leaves its other cores free.
-    """
+    """Return `placement`, but each floating unit that has one core to itself has only that core."""
     shared = shared_cores(placement)
     settled = dict(placement)
     for unit, place in placement.items():
@@ -298,9 +301,9 @@ class _Model:
         self._loads = [*self._units, _Load(where, 0.0, taken_ns, taken_ns, len(where) > 1)]
 
     def _load(self, place: Place, work: UnitWork, cost_ns: int) -> _Load:
-        """Return the unit's needs on its cores: the slowest core decides, and siblings that are both used are slower.
+        """Return the load of a unit. The slowest of its cores sets the speed, and two used siblings slow each other.
 
-        `cost_ns`: cost in ns of sharing the cores with others.
+        `cost_ns`: time in ns for changes of threads and moves.
         """
         floats = place.threads < len(place.cores)
         speed = min(self._speed[core] for core in place.cores)
@@ -317,10 +320,10 @@ class _Model:
         return round(sum(unit.serial_ns for unit in self._units) + self._scheduler_ns)
 
     def pipelined_ns(self) -> int:
-        """Return the least whole number of ns that is long enough, searched upwards from what every frame needs."""
+        """Return the frame time of a pipelined run: the least whole number of ns that meets all conditions."""
         high = low = int(max([*self._crowded(), *(unit.serial_ns for unit in self._units)]))
         gangs = [self._gang(unit) for unit in self._units if len(unit.cores) > 1 and not unit.floats]
-        # A time that fits stays one that fits when it grows, so it can be found by halving.
+        # If a time is long enough, every longer time is, so bisection finds the least.
         while not all(gang.fits(high) for gang in gangs):
             low, high = high, 2 * high + 1
         while high - low > 1:
@@ -329,7 +332,7 @@ class _Model:
         return high
 
     def _crowded(self) -> Iterator[float]:
-        """Yield, for each set of cores that can be too full, what it needs over what it can do."""
+        """Yield, for each set of cores that can limit the run, the least frame time in ns that its work allows."""
         floating = [load for load in self._loads if load.floats]
         sets = {frozenset([core]): 1.0 for core in self._speed}
         for one in self._physical_cores:
@@ -350,9 +353,9 @@ class _Model:
         return share_ns(load.cores, load.core_ns if len(these) == 1 else load.work_ns, load.floats, these)
 
     def _capacity(self, these: frozenset[int]) -> float:
-        """Return how many cores' worth of work the set does.
+        """Return the work that a set of cores does in a time, as a multiple of the work of one core.
 
-        Loads are in the time of these very cores, so each core counts 1.
+        The loads are already scaled to the cores' speeds, so each core counts 1.
         """
         counts = [sum(self._physical[core] == one for core in these) for one in self._physical_cores]
         return sum(SIBLINGS if count > 1 else count for count in counts)
@@ -368,10 +371,10 @@ class _Model:
 
 
 class _Gang(NamedTuple):
-    """A unit of several threads, each on a core.
+    """A unit of several threads, each on a core of its own.
 
     `serial_ns`, `core_ns`: times of its jobs, as in `_Load`.
-    `others_ns`: time of others on each of its cores, and on the core's siblings.
+    `others_ns`: for each of its cores, the time of other loads on this core, and on the core's siblings.
     """
 
     serial_ns: float
@@ -379,7 +382,7 @@ class _Gang(NamedTuple):
     others_ns: Sequence[tuple[float, float]]
 
     def fits(self, frame: int) -> bool:
-        """Return whether its jobs, stretched by their waits, end within `frame` ns."""
+        """Return whether the unit's jobs, lengthened by their waits for cores, end within `frame` ns."""
         # Beside a busy sibling, a core does SIBLINGS / 2 of its work.
         free = prod(
             max(1 - on / frame, 0.0) * (1 - (1 - SIBLINGS / 2) * min(beside / frame, 1.0))
@@ -388,13 +391,13 @@ class _Gang(NamedTuple):
         return self.serial_ns - self.core_ns + self.core_ns / max(free, LEAST_FREE) <= frame
 
 
-#: Relative difference from the shortest within which predictions are as good; the model's own error is not smaller.
+#: Relative difference from the shortest prediction that counts as none; the model's own error is not smaller.
 WORTH: Final = 0.03
-#: Relative difference from the shortest prediction up to which a placement may still be the best, and how many are
-#: tried.
+#: Relative difference from the shortest prediction up to which a placement may still be the best.
 UNCERTAIN: Final = 0.25
+#: Most placements that a trial runs.
 MOST_TRIED: Final = 5
-#: Relative difference within which measured frame times are the same.
+#: Relative difference within which measured frame times count as equal.
 SAME: Final = 0.01
 
 
@@ -406,13 +409,13 @@ class Ranked(NamedTuple):
 
 
 def ranked(cores: Sequence[CpuCore], times: Times, rules: Rules, fixed: Placement | None = None) -> list[Ranked]:
-    """Return all placements, the smallest frame time first.
+    """Return all placements, the shortest frame time first.
 
     Ties go to fewer shared cores, then less floating work, less time in all stages (latency), lower core numbers.
 
-    `fixed`: places that are given.
+    `fixed`: places of units that stay where they are.
 
-    Raises ValueError for no cores, or for a unit of which no number of threads fits.
+    Raises ValueError for no cores, or for a unit that has no number of threads that fits the cores.
     """
     found = [Ranked(each, frame_ns(each, cores, times, rules)) for each in placements(cores, times, fixed or {})]
     if not found:
@@ -421,11 +424,13 @@ def ranked(cores: Sequence[CpuCore], times: Times, rules: Rules, fixed: Placemen
 
 
 def chosen(found: Sequence[Ranked], rule: Ranked) -> Ranked:
-    """Return the placement of `found` to take; `found` is in the order of `ranked`.
+    """Return the placement of `found` to use.
 
-    The choice is never predicted longer than `rule`, the placement that suits any run. The rule stays unless another
-    placement is shorter by more than WORTH. In that case the choice is the one that shares the fewest cores among the
-    placements within WORTH of the shortest.
+    If no placement is shorter than `rule` by more than WORTH, `rule` is used. Otherwise the placement with the fewest
+    shared cores is used, among the placements within WORTH of the shortest.
+
+    `found`: placements in the order of `ranked`.
+    `rule`: placement that suits any run.
     """
     near = [each for each in found if each.frame_ns * (1 - WORTH) <= found[0].frame_ns]
     if rule.frame_ns * (1 - WORTH) <= found[0].frame_ns:
@@ -434,9 +439,11 @@ def chosen(found: Sequence[Ranked], rule: Ranked) -> Ranked:
 
 
 def worth_trying(found: Sequence[Ranked], rule: Ranked) -> list[Ranked]:
-    """Return the placements of `found` that may be the best; `found` is in the order of `ranked`.
+    """Return at most MOST_TRIED placements of `found` that may be the best, in the order of `found`.
 
-    The `chosen` one comes first, and the `rule` is always among them.
+    The placement that `chosen` returns comes first, and `rule` second if it is another one.
+
+    `found`, `rule`: as for `chosen`.
     """
     best, longest = chosen(found, rule), found[0].frame_ns * (1 + UNCERTAIN)
     first = [best] if best.placement == rule.placement else [best, rule]
@@ -447,8 +454,8 @@ def worth_trying(found: Sequence[Ranked], rule: Ranked) -> list[Ranked]:
 def typical(rounds: Sequence[Sequence[float]]) -> list[float]:
     """Return the typical frame time of each placement, in the unit of `rounds`.
 
-    `rounds`: frame times of all placements, for each round. They count relative to the median of their round, so that a
-    slow second of the machine slows all alike. The relative times are scaled by the median of these medians.
+    `rounds`: frame times of all placements, for each round. Each time is divided by the median of its round, because a
+    slow second of the machine slows all placements alike. The results are scaled by the median of these medians.
     """
     medians = [median(times) for times in rounds]
     relative = [[frame / middle for frame in times] for times, middle in zip(rounds, medians, strict=True)]
@@ -456,7 +463,7 @@ def typical(rounds: Sequence[Sequence[float]]) -> list[float]:
 
 
 def fastest(frame_ns: Sequence[float]) -> int:
-    """Return the index of the placement with the shortest measured frames; of those within `SAME` of it, the first."""
+    """Return the index of the first placement whose measured frame time is within `SAME` of the shortest."""
     return next(place for place, value in enumerate(frame_ns) if value <= min(frame_ns) * (1 + SAME))
 
 
@@ -468,6 +475,6 @@ def _tie(placement: Placement, times: Times) -> tuple[tuple[int, ...], tuple[tup
 
 
 def _sharing(placement: Placement) -> int:
-    """Count how often a unit has a shared core: each shared core counts for each unit that has it."""
+    """Return the number of pairs of a shared core and a unit that has it."""
     shared = shared_cores(placement)
     return sum(len(shared.intersection(place.cores)) for place in placement.values())

@@ -1,16 +1,16 @@
-"""What is decided of a frame before its first job: its run's policy, when it is released, and how much work it gets.
+"""Decisions about a frame before its first job: the run's policy, the frame's release, and how much work it gets.
 
-Rule: a policy is a row of the table; policies differ in their rows alone. Runs on this machine and runs in virtual time
+Rule: a policy is a row of the table; policies differ only in their rows. Runs on this machine and runs in virtual time
 take their settings from here, so that a policy means the same on both clocks. The source queues frames within limits:
-each frame leaves it once, or is counted.
+each frame is taken once, or counted as dropped.
 
-Less work is chosen so that a frame is in time. Rule: measured times decide; less work is chosen at once, more work only
+A frame that would be late gets less work. Rule: measured times decide; less work is chosen at once, more work only
 later. A ladder has rungs: rung 0 is all the work, and each further rung is less work at the price of a worse picture.
-Some stages take less time for less work (the network); the others are taken to need the same time.
+Some stages take less time for less work (the network); the other stages are assumed to need the same time.
 
-The time of a stage on a rung is the time that it took there alone, times its load. The time alone comes from
-`set_alone`, or else is proportional to the work. The load is the ratio of the stage's time to its time alone. The
-median over its last three jobs counts, so that one slow job decides nothing.
+The time of a stage on a rung is its isolated time there, times its load. The isolated time is measured (`set_alone`),
+or else proportional to the work. The load is the ratio of a job's time to the stage's isolated time. The median over
+the stage's last three jobs counts, so that one slow job decides nothing.
 
 The use of a rung is the larger of two shares:
 - the busiest unit's time for a frame, as a share of the period;
@@ -48,12 +48,12 @@ class Candidate(NamedTuple):
 
 
 def oldest_frame(candidates: Sequence[Candidate]) -> Candidate:
-    """Choose the frame that was begun first: along a chain this keeps the buffers drained and the latency low."""
+    """Choose the oldest frame; along a chain this keeps the edges empty and the latency low."""
     return min(candidates)
 
 
 def furthest_stage(candidates: Sequence[Candidate]) -> Candidate:
-    """Choose the stage nearest to the screen: newest-first would starve the later stages of a shared unit."""
+    """Choose the last of the stages; the newest frame first would starve the later stages of a shared unit."""
     return max(candidates, key=lambda c: c.position)
 
 
@@ -66,13 +66,13 @@ def earliest_deadline(candidates: Sequence[Candidate]) -> Candidate:
 class Policy:
     """One row of the table.
 
-    `choose`: function that says which of its runnable jobs a shared unit takes.
-    `in_flight`: limit of frames between admission and presentation; 0: no limit of its own.
-    `newest`: whether a stage takes the newest waiting frame, and the others are stale.
+    `choose`: function that says which of several runnable jobs a unit takes.
+    `in_flight`: limit of frames between admission and presentation; 0: the policy sets no limit.
+    `newest`: whether a stage takes the newest waiting frame; the other waiting frames are stale.
     `drop_late`: whether a frame that cannot make its deadline is dropped before its next stage.
     `lead_ns`: time before the expected end of a unit's job at which the unit gets its next job; 0: as soon as there is
     one.
-    `paced`: whether frames need a rate.
+    `paced`: whether the policy needs a rate: a period, arrivals or frame requests.
     """
 
     choose: Callable[[Sequence[Candidate]], Candidate]
@@ -117,13 +117,14 @@ def run_settings(policy: str, frames: int, scene_period_ns: int, forced_period_n
 
 
 class Source:
-    """The source of frames 0..n-1. A released frame waits in `queue` until it is taken, turned away, or out of time.
+    """The source of frames 0..n-1. A released frame waits in `queue` until it is taken or dropped.
 
     Without a rate (no period, no arrivals, no requests) a frame counts as released at the moment when it can be taken.
     While frames are held, `hold` alone releases them, a few at a time. After the hold the next frame is due at once,
     and the frames after it follow at their usual distances.
 
-    `drop`: function that is called with each frame that is dropped here, its release time and the cause.
+    `drop`: function that is called with each frame that is dropped here, its release time in ns and the cause.
+    `queue`: waiting frames as pairs (frame, release time in ns), the oldest first.
     `due_ns`: time at which the next frame is released or the oldest waiting frame runs out of time.
     `is_empty`: whether no frame can be taken now.
     """
@@ -210,7 +211,7 @@ class Source:
             self._set_due()
 
     def head(self, now_ns: int) -> tuple[int, int]:
-        """Return the next frame and its release time; only valid if `is_empty` is False."""
+        """Return the next frame's number and its release time in ns; only valid if `is_empty` is False."""
         return self.queue[0] if self.queue else (self._next, now_ns)
 
     def keep_newest(self) -> None:
@@ -220,12 +221,12 @@ class Source:
         self._set_due()
 
     def drop_late_head(self) -> None:
-        """Drop the frame that has waited longest, as it cannot be in time."""
+        """Drop the frame that has waited longest, because it cannot be in time."""
         self._drop(*self.queue.popleft(), DropCause.LATE)
         self._set_due()
 
     def take(self, now_ns: int) -> tuple[int, int]:
-        """Remove the head, and return it with its release time."""
+        """Remove the next frame, and return its number and its release time in ns."""
         head = self.head(now_ns)
         if self.queue:
             self.queue.popleft()
@@ -249,7 +250,7 @@ class Source:
             self.due_ns = min(self.due_ns, self.queue[0][1] + self._settings.queue_timeout_ns)
 
     def _release_ns(self, frame: int) -> int:
-        # Requests alone release frames.
+        # Only requests release frames.
         if self._settings.asked:
             return NEVER
         arrivals = self._settings.arrivals_ns
@@ -270,7 +271,7 @@ class WorkLadder:
     """The ladder of a run.
 
     `rung`: rung of the frames that begin from now on.
-    `patience`: number of frames until the next step up.
+    `patience`: number of frames in a row with room that the next step up needs.
     """
 
     def __init__(
@@ -301,7 +302,7 @@ class WorkLadder:
         self._since_up = MOST_PATIENCE
 
     def set_alone(self, position: int, rung: int, service_ns: int) -> None:
-        """Set the time that the stage at `position` takes on `rung` alone; to be called for all rungs or for none."""
+        """Set the isolated time of the stage at `position` on `rung`; to be called for all rungs or for none."""
         self._alone[position][rung] = max(service_ns, 1)
 
     def learn(self, position: int, rung: int, service_ns: int) -> None:
@@ -343,7 +344,7 @@ class WorkLadder:
 
 
 def _first_that_does(uses: Sequence[int]) -> int:
-    """Return the first rung whose use is at most `FULL`; without one, the first that is about as good as the best."""
+    """Return the first rung whose use is at most `FULL`; without one, the first within a twentieth of the least use."""
     for rung, use in enumerate(uses):
         if use <= FULL:
             return rung

@@ -1,6 +1,6 @@
-"""Records the steps of a run: events in, actions out.
+"""Records the steps of a run: its events and the core's actions.
 
-Rule: a replay gives the same actions, or says where it does not.
+Rule: a replay gives the same actions, or says which step gives others.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ CARRIED: dict[Any, Any] = {Dispatch: Job, Finish: Outcome}
 
 
 def _forms(kinds: tuple[Any, ...]) -> dict[str, tuple[Any, dict[str, Any]]]:
-    """Return each event or action by name, with its fields and their types in the order of its row."""
+    """Return (class, types of its fields by name, in the order of a row) of each event or action, by class name."""
     return {kind.__name__: (kind, get_type_hints(CARRIED.get(kind, kind))) for kind in kinds}
 
 
@@ -124,9 +124,9 @@ def read(path: Path) -> Recording:
 
 
 def replay(recording: Recording) -> Iterator[str]:
-    """Feed the events to a fresh core, and yield one sentence for every step that is answered differently.
+    """Feed the events to a new core, and yield one sentence for every step whose actions differ from the recorded ones.
 
-    Raises BadInputError for events of unknown units or frames, and for events that cannot happen to a unit then.
+    Raises BadInputError for events of unknown units or frames, and for events that the unit's state does not allow.
     """
     core = Core(recording.graph, recording.settings)
     for now_ns, events, actions in recording.steps:
@@ -141,7 +141,7 @@ def replay(recording: Recording) -> Iterator[str]:
 
 
 def row_of(item: Event | Action) -> list[Any]:
-    """Return an event or action as it is written: its name and its fields."""
+    """Return an event or action as a row: its name, then the values of its fields."""
     row: Any = item
     return [type(item).__name__, *(row[0] if type(item) in CARRIED else row)]
 
@@ -157,9 +157,9 @@ def actions_of(rows: Iterable[Sequence[Any]]) -> tuple[Action, ...]:
 
 
 def _listed(row: Mapping[str, Any], key: str, forms: dict[str, tuple[Any, dict[str, Any]]]) -> list[Any]:
-    """Return an object of a recording's line as a row.
+    """Return an event or action from its JSON object as a row (`row_of`).
 
-    Raises UnexpectedValue for other fields than those of its name.
+    Raises UnexpectedValue for an unknown name, and for missing or further fields.
     """
     name = row[key]
     _, types = _form(name, forms)
@@ -169,7 +169,7 @@ def _listed(row: Mapping[str, Any], key: str, forms: dict[str, tuple[Any, dict[s
 
 
 def _form(name: Any, forms: dict[str, tuple[Any, dict[str, Any]]]) -> tuple[Any, dict[str, Any]]:
-    """Return the form of `name`; raises UnexpectedValue for a name that none of `forms` has."""
+    """Return the row of `forms` for `name`; raises UnexpectedValue for an unknown name."""
     if not isinstance(name, str) or name not in forms:
         raise UnexpectedValue(repr(str(name)[:80]), f"one of {', '.join(forms)}")
     return forms[name]

@@ -1,7 +1,7 @@
 """Runs several pipelines in virtual time on the same hardware, each with a scheduler (`Core`) of its own.
 
 Rule: nothing here decides which job a pipeline does next; its `Core` decides that. This module decides whose job a unit
-takes when several pipelines have handed it one. It also decides how fast jobs go that run at the same time.
+takes when several pipelines have handed it one. It also decides the speed of jobs that run at the same time.
 
 Theory of operation. Each pipeline has its own `Core` with its own policy, ledger and recording, like two applications
 on one phone, and none knows of the others. Each unit of a pipeline has a *seat*: the hardware that does its jobs. On a
@@ -14,11 +14,11 @@ taken off its unit. Source of `deadline`: Liu and Layland, Journal of the ACM 20
 
 At one instant, all events and all deadlines of the schedulers come first; each is a step of one `Core`. Only then do
 jobs begin, so that no ready job is passed over because it was named later. Running jobs change their speed when others
-begin or end. The rest of a job is kept as a whole number of ns / `ONE`.
+begin or end. The work that is left of a job is kept as a whole number, in units of ns / `ONE`.
 
 Accounts. If a job waits while another pipeline has its seat, this time counts as preempted before the job
-(`JobDone.preempted_before_ns`). On a divided seat, the share of the others counts as preempted within the job
-(`preempted_ns`). A job that the memory slows down is busy all the while.
+(`JobDone.preempted_before_ns`). On a divided seat, the share of the other jobs counts as preempted within the job
+(`preempted_ns`). A job that waits for memory counts as busy.
 """
 
 from __future__ import annotations
@@ -55,14 +55,14 @@ class Waiting(NamedTuple):
 
 
 def _in_turn(waiting: Sequence[Waiting]) -> Waiting:
-    """Choose the next pipeline in turn: between two jobs of one pipeline, each other waiting pipeline gets one job."""
+    """Choose the job of the next pipeline in turn, so that each waiting pipeline gets one job after the other."""
     return min(waiting, key=lambda job: (job.behind, job.order))
 
 
 def _earliest_deadline(waiting: Sequence[Waiting]) -> Waiting:
     """Choose the job whose frame must be presented first; of equal deadlines, the next in turn.
 
-    Jobs without a deadline come last. When the pipelines ask for more than the unit can do, these may never have it.
+    Jobs without a deadline come last. If the pipelines need more than the unit can do, such jobs may never run.
     """
     return min(waiting, key=lambda job: (job.deadline_ns, job.behind, job.order))
 
@@ -106,7 +106,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Runs:
-    """A job that runs. `member`: number of its pipeline."""
+    """A job that runs. `member`: index of its pipeline."""
 
     member: int
     stage: str
@@ -115,8 +115,8 @@ class Runs:
     frame: int
 
 
-#: (a job that runs, the others that run) -> its speed beside them, above 0, in units of 1 / ONE. It ignores seat
-#: shares.
+#: (a job that runs, the other jobs that run) -> the job's speed beside them, above 0, in units of 1 / ONE. Shares of
+#: seats are not part of this speed.
 Speed = Callable[[Runs, Sequence[Runs]], int]
 
 
@@ -131,10 +131,10 @@ class _Waits(NamedTuple):
 class _Running:
     """A job that runs.
 
-    `left`: rest of its work, in ns * ONE.
-    `speed`: its speed now, of `ONE`.
-    `held`: its share of its seat now, of `ONE`.
-    `had`: share of its seat that it had so far, in ns * ONE.
+    `left`: work that is left, in units of ns / ONE.
+    `speed`: its present speed, in units of 1 / ONE.
+    `held`: its present share of its seat, in units of 1 / ONE.
+    `had`: sum of its shares of the seat over the time so far, in units of ns / ONE.
     `preempted_before_ns`: time for which its unit waited for the seat, from the hand-over or the end of the unit's last
     job.
     """
@@ -193,7 +193,7 @@ class BesideDriver:
 
         `turns`: name of a rule of `TURNS`, for every seat that is not among the `divided` ones.
         `divided`: names of the divided seats.
-        `speed`: speed of jobs beside each other; None: only shares of its seat slow a job.
+        `speed`: function that returns a job's speed beside other jobs; None: only its share of its seat slows a job.
         `keep`: whether to record the steps of each `Core`, and the jobs that end.
 
         Raises ValueError for an unknown policy, edge or rule of turns.
@@ -241,9 +241,9 @@ class BesideDriver:
                 running.had += passed_ns * running.held
 
     def _step_one(self) -> bool:
-        """Tell one `Core` of one thing that happens now: an event, a job's end or its deadline.
+        """Give one `Core` one thing that happens now: an event, a job's end, or the core's deadline.
 
-        Return False if there is none.
+        Return False if nothing more happens now.
         """
         now_ns = self._now_ns
         if self._heap and self._heap[0][0] <= now_ns:
@@ -276,9 +276,9 @@ class BesideDriver:
 
     @staticmethod
     def _check(line: _Line, action: Action) -> None:
-        """Raise RuntimeError for an action that only a unit that hangs calls for.
+        """Raise RuntimeError for an action before the finish that is no dispatch.
 
-        Here every job ends, however long it takes.
+        Only a unit that hangs causes such an action, and in virtual time every job ends.
         """
         if not line.core.finished:
             raise RuntimeError(f"{action} of pipeline {line.number}: its hang_ns is shorter than a job takes")
@@ -302,7 +302,7 @@ class BesideDriver:
         self._step(line, (done,))
 
     def _begin_jobs(self) -> None:
-        """Begin what can begin: on a divided seat the first job of each unit, on any other seat one job."""
+        """Begin all jobs that can begin: on a divided seat the first job of each unit, on any other seat one job."""
         waiting: dict[str, list[tuple[_Line, _Unit]]] = {}
         for line in self.lines:
             for unit in line.units.values():
@@ -359,10 +359,11 @@ class BesideDriver:
 
 
 def simulate_beside(members: Sequence[Member], *, keep: bool = False, **driver: Any) -> list[Simulation]:
-    """Run all `members` to their ends, and return what each gives, in their order.
+    """Run all `members` to their ends, and return a Simulation for each, in their order.
 
     Frames that still waited before the first stage at a `Stop` do not count as requested. The reports have one more
     key, `response_ms`: times from a frame's release to its presentation, for frames with a deadline.
+
     `keep`, `driver`: arguments of BesideDriver, which also lists the errors.
     """
     beside = BesideDriver(members, keep=keep, **driver)

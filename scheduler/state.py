@@ -1,7 +1,7 @@
-"""The core's memory of units, stages and frames. Rule: it holds fields and what follows from them; core.py decides.
+"""The state of units, stages and frames. Rule: this file holds the state and computes from it; core.py decides.
 
-A time that is not set is NEVER. Only a table changes the state of a unit. An event that the table refuses is a driver's
-defect.
+A time that is not set is NEVER. Only a table changes a unit's life. An event that the table refuses is a defect of the
+driver.
 
     down --back-off over--> starting --UnitReady--> ready --too slow--> stopping --UnitDied--> down
 
@@ -11,7 +11,7 @@ A unit has one deadline, and its state says what happens when the deadline passe
 - `ready`: the running job or the answer to a ping took too long, and the process is killed.
 - `stopping`: there is no deadline, because the process is about to end.
 
-`verdict` says what is to be done with a unit now, and `next_alarm_ns` says when the next verdict is due.
+`verdict` says what to do with a unit now, and `next_alarm_ns` says when the next verdict is due.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ REFUSED: Final = -2  # the event cannot happen
 
 
 class DeadlinePassed:
-    """The event that a unit's deadline has passed; the core finds it out itself, no driver sends it."""
+    """The event that a unit's deadline has passed. The core itself finds this out; no driver sends the event."""
 
 
 class UnitLifeError(Exception):
@@ -81,7 +81,7 @@ class UnitState:
     `queue`: the running job, then the one dispatched ahead.
     `queue_capacity`: number of jobs that it may hold now (`update_queue_capacity`).
     `head_since_ns`: time since which the running job could run.
-    `hold_until_ns`: end of the pause that its duty asks for.
+    `hold_until_ns`: end of the pause that its duty asks for; NEVER: no pause.
     `duty`: share of the time for which it may work, in thousandths.
     `failures`: number of its deaths since it last ended a job.
     `account`: account of the ledger that gets its time now.
@@ -156,10 +156,10 @@ class UnitState:
 
 
 class SourceLine:
-    """The frames that wait for a stage without inputs, in place of slots.
+    """The frames that wait for a stage without inputs, with the methods of `EdgeSlots`.
 
-    A run has such lines if several stages have no inputs, or one of them has `every`. A slot's number is the number of
-    its frame.
+    A run has such lines if several stages have no inputs, or the only one has `every`. A frame's number serves as its
+    slot.
     """
 
     def __init__(self) -> None:
@@ -173,7 +173,7 @@ class SourceLine:
         self.ready.remove(slot)
 
     def release(self, slot: int) -> None:
-        """Do nothing: no memory was held."""
+        """Do nothing, because the frame had no memory."""
 
     def pass_by(self, frame: int, _line: int) -> None:
         """Note that the stage no longer waits for `frame`."""
@@ -227,14 +227,14 @@ class StageState:
     `inlets`: inputs that take frame by frame; `input` is the first one's edge, and `waiting` its line.
     `others`: waiting lines of the other inputs.
     `slots_of`: inputs whose slots a job names, in the order of `Job.slot_in`.
-    `feeder`: unit that fills the input, if all jobs of the stage read one slot of the same edge; else None.
+    `feeder`: unit that fills the input, if every job of the stage reads one slot of the same edge; else None.
     `joins`: whether `Job.slot_in` is more than the slot of one input, and must be unpacked.
     `bypassed`: for the stage at which a bypass ends, the edge whose frames may skip to it.
     `readers`: stages that read its output frame by frame, in the order of the output's lines.
     `period`: distance between the frames that it does.
     `bit`: 1 shifted by its position.
     `after`: positions of the stages that it reads frame by frame.
-    `before`: bits of the stages that a frame must have done before it.
+    `before`: bits of the stages that must have done a frame before this stage can take it.
     `is_main`: whether the stage has no readers, or a stage without readers needs its work. Other stages do side work,
     which only inputs of the newest frame take.
     """
@@ -291,7 +291,8 @@ class StageState:
     def set_inlets(self, inlets: Sequence[Inlet], slots_of: Sequence[Inlet | NewestInlet]) -> None:
         """Set the inputs.
 
-        `slots_of`: inputs that have slots, those of the newest frame among them, in the order of the graph.
+        `inlets`: inputs that take frame by frame.
+        `slots_of`: inputs with slots, including inputs of the newest frame, in the order of the graph.
         """
         self.inlets, self.slots_of = tuple(inlets), tuple(slots_of)
         if inlets:
@@ -313,7 +314,8 @@ class FrameState:
     `skips`: whether it takes the bypass.
     `rung`: rung of its work.
     `number`: how many frames were put in flight before it.
-    `todo`, `begun`: bits of the stages that have not ended the frame yet, and of those that have begun it.
+    `todo`: bits of the stages that have not ended the frame yet.
+    `begun`: bits of the stages that have begun the frame; not kept in a chain.
     `jobs`: number of its jobs that units hold.
     `is_presented`: whether all stages without readers have done it; what is left is side work.
     """
@@ -357,7 +359,10 @@ class FrameState:
 
 
 def build(graph: Graph) -> tuple[list[StageState], dict[str, UnitState], list[EdgeSlots]]:
-    """Return the joined states of a graph's stages, units and edges; raises ValueError for an unknown edge."""
+    """Return the connected states of a graph: stages in its order, units by name, edges in the order of `graph.edges`.
+
+    Raises ValueError for an unknown edge.
+    """
     units = {name: UnitState(name) for name in graph.units}
     stages = [StageState(spec.name, units[spec.unit], position) for position, spec in enumerate(graph.stages)]
     named = {stage.name: stage for stage in stages}
@@ -416,7 +421,7 @@ BACK_OFF_NS = (0, 100_000_000, 400_000_000, 1_600_000_000)
 
 
 def verdict(unit: UnitState, now_ns: int, lead_ns: int) -> int:
-    """Return what is to be done with the unit now.
+    """Return the verdict on the unit now.
 
     `lead_ns`: lead of the policy; with a lead, the unit's next job may be due.
     """
@@ -430,7 +435,7 @@ def verdict(unit: UnitState, now_ns: int, lead_ns: int) -> int:
 def next_alarm_ns(units: Iterable[UnitState], now_ns: int, lead_ns: int) -> int:
     """Return when the first verdict other than NOTHING is due, or NEVER.
 
-    Until a deadline or a hold is set, no verdict can be due earlier: a job's end and a Pong only put deadlines off.
+    No verdict becomes due earlier until a deadline or a pause is set: a job's end and a Pong only put deadlines off.
     """
     alarm_ns = NEVER
     for unit in units:
@@ -443,24 +448,24 @@ def next_alarm_ns(units: Iterable[UnitState], now_ns: int, lead_ns: int) -> int:
 
 
 def fates(jobs: Iterable[Job], sources: Container[str]) -> list[tuple[Job, bool]]:
-    """Return the jobs of a unit whose process is gone, and whether the frame of each is lost with it.
+    """Return pairs of a job of a dead unit and whether the job's frame is lost, in the order of `jobs`.
 
-    The frame that the unit worked on is lost. The others wait for their stage again, except before a stage that takes
-    no slot of another one: nothing keeps their input.
+    The frame of the running job is lost. A frame before a stage without an input slot is lost too, because nothing
+    keeps its input. All other frames wait for their stage again.
 
     `jobs`: jobs of the unit, the running one first.
-    `sources`: names of the stages that take no slot.
+    `sources`: names of the stages without an input slot.
     """
     return [(job, place == 0 or job.stage in sources) for place, job in enumerate(jobs)]
 
 
 def back_off_ns(failures: int) -> int:
-    """Return how long a unit stays down after `failures` failures in a row, 1 or more."""
+    """Return how long in ns a unit stays down after `failures` failures in a row, at least 1."""
     return BACK_OFF_NS[min(failures, len(BACK_OFF_NS)) - 1]
 
 
 def extended_deadline_ns(unit: UnitState, ns: int) -> int:
-    """Return the unit's deadline, put off by the `ns` for which the scheduler did nothing; a restart is not put off."""
+    """Return the unit's deadline, later by the `ns` for which the scheduler did nothing; a restart is not delayed."""
     if unit.deadline_ns == NEVER or unit.life not in (STARTING, READY):
         return unit.deadline_ns
     return unit.deadline_ns + ns

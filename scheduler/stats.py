@@ -2,14 +2,14 @@
 
 Rule: while the values are few, percentiles are exact (linear between ranks, without bins). After that they come from a
 sketch; `is_exact` says which. A sketch is a structure of bounded size that gives percentiles within a stated error.
-This folder contains no sketch: the maker of `Samples` provides one for a run that may last for days. Without one, all
-values are kept.
+This folder contains no sketch: the caller of `Samples` provides one for a run that may last for days. Without a sketch,
+all values are kept.
 
 The interval of a mean frame time follows from the run's own frames. Successive frames are not independent, so the
-method is nonoverlapping batch means. The times are cut into batches of equal length, longer than what one frame carries
-over to the next. The means of the batches count as independent, and Student's t over them gives the interval. Once a
-sketch has the times, the interval is computed from the means of blocks. The blocks have equally many times, each about
-a thousandth of the run.
+method is nonoverlapping batch means. The times are cut into batches of equal length. A batch has more frames than one
+slow frame can delay. The means of the batches count as independent, and Student's t over them gives the interval. Once
+a sketch has the times, the interval is computed from the means of blocks. Each block has the same number of times,
+about a thousandth of the run.
 
 Sources: Schmeiser, "Batch Size Effects in the Analysis of Simulation Output", Operations Research 30 (1982), who finds
 little use in more than 10 to 30 batches; Law, Simulation Modeling and Analysis, chapter 9.
@@ -32,7 +32,7 @@ LARGEST_EXPONENT = 700.0  # e to this power is still a number
 
 
 def percentile(ordered: Sequence[int], share: float) -> float:
-    """Interpolate linearly between the two nearest ranks of the sorted `ordered`; return 0 if it is empty."""
+    """Return the percentile at `share` (0 to 1) of the sorted `ordered`, linear between ranks; 0 if it is empty."""
     if not ordered:
         return 0.0
     place = share * (len(ordered) - 1)
@@ -50,7 +50,11 @@ def summary_ms(values_ns: Iterable[int]) -> dict[str, float]:
 
 
 def _summary_row(count: int, total: int, largest: int, percentile_of: Callable[[float], float]) -> dict[str, float]:
-    """Return `summary_ms` of `count` values in ns. `percentile_of`: function that returns their percentiles in ns."""
+    """Return `summary_ms` of `count` values in ns.
+
+    `total`, `largest`: their sum and the largest of them, in ns.
+    `percentile_of`: function that returns their percentile at a share, in ns.
+    """
     if not count:
         return dict.fromkeys(("mean", "p50", "p90", "p95", "p99", "max", "samples"), 0)
     ranks = {f"p{rank}": percentile_of(rank / 100) for rank in (50, 90, 95, 99)}
@@ -84,9 +88,9 @@ def median_interval(values: Sequence[float], confidence: float = 0.95) -> tuple[
 
 
 def energy_score(frame_mj: float) -> float:
-    """Return (E - e) / E, e the millijoules of a frame, E = `LARGEST_ENERGY_MJ`: 1 for nothing, 0 for E and more.
+    """Return the energy score of a frame of `frame_mj` millijoules: 1 for 0 mJ, 0 for `LARGEST_ENERGY_MJ` and more.
 
-    Kwon et al., XRBench, MLSys 2023, section 3, with their E.
+    Kwon et al., XRBench, MLSys 2023, section 3, with their largest energy.
     """
     return max(0.0, 1 - frame_mj / LARGEST_ENERGY_MJ)
 
@@ -100,13 +104,13 @@ T_975 = {4: 2.776445, 5: 2.570582, 6: 2.446912, 7: 2.364624, 8: 2.306004, 9: 2.2
 
 
 def mean_interval(values: Sequence[float], mean: float | None = None) -> tuple[float, float] | None:
-    """Return the 95 % interval of the mean of an endless run like this one, in the unit of `values`.
+    """Return the 95 % interval (low, high) of the mean of an endless run like this one, in the unit of `values`.
 
-    None stands for too few values: fewer than `LEAST_BATCHES` batches of `LEAST_FRAMES`, or an interval that reaches 0.
+    Return None for too few values: fewer than `LEAST_BATCHES` batches of `LEAST_FRAMES`, or an interval that reaches 0.
 
-    `values`: values above 0 in the order of measurement. The first ones, which do not fill a batch, count for the mean
-    alone.
-    `mean`: mean of all values, where `values` are means of blocks.
+    `values`: values above 0 in the order of measurement. The first values, which do not fill a batch, count only for
+    the mean.
+    `mean`: mean of all single values, if `values` are means of blocks; None: the mean of `values`.
     """
     batches = min(len(values) // LEAST_FRAMES, MOST_BATCHES)
     if batches < LEAST_BATCHES:
@@ -119,7 +123,7 @@ def mean_interval(values: Sequence[float], mean: float | None = None) -> tuple[f
 def batch_interval(values: Sequence[float]) -> float | None:
     """Return half the width of the 95 % interval of a mean, from `values` over equal batches of at least LEAST_FRAMES.
 
-    None stands for fewer than LEAST_BATCHES batches. With more than MOST_BATCHES, neighbours are merged.
+    Return None for fewer than LEAST_BATCHES batches. If there are more than MOST_BATCHES, neighbours are merged.
     """
     batches = min(len(values), MOST_BATCHES)
     return _half_width(values, batches) if batches >= LEAST_BATCHES else None
@@ -143,19 +147,22 @@ def frame_interval_ms(interval_ns: tuple[float, float] | None) -> dict[str, floa
 
 
 def fps_interval(interval_ns: tuple[float, float] | None) -> dict[str, float | None]:
-    """Return `fps_low` and `fps_high`, the same interval in frames a second."""
+    """Return `fps_low` and `fps_high`, in frames a second; both are None without an interval.
+
+    `interval_ns`: interval of the mean frame time in ns.
+    """
     low, high = interval_ns or (None, None)
     return {"fps_low": high and NS_PER_S / high, "fps_high": low and NS_PER_S / low}
 
 
 # At 8 bytes a value, runs of some minutes stay exact, and runs of days stay small (docs/decisions/journal.md).
 MOST_EXACT: Final = 20_000
-#: Number of kept values that go to the sketch with each further value, so that no step of the scheduler takes long.
+#: Number of kept values that move to the sketch with each further value, so that no step of the scheduler takes long.
 MOVED_AT_ONCE: Final = 4
 
 
 class Sketch(Protocol):
-    """Percentiles of any number of values."""
+    """A structure of bounded size that gives percentiles of any number of values."""
 
     def add(self, value: int) -> None:
         """Add one value."""
@@ -169,8 +176,8 @@ class Sketch(Protocol):
 class Samples:
     """Values in ns. `count`, `total` and `largest` are exact.
 
-    `is_exact`: whether all values are in `kept`, in the order in which they came. Otherwise `kept` is on its way into
-    the sketch.
+    `is_exact`: whether all values are in `kept`, in the order in which they came. Otherwise the values move from `kept`
+    to the sketch, a few at a time.
     """
 
     def __init__(self, sketch: Callable[[], Sketch] | None = None) -> None:
@@ -256,8 +263,8 @@ class FrameTimeSamples:
     def row(self) -> dict[str, float | None]:
         """Return `frame_time_ms` of a report: summary, exponential average, jitter, interval of the mean.
 
-        The average over SPAN frames (weight 2 / (SPAN + 1)) counts from frame SPAN on, if there are that many. Jitter
-        is the mean absolute difference of successive times, None for fewer than two.
+        The exponential average (weight 2 / (SPAN + 1)) counts from frame SPAN on; in a shorter run, only its last value
+        counts. Jitter is the mean absolute difference of successive times, None for fewer than two.
         """
         count = self.samples.count
         return {
@@ -309,8 +316,9 @@ class Lateness:
 
     @property
     def real_time_score(self) -> float | None:
-        """The mean of 1 / (1 + e^(15 l)), l the lateness of a frame in ms: 1 in time, 0 late, None for no frame.
+        """The mean score of the frames, from 1 (long before the deadline) to 0 (late); None without a frame.
 
-        Kwon et al., XRBench, MLSys 2023, section 3.
+        The score of a frame is 1 / (1 + e^(15 l)), where l is its lateness in ms (Kwon et al., XRBench, MLSys 2023,
+        section 3).
         """
         return self._score / self.count if self.count else None

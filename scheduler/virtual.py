@@ -3,17 +3,18 @@
 Rule: the scheduler is the real `Core`; only the units and the cores are simulated. Equal inputs give equal runs.
 
 With cores of their own (`VirtualDriver`), the units are queues of jobs whose service times come from a function. A heap
-keyed (t_ns, priority, seq) decides ties.
+with the key (t_ns, priority, seq) orders the events.
 
 On shared cores (`SharedCores`), every job's needs are given: CPU time of its unit's threads, and time in which they
-need no core (a device works, or the unit sleeps). A unit with one thread is on one core at a time. When it wakes, it
-goes where it was; if others are there, it goes to an idle one of its cores. A core that becomes idle pulls a unit that
-shares another core. If a unit begins to share a core while another core is already idle, the idle core pulls it at the
-next tick (BALANCE_NS). The units on a core have equal shares of it. A unit of several threads is on all of its cores at
-once. It goes as fast as the slowest of them, because each parallel region waits for its slowest thread.
+need no core (a device works, or the unit sleeps). A unit with one thread is on one core at a time. It wakes on its last
+core. If another unit is there, it wakes on the core with the fewest units among its own. A core that becomes idle pulls
+a unit that shares another core. If a unit begins to share a core while another core is already idle, the idle core
+pulls it at the next tick (BALANCE_NS). The units on a core have equal shares of it. A unit of several threads is on all
+of its cores at once. It is as fast as on the fullest of them, because each parallel region waits for its slowest
+thread.
 
-Equal shares stand for the kernel's slices in turn. Moves and changes of threads cost nothing here, because the given
-CPU times of jobs include them.
+Equal shares stand for the kernel's time slices. Moves and changes of threads cost nothing here, because the given CPU
+times of jobs include them.
 """
 
 from __future__ import annotations
@@ -66,8 +67,9 @@ def none_skips(_frame: int, _fresh: bool) -> bool:
 class Simulation:
     """The result of a simulated run.
 
-    `report` has the keys of report.json. `shown_ns`: time in ns at which each frame was presented, by the frame's
-    number.
+    `report`: keys of report.json.
+    `recording`, `jobs`: recording and finished jobs; None and empty if they are not kept.
+    `shown_ns`: time in ns at which each frame was presented, by the frame's number.
     """
 
     report: dict[str, Any]
@@ -235,13 +237,13 @@ def simulate(
     return Simulation(report, virtual.recording, tuple(virtual.jobs), outcome, virtual.core.ledger.shown_ns)
 
 
-#: Assumed: time between two looks of the kernel at cores that are idle while others are shared, a tick of 250 Hz.
+#: Assumed: time after which the kernel looks again for idle cores while other cores are shared, a tick of 250 Hz.
 BALANCE_NS: Final = 4_000_000
 DONE_NS: Final = 1e-3  # what is left of a job that has ended, by the rounding of floating-point numbers
 
 
 class Need(NamedTuple):
-    """What a job needs, in ns.
+    """The needs of a job.
 
     `cpu_ns`: CPU time of each of its unit's threads.
     `other_ns`: time in which it needs no core.
@@ -260,8 +262,10 @@ Needs = Callable[[str, int], Need]
 class _Unit:
     """A unit, or the scheduler.
 
-    `queue`: jobs handed to it, or events that the scheduler hears of; the first is worked on.
+    `queue`: jobs handed to the unit, or groups of events that the scheduler hears of. The first element is in work.
     `on`: cores where its threads are while they compute.
+    `left`: rest of its computation, or of its time without a core, in ns at full speed.
+    `rate`: its present speed, 1 for full speed.
     """
 
     __slots__ = ("begin_ns", "cores", "gangs", "last", "left", "name", "need", "on", "queue", "rate")
@@ -279,9 +283,12 @@ class _Unit:
 class SharedCores:
     """The `trilane.scheduler.core.Core` of one run on simulated cores. Equal inputs give equal runs.
 
-    `places`: cores and threads of every unit. `needs`: needs of every job. `message_ns`: time from the end of a job
-    until the scheduler hears of it. `scheduler_ns`: CPU time that the scheduler then takes on the cores of the first
-    stage's unit; a job that it hands over begins at once when its unit is free.
+    A job that the scheduler hands over begins at once if its unit is free.
+
+    `places`: cores and threads of every unit.
+    `needs`: function that returns the needs of a job.
+    `message_ns`: time from the end of a job until the scheduler hears of it.
+    `scheduler_ns`: CPU time that the scheduler takes after that, on the cores of the first stage's unit.
     """
 
     def __init__(
@@ -305,9 +312,9 @@ class SharedCores:
         self.presented: list[tuple[int, int]] = []
 
     def run(self) -> list[tuple[int, int]]:
-        """Run to the end; return number and time in ns of each presented frame.
+        """Run to the end; return pairs of number and time in ns, one for each presented frame.
 
-        Raises RuntimeError when nothing can ever happen again.
+        Raises RuntimeError if nothing can ever happen again, or if the run ends before its last frame.
         """
         core, active, heard = self._core, self._active, self._heard
         self._step(0, tuple(UnitReady(unit) for unit in self._units))
@@ -335,7 +342,7 @@ class SharedCores:
         return self.presented
 
     def _hear(self, now_ns: int, events: tuple[Event, ...]) -> None:
-        """Let the scheduler take its time for `events`, behind those that it has heard of."""
+        """Let the scheduler spend its CPU time on `events`, after the events that it heard of earlier."""
         if not self._scheduler_ns:
             self._step(now_ns, events)
             return
@@ -345,7 +352,7 @@ class SharedCores:
             self._set_rates()
 
     def _step(self, now_ns: int, events: tuple[Event, ...]) -> None:
-        """Tell the scheduler, and carry out what it says."""
+        """Take a step of the core, and begin the jobs that it hands over."""
         actions, self._deadline_ns = self._core.step(now_ns, events)
         is_changed = False
         for action in actions:
@@ -359,7 +366,7 @@ class SharedCores:
             self._set_rates()
 
     def _begin(self, unit: _Unit, need: Need) -> None:
-        """Begin what is next in the unit's queue: it first computes."""
+        """Begin the first job of the unit's queue with its computation."""
         unit.need, unit.begin_ns = need, ceil(self._now_ns)
         unit.left = max(need.cpu_ns, 2 * DONE_NS)
         unit.on = unit.cores if unit.gangs else (self._woken_on(unit),)
@@ -378,14 +385,14 @@ class SharedCores:
         return unit.last
 
     def _go_on(self, unit: _Unit) -> None:
-        """Do what follows when a unit has computed, or has waited for its device."""
+        """Go on after a unit's computation, or after its time without a core."""
         assert unit.need is not None
         if unit.on:
             self._leave(unit)
             if unit.need.other_ns:
                 unit.left = unit.need.other_ns
                 return
-        # The core's time is in whole ns, and no end is told early.
+        # The scheduler's time is in whole ns; rounded up, no end is reported early.
         ended, now_ns, skips = unit.queue.popleft(), ceil(self._now_ns), unit.need.skips
         self._active.remove(unit)
         unit.need = None
@@ -397,7 +404,7 @@ class SharedCores:
             self._end(unit, ended, now_ns, skips)
 
     def _end(self, unit: _Unit, job: Job, now_ns: int, skips: bool) -> None:
-        """Send word that a job has ended, and begin the unit's next one."""
+        """Send the end of a job to the scheduler, and begin the unit's next job."""
         done = JobDone(unit.name, job.id, unit.begin_ns, now_ns, unit.begin_ns, skips=skips)
         self._heard.append((now_ns + self._message_ns, (done,)))
         if job.stage == self._last_stage:
@@ -406,7 +413,7 @@ class SharedCores:
             self._begin(unit, self._needs(unit.queue[0].stage, unit.queue[0].frame))
 
     def _leave(self, unit: _Unit) -> None:
-        """Take the unit off its cores; each that is idle now pulls a unit that shares another core."""
+        """Take the unit off its cores; each core that becomes idle pulls a unit that shares another core."""
         for core in unit.on:
             self._queues[core].remove(unit)
         left, unit.on = unit.on, ()
@@ -415,7 +422,7 @@ class SharedCores:
                 self._pull(core)
 
     def _balance(self) -> None:
-        """Let every idle core pull a unit, at a tick."""
+        """Do the work of a tick: let every idle core pull a unit that shares another core."""
         self._balance_ns = inf
         for core, queue in self._queues.items():
             if not queue:

@@ -1,11 +1,11 @@
-"""What other tools measured, in one form, and the checks that every number of theirs passes.
+"""Measurements of other tools in one form, and the checks of every number in them.
 
     found = Found("QNN profile", "times of each run ...")
     found.sample("line 16: RPC (execute) time", "RPC (execute) time", "run", 7784, "us")
     found.measurements, found.refused
 
-Rule: a reader hands each number to `Found`, which converts it to ms and refuses what no tool can have measured. A
-refused number names its row and a reason; the rows beside it stay. Nothing is guessed and nothing is repaired.
+Rule: a reader hands each number to `Found`, which converts it to ms and refuses a number that no tool can have
+measured. A refusal names the row and a reason; other rows stay. Nothing is guessed and nothing is repaired.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ import numpy as np
 
 from trilane.errors import BadInputError
 
-#: run: one job of a whole network. layer: a part of one. wall: from outside, with whatever else happened meanwhile.
+#: run: one job of a whole network. layer: a part of such a job. wall: a time from outside, with all waiting.
 Kind = Literal["run", "layer", "wall"]
-#: How many of a unit are a millisecond. Division rounds once, so 99091 us are 99.091 ms.
+#: Number of each unit of time in a millisecond. A division rounds only once, so 99091 us are 99.091 ms.
 PER_MS: Final = {"s": 1e-3, "ms": 1.0, "us": 1e3, "ns": 1e6}
 CYCLES: Final = "cycles"
-MOST_SAMPLES: Final = 1_000_000  # of a file
+MOST_SAMPLES: Final = 1_000_000  # in one file
 MOST_NAMES: Final = 50_000
-MOST_REFUSED: Final = 1000  # that are listed; the others are counted
+MOST_REFUSED: Final = 1000  # refused rows that are listed; further ones are only counted
 UNNAMED: Final = "unnamed"
 LONGEST_NAME: Final = 300
 LONGEST_MS: Final = 3.6e6
-WARM_UP: Final = 1.5  # first run over the median of the others from which on it looks like a warm-up
-#: Why a time with a queue in it is no service time.
+WARM_UP: Final = 1.5  # a first run longer than this times the median of the other runs looks like a warm-up
+#: Remedy for a time that contains queueing.
 QUEUEING: Final = "a wall time that contains queueing is no service time"
 
 
 class Refused(NamedTuple):
-    """A row that was not taken. `row`: its place and name."""
+    """A row that was refused. `row`: its place in the file and its name."""
 
     row: str
     reason: str
@@ -48,10 +48,16 @@ class Refused(NamedTuple):
 class Measurement:
     """One measured time.
 
-    `name`: as the tool has it. `unit`: unit of the source: s, ms, us, ns or cycles.
-    `samples_ms`: single times, empty where the tool states figures of them alone. `count`: how many were measured;
-    None where that is not said. `what`: what it contains, in words. `share`: part of all layers, where that is known.
-    `hardware`: unit that did it, as the tool names it. `service`: whether it can be a stage's time.
+    `name`: name that the tool gives it.
+    `unit`: unit of time in the source: s, ms, us, ns or cycles.
+    `what`: contents of the time, in words.
+    `samples_ms`: single times; empty if the tool states only figures such as a mean.
+    `count`: number of measured times; None if the tool does not state it.
+    `mean_ms`, ..., `max_ms`: figures of the times; None if the tool does not state them.
+    `share`: share of the layer in all layers, if it is known.
+    `hardware`: hardware that did the work, as the tool names it.
+    `service`: whether the time can be the service time of a stage.
+    `hint`: warning about the measurement, or empty.
     `more`: other figures of the source, by name.
     """
 
@@ -81,15 +87,18 @@ class Measurement:
 
 
 def is_finite(value: object) -> TypeGuard[int | float]:
-    """Say whether a value of a JSON document is a finite number; true and false are none."""
+    """Return whether a value of a JSON document is a finite number; true and false are no numbers."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 class Found:
-    """Collects what a reader finds in one file.
+    """Collects the measurements that a reader finds in one file.
 
-    `tool`: name of the format. `says`: what its times are, in a sentence.
-    `refused`: implausible rows. `skipped`: how many rows are of another kind, by reason.
+    `tool`: name of the format.
+    `says`: description of its times, part of a sentence.
+    `refused`: refused rows, at most MOST_REFUSED.
+    `refused_count`: number of all refused rows.
+    `skipped`: number of rows that are no times of a run, by reason.
     """
 
     def __init__(self, tool: str, says: str) -> None:
@@ -103,7 +112,7 @@ class Found:
         self._left = MOST_SAMPLES
 
     def refuse(self, row: str, reason: str) -> None:
-        """Note a row that is not plausible."""
+        """Note a row whose number is not plausible. `row`: its place and name."""
         self.refused_count += 1
         if len(self.refused) < MOST_REFUSED:
             self.refused.append(Refused(row[:LONGEST_NAME], reason))
@@ -113,7 +122,11 @@ class Found:
         self.skipped[reason] += 1
 
     def number(self, row: str, value: object, what: str = "the time") -> float | None:
-        """Return a finite number that is not negative; otherwise refuse the row and return None."""
+        """Return `value` if it is a finite number that is not negative; otherwise refuse the row and return None.
+
+        `row`: place and name of the row, for messages.
+        `what`: name of the number in messages.
+        """
         if not isinstance(value, int | float) or isinstance(value, bool):
             text = "nothing" if value is None else repr(value)[:40]
             self.refuse(row, f"{what} is {text}: a number was expected")
@@ -128,7 +141,13 @@ class Found:
         return number
 
     def ms(self, row: str, value: object, unit: str, kind: Kind, what: str = "the time") -> float | None:
-        """Return a time in ms; otherwise refuse the row and return None. A run takes time; a layer may take none."""
+        """Return `value` in ms; if it is no plausible time, refuse the row and return None.
+
+        A time of 0 is plausible only for a layer.
+
+        `row`, `what`: as for `number`.
+        `unit`: unit of `value`, a key of PER_MS.
+        """
         number = self.number(row, value, what)
         if number is None:
             return None
@@ -144,9 +163,10 @@ class Found:
     def sample(
         self, row: str, name: str, kind: Kind, value: object, unit: str, what: str = "", **facts: Any
     ) -> float | None:
-        """Take one time of `name`; return it in ms, or None where it is refused.
+        """Take one time of the measurement `name`; return it in ms, or None if it is refused.
 
-        `facts`: further fields of the measurement, those of its first sample.
+        `row`, `unit`: as for `ms`.
+        `what`, `facts`: fields of the measurement; those of its first sample count.
         """
         time = self.ms(row, value, unit, kind)
         if time is None:
@@ -165,19 +185,19 @@ class Found:
         return time
 
     def add(self, measurement: Measurement) -> None:
-        """Take a measurement for which the tool states figures, but no single times."""
+        """Take a measurement of a tool that states figures, but no single times."""
         if len(self._made) >= MOST_NAMES:
             raise BadInputError("the file", f"over {MOST_NAMES} names", "fewer")
         self._made.append(replace(measurement, name=measurement.name[:LONGEST_NAME] or UNNAMED))
 
     def take_back(self, names: set[str], row: str, reason: str) -> None:
-        """Refuse measurements that were taken before, by name."""
+        """Remove measurements that `add` has taken, by name, and refuse `row` for the reason."""
         self._made = [each for each in self._made if each.name not in names]
         self.refuse(row, reason)
 
     @property
     def measurements(self) -> list[Measurement]:
-        """All measurements, those with samples first, names as in the file. Layers of one file get their shares."""
+        """All measurements, those with samples first, in the order of the file."""
         sampled = [
             _of_samples(name, kind, values, self._facts[name, kind]) for (name, kind), values in self._samples.items()
         ]
@@ -207,7 +227,7 @@ def _of_samples(name: str, kind: Kind, samples: list[float], facts: dict[str, An
 
 
 def _told_apart(made: list[Measurement]) -> list[Measurement]:
-    """Number the measurements that share a name: `net.tflite`, `net.tflite #2`."""
+    """Return the measurements with different names: `net.tflite`, `net.tflite #2`."""
     seen: Counter[str] = Counter()
     result = []
     for each in made:
@@ -218,7 +238,7 @@ def _told_apart(made: list[Measurement]) -> list[Measurement]:
 
 
 class Figures(NamedTuple):
-    """Figures of a distribution in ms, as a tool states them; None where it states none."""
+    """Figures of a distribution in ms, as a tool states them; None for a figure that it does not state."""
 
     mean: float | None = None
     sd: float | None = None
@@ -233,7 +253,10 @@ ROUNDING: Final = 2e-5
 
 
 def contradiction(figures: Figures) -> str:
-    """Say which figures contradict each other; "" if none do. Mean and percentiles lie between least and largest."""
+    """Return a sentence about two figures that contradict each other; "" if none do.
+
+    Mean and percentiles lie between the least and the largest time, and percentiles rise.
+    """
     named = [
         ("the least", figures.low),
         ("the median", figures.p50),
@@ -255,10 +278,10 @@ def contradiction(figures: Figures) -> str:
 
 
 def falling(values: Sequence[float], slack: float = 0.0) -> list[int]:
-    """Return the places of the longest series in `values` that never rises by more than the share `slack`.
+    """Return the indices of the longest series in `values` that never rises by more than the share `slack`.
 
-    The values outside it do not fit most of the others. Of several longest series, the one with the larger values
-    counts, because a tool leaves a part out of a time more easily than it adds one.
+    Values outside the series do not fit most other values. Of several longest series, the one with the larger sum is
+    returned: a wrong time lacks a part more often than it has one too many.
     """
 
     def weight(series: list[int]) -> tuple[int, float]:

@@ -1,10 +1,10 @@
-"""Reads the measurements of other tools: finds out by its content what a file is, and has it read.
+"""Reads the measurements of other tools: finds the format of a file by its content, and calls the reader of the format.
 
     read = read_measurements(Path("profile.csv"))
     read.tool, read.measurements, read.refused
     chosen(read, "RPC (execute) time", "street.toml: stages.seg.time_ms")
 
-The file may be a stranger's: sizes are checked before anything is made, and a defect becomes one BadInputError.
+The file may come from a stranger: sizes are checked before memory is allocated, and a defect becomes one BadInputError.
 """
 
 from __future__ import annotations
@@ -33,10 +33,13 @@ OWN_COLUMNS: Final = ("name", "kind", "unit", "sample", "ms")
 
 @dataclass(frozen=True)
 class Measurements:
-    """What a file says.
+    """The measurements of a file.
 
-    `tool`: its format. `says`: what its times are. `refused`: the first implausible rows. `refused_count`: number of
-    all of them. `skipped`: how many rows are no times of runs, by reason.
+    `tool`: name of its format.
+    `says`: description of its times, part of a sentence.
+    `refused`: refused rows, at most MOST_REFUSED.
+    `refused_count`: number of all refused rows.
+    `skipped`: number of rows that are no times of a run, by reason.
     """
 
     path: Path
@@ -77,7 +80,7 @@ def _found(path: Path) -> Found:
 
 
 def _about(path: Path, error: BadInputError) -> BadInputError:
-    """Return the error with the file's name, which a reader does not know."""
+    """Return the error with the file's name, because a reader knows only the text."""
     if str(path) in error.where:
         return error
     return BadInputError(path, f"{error.found} in {error.where}", error.expected, error.remedy)
@@ -107,7 +110,10 @@ def _of_text(path: Path, text: str) -> Found:
 
 
 def _of_json(path: Path, text: str) -> Found | None:
-    """Read a JSON document; None where it is none, but may be a text of another kind."""
+    """Return the measurements of a JSON document; None for a log of benchmark_model that begins like JSON.
+
+    Raises BadInputError for other text that is no JSON, and for JSON of no known tool.
+    """
     try:
         document = json.loads(text, parse_int=whole_number)
     except RecursionError:
@@ -164,7 +170,7 @@ def _of_list(document: object) -> Found | None:
 
 
 def _of_events(events: Sequence[Any]) -> Found:
-    """Read events: ONNX Runtime's have the categories Session and Node."""
+    """Return the measurements of trace events; events of ONNX Runtime have the category Session or Node."""
     categories = {
         each.get("cat") for each in events[:1000] if isinstance(each, dict) and isinstance(each.get("cat"), str)
     }
@@ -174,7 +180,7 @@ def _of_events(events: Sequence[Any]) -> Found:
 
 
 def _events_by_line(text: str) -> tuple[list[Any], list[str]]:
-    """Return the events of a list that is cut off, an event a line, and the places of lines that are none."""
+    """Return (events, places of the lines that are no event) of a list that is cut off, with an event a line."""
     events, broken = [], []
     for number, line in enumerate(text.splitlines(), 1):
         bare = line.strip().removeprefix('{"traceEvents":').removeprefix("[").removesuffix("]").rstrip(", ")
@@ -192,7 +198,7 @@ def _events_by_line(text: str) -> tuple[list[Any], list[str]]:
 
 
 def _read_own(text: str) -> Found:
-    """Read the CSV that `trilane times --csv` writes."""
+    """Return the measurements of a CSV that `trilane times --csv` wrote."""
     found = Found("CSV of trilane times", "samples, as another tool measured them")
     lines = text.splitlines()
     reader, last = csv.DictReader(lines), len(lines)
@@ -221,7 +227,9 @@ def _read_own(text: str) -> Found:
 def chosen(read: Measurements, name: str, where: str) -> Measurement:
     """Return the measurement `name` as the time of a stage; an empty `name` stands for the only run.
 
-    `where`: place to name in errors. Raises BadInputError for an unknown name, several runs, or no service time.
+    `where`: place to name in errors.
+
+    Raises BadInputError for an unknown name, for several runs or none without a name, and for no service time.
     """
     if name:
         found = [each for each in read.measurements if each.name == name]
@@ -245,7 +253,7 @@ def chosen(read: Measurements, name: str, where: str) -> Measurement:
 
 
 def _not_one(read: Measurements, runs: Sequence[Measurement], where: str) -> BadInputError:
-    """Return the error for a file without a run, or with several: those that a name can choose, or why none can."""
+    """Return the error for a file without a single run; it lists the measurements that a name can choose."""
     usable = runs or [each for each in read.measurements if each.service and each.unit != CYCLES]
     listed = [f"{each.name!r}" if runs else f"{each.name!r} ({each.what})" for each in usable or read.measurements]
     shown = ", ".join(listed[:8]) + (" …" if len(listed) > 8 else "")

@@ -1,9 +1,10 @@
-"""Readers of what runtimes write: ONNX Runtime's profile, `benchmark_model`'s log, TensorRT's layers, ExecuTorch's.
+"""Readers of files that network runtimes write.
 
-The tools write these layouts:
-- ONNX Runtime (`profiler.cc`): a JSON array with an event a line; it is cut off if the session was not closed.
-- `benchmark_model` of TFLite and LiteRT: microseconds, but ms for operators.
-- `trtexec --exportProfile`: ms.
+The tools write these formats:
+- ONNX Runtime's profile (`profiler.cc`): a JSON array with an event a line; it is cut off if the session was not
+  closed.
+- The log of `benchmark_model` of TFLite and LiteRT: microseconds, but ms for operators.
+- TensorRT's layers from `trtexec --exportProfile`: ms.
 - The app benchmarks of react-native-executorch: ms.
 """
 
@@ -26,7 +27,7 @@ from trilane.pipeline.measurements.measurement import (
     falling,
 )
 
-#: Events of a session that are runs: what they contain.
+#: Contents of the session events that are runs, by the event's name.
 RUNS: Final = {
     "model_run": "a call of the session",
     "SequentialExecutor::Execute": "the nodes of a run",
@@ -73,17 +74,20 @@ OPERATORS: Final = "Run Order"
 
 
 def is_benchmark(text: str) -> bool:
-    """Say whether a text has lines of `benchmark_model`."""
+    """Return whether a text has lines of `benchmark_model`."""
     return re.search(r"\bcount=\d+ (first|curr)=|Inference timings in us:|Inference \(avg\):", text) is not None
 
 
 def read_benchmark(text: str) -> Found:
-    """Read the log of `benchmark_model`, with one benchmark or several after each other."""
+    """Read the log of `benchmark_model`, which may contain several benchmarks."""
     return _Benchmark(text).found
 
 
 class _Benchmark:
-    """The log of `benchmark_model`, line by line. The last line of figures before a summary is that of the runs."""
+    """Reads the log of `benchmark_model` line by line.
+
+    The last line of figures before a summary belongs to the runs; a line of figures before it belongs to the warm-up.
+    """
 
     def __init__(self, text: str) -> None:
         says = "count, mean, spread and percentiles of the runs, warm-up apart; of operators the mean"
@@ -92,7 +96,7 @@ class _Benchmark:
         self._announced = 0
         self._lines: list[str] = []  # of this benchmark
         self._figures: tuple[str, dict[str, str]] | None = None
-        self._is_warm = False  # whether a warm-up came before those figures
+        self._is_warm = False  # whether a warm-up came before `_figures`
         self._litert: dict[str, tuple[str, str, str | None, str | None]] = {}
         for number, line in enumerate(text.splitlines(), 1):
             self._line(f"line {number}", line)
@@ -135,14 +139,18 @@ class _Benchmark:
                 self._take(place, pairs, f"{self._graph}, sum of operators")
             return
         if self._figures is not None and self._is_warm:
-            self._flush(place)  # of the log before, in a file of several
+            self._flush(place)  # the figures of the log before, in a file of several logs
         elif self._figures is not None:  # two such lines in a row: the first one is the warm-up
             self.found.skip("warm-up")
             self._is_warm = True
         self._figures = (place, pairs)
 
     def _flush(self, place: str, summary: str = "") -> None:
-        """Take the figures that came last, which the summary repeats in part."""
+        """Take the last line of figures, and check it against the summary, which repeats the mean.
+
+        `place`: place of the summary.
+        `summary`: text of the summary; empty without one.
+        """
         figures, self._figures, self._is_warm = self._figures, None, False
         stated = re.search(r"Inference \(avg\): ([^\s,]+)", summary)
         average = _number(stated[1]) if stated else None
@@ -165,7 +173,7 @@ class _Benchmark:
         self._take(row, pairs, self._graph)
 
     def _take(self, place: str, pairs: Mapping[str, str], name: str) -> None:
-        """Take a line of figures in us; with one run it has no mean, but the time of that run."""
+        """Take a line of figures in us. A line of a single run has its time in place of a mean."""
         times = {key: _number(value) for key, value in pairs.items() if key != "count"}
         times.setdefault("avg", times.get("curr", ""))
         self._add(place, name, _number(pairs["count"]), times, "us")
@@ -178,7 +186,7 @@ class _Benchmark:
             self.found.add(Measurement(self._graph, "run", "us", what, mean_ms=time, hardware=hardware))
 
     def _flush_litert(self) -> None:
-        """Take the block of figures that newer versions print, each with its unit."""
+        """Take the block of lines that newer versions print, with one figure and its unit in each line."""
         if "avg" not in self._litert:
             self._litert = {}
             return
@@ -194,7 +202,12 @@ class _Benchmark:
         self._add(place, self._graph, float(count) if count else None, times, unit or "us")
 
     def _of_block(self, place: str, average: object, unit: str) -> None:
-        """Take the line of figures before a block, which repeats them with two digits; refuse what contradicts it."""
+        """Take the line of figures before a block, which repeats them with two digits.
+
+        If the block's mean contradicts the line, the line is refused.
+
+        `average`: mean of the block, in `unit`.
+        """
         assert self._figures is not None
         row, pairs = self._figures
         mean, factor = _number(pairs.get("avg", "")), PER_MS["us"] / PER_MS[unit]
@@ -206,7 +219,10 @@ class _Benchmark:
         self._flush("")
 
     def _add(self, place: str, name: str, count: object, times: Mapping[str, object], unit: str) -> None:
-        """Add the figures of the runs; refuse them where they contradict each other."""
+        """Add the figures of the runs; refuse them if they contradict each other.
+
+        `times`: figures in `unit`, by the tool's key, such as `avg`; a value that is no number is refused.
+        """
         row = f"{place}: {name}"
         if count is not None and (not isinstance(count, float) or count < 1 or count != count // 1):
             self.found.refuse(row, f"count is {count}, not a whole number of runs")
@@ -238,7 +254,7 @@ class _Benchmark:
         )  # fmt: skip
 
     def _operator(self, place: str, line: str) -> None:
-        """Take a row of the table of operators in the order of a run; its columns are named above it."""
+        """Take a row of the table of operators in run order; the table's first row names the columns."""
         cells = [cell.strip() for cell in line.strip("\r\n").split("\t")][1:]
         if any(cell.lower() == "[node type]" for cell in cells):
             self._columns = [cell.strip("[]").lower() for cell in cells]
@@ -255,9 +271,9 @@ class _Benchmark:
 
 
 def _ran_by(lines: Sequence[str]) -> str:
-    """Return the delegate that ran the whole graph, as the lines of a log say; "" where that is not clear.
+    """Return the delegate that ran the whole graph, from the lines of a log; "" if that is not clear.
 
-    XNNPACK takes what other delegates leave. Where it is the only one that the log names, all ran on the CPU.
+    XNNPACK runs the operators that other delegates leave. If the log names no other delegate, all ran on the CPU.
     """
     named = [line for line in lines if "delegate" in line.lower() and "\t" not in line]  # tables have tabs
     applied = [said[1] for line in named if (said := APPLIED.search(line))]
@@ -274,12 +290,12 @@ def _number(text: str) -> object:
 
 
 def _in_unit(value: object, of: str, unit: str) -> object:
-    """Return a number in the unit `of` in `unit`; anything else as it is."""
+    """Return a number of the unit `of`, converted to `unit`; another value is returned unchanged."""
     return value / PER_MS[of] * PER_MS[unit] if isinstance(value, float) and of != unit else value
 
 
 def is_tensorrt(document: Sequence[Any]) -> bool:
-    """Say whether a list is what `trtexec --exportProfile` writes."""
+    """Return whether `trtexec --exportProfile` wrote a list."""
     tables = [each for each in document[:3] if isinstance(each, dict)]
     return any("averageMs" in each or "timeMs" in each for each in tables)
 
@@ -309,7 +325,7 @@ def read_tensorrt(document: Sequence[Any]) -> Found:
 
 
 def _of_tensorrt(found: Found, row: str, layer: Mapping[str, Any], count: int | None) -> float | None:
-    """Add one layer; return its mean in ms, or None where it is refused."""
+    """Add one layer; return its mean in ms, or None if it is refused. `count`: number of runs, if known."""
     mean = found.ms(row, layer.get("averageMs"), "ms", "layer", "averageMs")
     if mean is None:
         return None
@@ -330,7 +346,7 @@ def _of_tensorrt(found: Found, row: str, layer: Mapping[str, Any], count: int | 
 
 
 def read_layer_means(document: Sequence[Any]) -> Found:
-    """Read a list of layers with `average_time_ms`, as scripts make of TensorRT's profiles."""
+    """Read a list of layers with `average_time_ms`, as scripts make from TensorRT's profiles."""
     found = Found("table of layers' means", "the mean of each layer")
     for index, layer in enumerate(document):
         name = str(layer.get("name", index)) if isinstance(layer, dict) else str(index)
@@ -345,9 +361,9 @@ CUT: Final = re.compile(r"^(.*)_at_(-?\d+)$")
 
 
 def read_cut_means(document: Mapping[str, Any]) -> Found:
-    """Read a table of mean times of cut networks, by the place N of the cut (`NAME_at_N`).
+    """Read a table of mean times of networks that are cut after layer N (`NAME_at_N`).
 
-    The rest of a network behind a later cut cannot take longer than behind an earlier one.
+    The rest of a network behind a later cut cannot take longer than the rest behind an earlier cut.
     """
     found = Found("table of times by cut", "the mean for each place at which a network is cut")
     rests: dict[str, list[tuple[int, float]]] = defaultdict(list)
@@ -378,9 +394,11 @@ def read_cut_means(document: Mapping[str, Any]) -> Found:
 
 
 def rising_rests(points: Sequence[tuple[int, float]]) -> Iterator[tuple[int, str]]:
-    """Yield the cuts to remove, each with a reason, so that the rest times fall from cut to cut.
+    """Yield (cut to remove, reason), so that the times that are left never rise from cut to cut.
 
-    `points`: place of the cut, and time of the rest in ms. The longest series that never rises stays.
+    The longest series of times that never rises stays.
+
+    `points`: pairs of a cut and the time of the network behind it in ms.
     """
     ordered = sorted(points)
     kept = falling([time for _, time in ordered])

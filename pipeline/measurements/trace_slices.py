@@ -1,7 +1,8 @@
-"""Named slices of a trace as samples: Perfetto's packets and Chrome's JSON. No trace processor is needed or fetched.
+"""Reads the named slices of a trace as samples: Perfetto's packets and Chrome's JSON, without a trace processor.
 
-Slices come from track events (with interned names, delta clocks and compressed packets; those of older Chrome too) and
-from marks of Android's atrace in ftrace packets. A slice is a wall time: it contains whatever its thread waited for.
+Slices come from track events, and from marks of Android's atrace in ftrace packets. Track events may have interned
+names, delta clocks, compressed packets, or the form of older Chrome. A slice is a wall time: it contains all waits of
+its thread.
 Sources: the comments of Perfetto's protos (track_event.proto, clock_snapshot.proto); Chrome's Trace Event Format.
 """
 
@@ -21,8 +22,8 @@ if TYPE_CHECKING:
 
 WHAT: Final = "slice, with what its thread waited for"
 WHAT_ASYNC: Final = "asynchronous slice, with all waiting"
-BEGINS, ENDS, ASYNC = "BbS", "EeF", "beSF"  # phases of Chrome's events; b, e, S and F are of asynchronous slices
-#: What the events of the other phases are.
+BEGINS, ENDS, ASYNC = "BbS", "EeF", "beSF"  # phases of Chrome's events; b, e, S and F belong to asynchronous slices
+#: Meaning of the events of all other phases.
 NO_SLICES: Final = {
     "M": "a name or another fact of a process or thread, no slice",
     "C": "a counter, no slice",
@@ -36,19 +37,19 @@ NO_SLICES: Final = {
 }
 UNENDED: Final = "a slice that does not end in the trace"
 MOST_UNPACKED_BYTES: Final = 512 << 20
-FIRST_OWN_CLOCK, LAST_OWN_CLOCK = 64, 127  # clocks of a sequence; those above are of the whole trace
+FIRST_OWN_CLOCK, LAST_OWN_CLOCK = 64, 127  # clocks of a sequence; higher numbers are clocks of the whole trace
 STATE_CLEARED, NEEDS_STATE = 1, 2  # flags of a packet
 LOST_STATE: Final = "an event whose names or clock were in packets that are lost"
 NO_CLOCK: Final = "an event on a clock that the trace does not explain"
 ATRACE: Final = re.compile(r"([BE])(?:\|(\d+)(?:\|(.*))?)?\s*", re.DOTALL)
-#: Traces as text, which are told apart but not read: ftrace's lines, and Perfetto's.
+#: Traces as text, which are recognised but not read: ftrace's lines, and Perfetto's.
 FTRACE_TEXT: Final = re.compile(r"^# tracer: |\[\d{3}\] .{0,40}\d+\.\d+: \w+: ", re.MULTILINE)
 PERFETTO_TEXT: Final = re.compile(r"\s*packet\s*:?\s*\{")
 PACKET: Final = 0x0A  # field 1 of a Trace, with a length
 
 
 def is_perfetto(head: bytes) -> bool:
-    """Say whether a file begins with a packet and its length, as a trace of Perfetto does, and not with text."""
+    """Return whether a file begins like a trace of Perfetto, with a packet and its length, and not with text."""
     if head[:1] != bytes([PACKET]):
         return False
     try:
@@ -66,18 +67,21 @@ def read_perfetto(data: bytes) -> Found:
 
 
 class _Sequence:
-    """What a writer of packets has said so far: names by number, its clocks, its default track and clock."""
+    """The state of one writer of packets: names by number, its clocks, its default track and clock."""
 
     def __init__(self) -> None:
         self.names: dict[int, str] = {}
         self.clocks: dict[int, list[int]] = {}  # clock: its last time, ns of a tick, whether times are differences
         self.default_clock = 0
         self.default_track = 0
-        self.is_known = False  # whether all that it has said is here
+        self.is_known = False  # whether no packet of the writer is missing
 
 
 class _Slices:
-    """Begins and ends are collected by track first: packets of several writers come in any order."""
+    """Reads the slices of a Perfetto trace.
+
+    Begins and ends are first collected by track, because packets of several writers come in any order.
+    """
 
     def __init__(self, found: Found) -> None:
         self._found = found
@@ -102,7 +106,7 @@ class _Slices:
             self._pair(sorted(marks, key=lambda mark: mark[0]))  # marks of one time stay in their order
 
     def _pair(self, marks: Sequence[tuple[int, str | None]]) -> None:
-        """Take the slices of one track, whose ends each belong to the last begin that is open."""
+        """Take the slices of one track. Each end belongs to the last begin that is still open."""
         begun: list[tuple[str, int]] = []
         for at, name in marks:
             if name is not None:
@@ -115,7 +119,10 @@ class _Slices:
             self._found.skipped[UNENDED] += len(begun)
 
     def _packets(self, data: bytes, *, packed: bool = False) -> Iterator[TracePacket]:
-        """Yield the packets one by one, so that a long trace is never held as objects. Raises DecodeError."""
+        """Yield the packets one by one, so that a long trace is never held as objects. Raises DecodeError.
+
+        `packed`: whether `data` comes from a compressed packet.
+        """
         from google.protobuf.message import DecodeError
         from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import TracePacket
 
@@ -153,7 +160,7 @@ class _Slices:
                 self._mark(event.pid, event.timestamp, event.print.buf)
 
     def _learned(self, packet: TracePacket) -> _Sequence:
-        """Return the sequence of a packet, with what the packet says for later ones."""
+        """Return the sequence of a packet, after adding the packet's names, defaults and clocks to it."""
         sequence = self._sequences[packet.trusted_packet_sequence_id]
         if packet.previous_packet_dropped:
             sequence.is_known = False
@@ -173,7 +180,7 @@ class _Slices:
         return sequence
 
     def _time(self, packet: TracePacket, sequence: _Sequence) -> int | None:
-        """Return the time of a packet in ns; None on a clock of a program's own that no snapshot explains."""
+        """Return the time of a packet in ns; None for a program's own clock that no snapshot explains."""
         known = packet.timestamp_clock_id or sequence.default_clock
         clock = sequence.clocks.get(known) or self._clocks.get(known)
         if clock is None:
@@ -195,7 +202,7 @@ class _Slices:
             self._take(name, at, at + 1000 * event.legacy_event.duration_us)
 
     def _mark(self, thread: int, at: int, text: str) -> None:
-        """Take a mark of atrace: `B|process|name` begins a slice of the thread, `E` ends its last one."""
+        """Take a mark of atrace: `B|process|name` begins a slice of the thread, `E` ends the thread's last slice."""
         mark = ATRACE.fullmatch(text)
         if mark is not None:
             self._marks["thread", thread].append((at, (mark[3] or "").strip() if mark[1] == "B" else None))
@@ -210,7 +217,7 @@ class _Slices:
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:
-    """Return the number at `at` in protobuf's form and the place behind it; -1 where it does not end."""
+    """Return (number, index behind it) of the protobuf varint at index `at`; the number is -1 if it does not end."""
     value = 0
     for index in range(10):
         if at + index >= len(data):
@@ -292,9 +299,9 @@ def _thread(event: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _asynchronous_track(event: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return what begin and end of an asynchronous slice share; () if a part of it is missing.
+    """Return a key that begin and end of an asynchronous slice share; () if a part of the key is missing.
 
-    It may end in another process than it began in, unless its id is local.
+    If its id is not local, the slice may end in another process.
     """
     name, id_, scoped = event.get("name"), event.get("id"), event.get("id2")
     process = ""

@@ -1,8 +1,6 @@
-"""Readers of what vendors' tools write: Qualcomm's profiles, and MLPerf's results.
+"""Readers of files that vendors' tools write: Qualcomm's profiles, and MLPerf's results.
 
-Qualcomm: the CSV of the QNN execution provider, QHAS summaries, and jobs of AI Hub.
-
-The tools write these layouts:
+Qualcomm's tools write these formats:
 - The QNN execution provider of ONNX Runtime (`qnn_backend_manager.cc`) writes seven columns. It appends the rows of
   each run, and does not quote identifiers.
 - `qnn-profile-viewer` writes the same table after some lines of text. The header has blanks, each row has `EXECUTE`,
@@ -12,14 +10,14 @@ The tools write these layouts:
 
 Cycles become shares of a run, never times, because the clock is not in the file.
 
-MLPerf: the summary of LoadGen, and the result file of the mobile app.
+MLPerf's files are the summary of LoadGen, and the result file of the mobile app.
 
 In SingleStream the next query begins when the last one has ended, so a latency is a service time. In the other
-scenarios queries wait for each other, or are many at once: their latencies are wall times with queueing.
+scenarios queries wait for each other, or come many at once: their latencies are wall times with queueing.
 
-Versions: LoadGen before 1.0 writes `Single Stream` and `Performance`. The app before 4.0 states no latencies, but how
-long all queries took (`loadgen_info.duration`, or `duration_ms`), and before 3.0 its file is a list of results. In
-SingleStream the app's throughput is one over the 90th percentile.
+Versions: LoadGen before 1.0 writes `Single Stream` and `Performance`. The app before 4.0 states no latencies, but the
+duration of all queries (`loadgen_info.duration`, or `duration_ms`). Before 3.0 its file is a list of results. In
+SingleStream the app's throughput is the reciprocal of the 90th percentile.
 Source: the results that mlcommons publishes (mobile_results_v2.1 to v5.0).
 """
 
@@ -49,7 +47,7 @@ IDENTIFIER: Final = "Event Identifier"
 #: Units of the CSV. Counts, bytes and objects are no times.
 QNN_UNITS: Final = {"US": "us", "MICROSEC": "us", "MS": "ms", "NS": "ns", "S": "s", "CYCLES": CYCLES}
 NO_TIMES: Final = ("COUNT", "BYTES", "OBJECT", "NONE", "INF/SEC", "UNKNOWN", "")
-#: Times of one execution, from the outermost in: each contains the next.
+#: Times of one execution, the outermost first: each contains the next.
 NET_RUN: Final = "NetRun (execute) time"
 WHOLE: Final = "QNN (execute) time"
 NESTED: Final = (
@@ -66,7 +64,7 @@ RATE_SLACK: Final = 0.02  # relative, between a time and the rate that the same 
 
 
 def is_qnn(lines: Sequence[str]) -> bool:
-    """Say whether one of the first lines is the header of the QNN CSV."""
+    """Return whether one of the first lines is the header of the QNN CSV."""
     return any(_names(line.lstrip("\ufeff").split(","))[:3] == list(QNN_COLUMNS[:3]) for line in lines[:20])
 
 
@@ -102,9 +100,9 @@ def read_qnn(text: str) -> Found:
 
 
 def _qnn_rows(text: str, found: Found) -> Iterator[tuple[str, dict[str, str], str, str]]:
-    """Yield place, cells by column, identifier and named graph of each row. A header may come again in joined files.
+    """Yield (place, cells by column, identifier, graph) of each row; the graph is "" for a row that names none.
 
-    A row is one line, so that a quote that is not closed takes no other row with it.
+    In joined files a header may come again. Each line is parsed by itself, so that an open quote damages only one row.
     """
     header: list[str] = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -134,7 +132,10 @@ def _qnn_rows(text: str, found: Found) -> Iterator[tuple[str, dict[str, str], st
 
 
 def _event(named: dict[str, str], identifier: str) -> str:
-    """Return the name of an event. A row of `qnn-net-run` itself names the graph; an event may have no name (NULL)."""
+    """Return the name of an event. A row of `qnn-net-run` has the graph's name as identifier, an unnamed event NULL.
+
+    The texts of the other columns in `named` are cleaned in place.
+    """
     for column in ("Event Level", "Message", "Timing Source"):
         named[column] = named.get(column, "").strip().upper()
     if named["Message"] == "EXECUTE" and named["Event Level"] == "ROOT":
@@ -146,7 +147,7 @@ def _event(named: dict[str, str], identifier: str) -> str:
 
 
 def _fits_name(unit: str, identifier: str, level: str) -> bool:
-    """Say whether the unit is the one that a name says. Names of nodes may leave `(cycles)` out."""
+    """Return whether a unit agrees with the event's name. The name of a node need not contain `(cycles)`."""
     if QNN_UNITS[unit] == CYCLES and level == "SUB-EVENT":
         return identifier not in WHAT
     return ("(cycles)" in identifier.lower()) == (QNN_UNITS[unit] == CYCLES)
@@ -160,9 +161,10 @@ def _number_of(text: str) -> object:
 
 
 class _Run:
-    """The times of one execution, in any order. A name that comes again, or the whole behind parts, ends it.
+    """Collects the times of one execution, in any order.
 
-    Executions of several graphs are told apart by the graph that a row of `qnn-net-run` names.
+    A name that comes again begins the next execution; the whole time after its parts ends the present one. A row of
+    `qnn-net-run` names the graph of an execution.
     """
 
     def __init__(self, found: Found) -> None:
@@ -184,7 +186,7 @@ class _Run:
             self.end()
 
     def end(self) -> None:
-        """Take the times that fit into each other; refuse those that do not fit to most others."""
+        """End the execution: take the times that fit into each other, and refuse times that do not fit most others."""
         names = [name for name, _ in NESTED if name in self._rows]
         ms = [self._rows[name][1] / PER_MS[self._rows[name][2]] for name in names]
         kept = falling(ms, NESTED_SLACK)
@@ -201,7 +203,7 @@ class _Run:
         self._rows, self._graph = {}, ""
 
     def finish(self) -> None:
-        """Take the times of all executions, with their graph in the name where the file has several."""
+        """Take the times of all executions; if the file has several graphs, the names contain the graph."""
         self.end()
         several = len({graph for graph, *_ in self._ended if graph}) > 1
         for graph, row, name, value, unit in self._ended:
@@ -216,7 +218,7 @@ def _take_cycles(found: Found, row: str, level: str, name: str, value: object, c
 
 
 def _add_cycles(found: Found, cycles: Mapping[str, Sequence[float]]) -> None:
-    """Add the nodes with their shares in all cycles of the nodes."""
+    """Add each node with its share of all nodes' cycles. `cycles`: counts of each node by name; "" for whole runs."""
     nodes = {name: sum(values) / len(values) for name, values in cycles.items() if name}
     _add_shares(found, nodes, {name: len(cycles[name]) for name in nodes})
     if of_runs := cycles.get(""):
@@ -272,7 +274,7 @@ def read_qhas(document: Mapping[str, Any]) -> Found:
     return found
 
 
-#: Figures of a QHAS summary that are kept beside its time.
+#: Figures of a QHAS summary that a measurement keeps in `more`.
 QHAS_MORE: Final = (
     "total_dram_read", "total_dram_write", "total_dram", "peak_vtcm_alloc", "percent_utilization", "inf_per_s",
     "timeline_cycles",
@@ -285,7 +287,7 @@ def _rows(table: object) -> list[dict[str, Any]]:
 
 
 def read_ai_hub(document: Mapping[str, Any]) -> Found:
-    """Read what `download_profile()` of AI Hub returns. All its times are microseconds."""
+    """Read the result of `download_profile()` of AI Hub. All its times are microseconds."""
     found = Found("AI Hub profile", "times of each run on the device, and the mean of each layer")
     summary = document.get("execution_summary")
     summary = summary if isinstance(summary, dict) else {}
@@ -335,10 +337,10 @@ SCENARIOS: Final = (SINGLE, "MultiStream", "Server", OFFLINE)
 TITLE: Final = "MLPerf Results Summary"
 LATENCY: Final = re.compile(r"(Min|Max|Mean|[\d.]+ percentile) latency \(ns\)")
 PROCESSED: Final = re.compile(r"Processed at least \d+ queries \((\d+)\)")
-APP_RATE_SLACK: Final = 0.25  # relative, between a rate and the time that it is one over
+APP_RATE_SLACK: Final = 0.25  # relative difference between a rate and the reciprocal of its time
 RATE_ROUNDING: Final = 0.005  # of the rates that LoadGen prints
-UNIT_SLACK: Final = 10.0  # between a rate of the 90th percentile and the mean: a wrong unit is further off
-WHOLE_MS: Final = "measured_duration_ms"  # of all queries, where the app states nothing of LoadGen
+UNIT_SLACK: Final = 10.0  # factor between mean and 90th percentile; a wrong unit differs by more
+WHOLE_MS: Final = "measured_duration_ms"  # key of the duration of all queries, if the app states nothing of LoadGen
 ACCURACY: Final = ("AccuracyOnly", "Accuracy")
 
 
@@ -426,7 +428,7 @@ def _what(scenario: str) -> str:
 
 
 def _of_rate(scenario: str, facts: Mapping[str, tuple[str, str]], mean_ms: float) -> str:
-    """Say whether the rate of a SingleStream run contradicts its mean latency."""
+    """Return a sentence if the rate of a SingleStream run contradicts its mean latency; otherwise ""."""
     rate = _number(facts.get("QPS w/o loadgen overhead", ("", ""))[1])
     if scenario != SINGLE or not isinstance(rate, float) or rate <= 0:
         return ""
@@ -443,13 +445,13 @@ def _number(text: str) -> object:
 
 
 def is_mlperf_app(document: object) -> bool:
-    """Say whether a document is one result of MLPerf's mobile app, or a list of them."""
+    """Return whether a document is one result of MLPerf's mobile app, or a list of such results."""
     several = document if isinstance(document, list) else [document]
     return any(isinstance(result, dict) and "loadgen_scenario" in result for _, result in _results(several))
 
 
 def _results(documents: Sequence[Any]) -> Iterator[tuple[str, Any]]:
-    """Yield the place and the table of each benchmark."""
+    """Yield (place in the file, table) of each benchmark."""
     for number, each in enumerate(documents):
         results = each.get("results") if isinstance(each, dict) else None
         for index, result in enumerate(results if isinstance(results, list) else []):
@@ -485,14 +487,14 @@ def read_mlperf_app(document: Mapping[str, Any] | Sequence[Any]) -> Found:
 
 
 def _loadgen(run: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the table with LoadGen's latencies: versions from 4.0 on call it `loadgen`; {} if there is none."""
+    """Return the table with LoadGen's latencies, which the app calls `loadgen` from 4.0 on; {} if there is none."""
     older = run.get("loadgen_info")
     table = older if isinstance(older, dict) and "latency_mean" in older else run.get("loadgen")
     return table if isinstance(table, dict) else {}
 
 
 def _of_older_app(found: Found, row: str, run: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what newer versions state of a run: the mean is the time of all queries by their number."""
+    """Return the table that newer versions state, with the mean computed: duration of all queries by their number."""
     info = run.get("loadgen_info")
     info = info if isinstance(info, dict) else {}
     key = next((key for key in ("duration", "duration_ms") if key in info), "duration" if info else WHOLE_MS)
@@ -549,7 +551,10 @@ def _add_result(
 
 
 def _fits(rate: float, mean_ms: float, p90_ms: float | None) -> bool:
-    """Say whether a rate is one over the 90th percentile; where that is not stated, not a unit away from the mean."""
+    """Return whether a rate is about the reciprocal of the 90th percentile.
+
+    If no percentile is stated, the reciprocal of the mean must not differ as much as a wrong unit would.
+    """
     if p90_ms is not None:
         return (
             abs(rate * p90_ms / 1e3 - 1) <= APP_RATE_SLACK and mean_ms < UNIT_SLACK * p90_ms < UNIT_SLACK**2 * mean_ms
