@@ -148,11 +148,12 @@ def check_rate(name: str, fps: float) -> None:
 class Tenant:
     """An avatar, or a network by itself, as a `Pipeline`.
 
-    `networks`: one network for each shape of the tensor and number of avatars in view. `frames`: for each frame, the
-    place of its network in `networks`, or `SKIPS`; the list starts over after its end. `unit`: unit of the network.
-    `variant`: how the stages are joined. `is_bare`: whether there is nothing but the network, whose result is due when
-    the next frame comes. `avatars`: number of avatars in view for each of `networks`; empty for one each. `computes`:
-    how the networks compute. Raises BadInputError for a unit or a rate out of range.
+    `networks`: one network for each shape of the tensor, number of avatars in view and levels of their meshes.
+    `frames`: for each frame, the place of its network in `networks`, or `SKIPS`; the list starts over after its end.
+    `unit`: unit of the network. `variant`: how the stages are joined. `is_bare`: whether there is nothing but the
+    network, whose result is due when the next frame comes. `avatars`: number of avatars in view for each of `networks`;
+    empty for one each. `meshes`: their vertices, in whole meshes, for each of `networks`; empty for whole ones.
+    `computes`: how the networks compute. Raises BadInputError for a unit or a rate out of range.
     """
 
     name: str
@@ -164,6 +165,7 @@ class Tenant:
     variant: Variant = NEWEST
     is_bare: bool = False
     avatars: tuple[int, ...] = ()
+    meshes: tuple[float, ...] = ()
     computes: Computes = AS_IT_SAYS
 
     def __post_init__(self) -> None:
@@ -212,7 +214,8 @@ class Tenant:
     def plan(self, kind: int, stretch: float = 1.0) -> Plan:
         """Return what runs in a frame with the network at place `kind`. `stretch`: factor on the network's time."""
         avatars = self.avatars[kind] if self.avatars else 1
-        return Plan(self.networks[kind], self.unit, self.variant, avatars=avatars, stretch=stretch)
+        meshes = self.meshes[kind] if self.meshes else None
+        return Plan(self.networks[kind], self.unit, self.variant, avatars=avatars, meshes=meshes, stretch=stretch)
 
     def place(self, frame: int) -> int:
         """Return the place of the frame's network, or SKIPS."""
