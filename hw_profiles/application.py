@@ -57,15 +57,12 @@ REFERENCE = Variant()
 class Plan:
     """One application on one chip.
 
-    `network`: network that runs.
-    `unit`: unit that runs it, gpu or dsp.
-    `variant`: how the stages are connected and scheduled.
-    `gpu_share`: share of the network's products that the GPU does while the DSP does the rest, 0 to below 1.
-    `most_fps`: largest rate of shown frames, as if a display had this rate; None for the display of the profile.
-    `stretch`: factor on the network's expected time.
-    `avatars`: number of avatars in view; they share one tensor.
-
-    Raises BadInputError for a value outside its range.
+    `network`: network that runs. `unit`: unit that runs it, gpu or dsp. `variant`: how the stages are joined.
+    `gpu_share`: part of the network's products that the GPU does while the DSP does the rest, 0 to below 1. `most_fps`:
+    rate that the application is held to, as by a display; None for the display's own. Policies that release frames at a
+    rate have the rate in their variant. `stretch`: factor on the network's expected time. `avatars`: number of avatars
+    in view; they share one tensor. `meshes`: their vertices, in whole meshes of an avatar; None for all of them. Raises
+    BadInputError for a value outside its range.
     """
 
     network: Network
@@ -75,6 +72,7 @@ class Plan:
     most_fps: float | None = None
     stretch: float = 1.0
     avatars: int = 1
+    meshes: float | None = None
 
     def __post_init__(self) -> None:
         if self.unit not in NETWORK_UNITS:
@@ -123,8 +121,8 @@ def _job(
 def stage_times_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[str, UnitName], float]:
     """Return the time of one job in ms, by (stage, unit), in data-flow order.
 
-    A job has `plan.variant.batch` frames. Joints and vertices count for each avatar in view; pixels count once, for the
-    tensor that all avatars share.
+    A job has `plan.variant.batch` frames. Joints count for each avatar in view, vertices for the meshes that are drawn,
+    and pixels for the one tensor that all avatars share.
     """
     app, network, batch = profile.application, plan.network, plan.variant.batch
     cpu, gpu = (profile.units[u].clock(corners[UNITS.index(u)]) for u in ("cpu", "gpu"))
@@ -132,7 +130,8 @@ def stage_times_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple
     moved_bytes = network.pixels * (
         PACKED_BYTES_PER_PIXEL if network.layout == "packed" else CHANNELS_PER_PASS * passes
     )
-    draw_ns = plan.avatars * app.vertices.or_else(0) * app.raster_ns_per_vertex.or_else(0) * passes
+    meshes = plan.avatars if plan.meshes is None else plan.meshes
+    draw_ns = meshes * app.vertices.or_else(0) * app.raster_ns_per_vertex.or_else(0) * passes
     draw_ns += network.pixels * app.raster_ns_per_pixel.or_else(0) * -(-network.channels // CHANNELS_PER_PASS)
     raster_ns = draw_ns / gpu + moved_bytes * app.readback_ns_per_byte.or_else(0)
     times: dict[tuple[str, UnitName], float] = {

@@ -152,15 +152,12 @@ def check_rate(name: str, fps: float) -> None:
 class Tenant:
     """An avatar, or a network by itself, as a `Pipeline`.
 
-    `networks`: one network for each combination of tensor shape and number of avatars in view.
-    `frames`: for each frame, the index of its network in `networks`, or `SKIPS`; after its end the list starts over.
-    `unit`: unit of the network.
-    `variant`: how the stages are connected and scheduled.
-    `is_bare`: whether it consists only of the network, whose result is due when the next frame comes.
-    `avatars`: number of avatars in view for each of `networks`; empty for one avatar each.
-    `computes`: precision and runtime of the networks.
-
-    Raises BadInputError for a unit or a rate out of range.
+    `networks`: one network for each shape of the tensor, number of avatars in view and levels of their meshes.
+    `frames`: for each frame, the place of its network in `networks`, or `SKIPS`; the list starts over after its end.
+    `unit`: unit of the network. `variant`: how the stages are joined. `is_bare`: whether there is nothing but the
+    network, whose result is due when the next frame comes. `avatars`: number of avatars in view for each of `networks`;
+    empty for one each. `meshes`: their vertices, in whole meshes, for each of `networks`; empty for whole ones.
+    `computes`: how the networks compute. Raises BadInputError for a unit or a rate out of range.
     """
 
     name: str
@@ -172,6 +169,7 @@ class Tenant:
     variant: Variant = NEWEST
     is_bare: bool = False
     avatars: tuple[int, ...] = ()
+    meshes: tuple[float, ...] = ()
     computes: Computes = AS_IT_SAYS
 
     def __post_init__(self) -> None:
@@ -220,7 +218,8 @@ class Tenant:
     def plan(self, kind: int, stretch: float = 1.0) -> Plan:
         """Return the application of a frame with the network `networks[kind]`. `stretch`: factor on its time."""
         avatars = self.avatars[kind] if self.avatars else 1
-        return Plan(self.networks[kind], self.unit, self.variant, avatars=avatars, stretch=stretch)
+        meshes = self.meshes[kind] if self.meshes else None
+        return Plan(self.networks[kind], self.unit, self.variant, avatars=avatars, meshes=meshes, stretch=stretch)
 
     def place(self, frame: int) -> int:
         """Return the index of the frame's network, or SKIPS."""

@@ -2,9 +2,9 @@
 
 Rule: the run's own pose stage decides. `ScenePlan` measures how far a level of detail moves vertices on the picture,
 against the whole body in float64. Costs are computed, never measured, by the same model as `trilane predict`; joints
-and vertices count for each avatar in view. Every figure says whether it is a bound, measured or computed. The drawing
-shows the plan for a frame of each phase, not the painted frame: the bodies' vertices, the bodies' rectangles and the
-tensor's crop rectangles.
+count for each avatar in view, and vertices for the level of its mesh. Every figure says whether it is a bound, measured
+or computed. The drawing shows the plan, not the painted frame: the bodies' vertices, their rectangles and the tensor's,
+for a frame of each phase.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -346,7 +346,7 @@ def _phase(
 
 
 def _cost(plan: FramePlan, costs: CostModel) -> FrameCost:
-    return costs.of(plan.shape, *costs.in_view(plan)) if plan.work is FrameWork.FULL else costs.of(None)
+    return costs.of(plan.shape, *costs.in_view(plan), plan.meshes) if plan.work is FrameWork.FULL else costs.of(None)
 
 
 def _least(group: Sequence[PlannedFrame]) -> float:
@@ -449,13 +449,16 @@ class CostModel:
         """Return the number of avatars that a frame shows, and the numbers of the networks that paint them."""
         return len(plan.seen), self._painters(plan.seen) or FIRST
 
-    def _of(self, shape: Shape | None, avatars: int = 1, networks: Networks = FIRST) -> FrameCost:
-        """Return the cost of a frame with `avatars` avatars in view. `shape`: shape of its tensors; None for no tensor.
+    def _of(
+        self, shape: Shape | None, avatars: int = 1, networks: Networks = FIRST, meshes: float | None = None
+    ) -> FrameCost:
+        """Return the cost of a frame whose tensors have `shape`, None for no tensor, with `avatars` avatars in view.
 
-        `networks`: numbers of the networks that paint the avatars, each on a tensor of its own. With nobody in view,
-        the pose of one avatar still counts, because the pose stage looks for somebody.
+        `networks`: numbers of the networks that paint them, each on a tensor. `meshes`: their vertices, in whole
+        meshes; None for all. A frame with nobody in view still counts one avatar's pose, because the pose stage looks
+        for somebody.
         """
-        plan = self._plan(shape, avatars, networks)
+        plan = replace(self._plan(shape, avatars, networks), meshes=meshes)
         times = stage_times_ms(self._chip, plan, self._corners)
         if shape is None:
             kept = {key: ms for key, ms in times.items() if key[0] in ALWAYS}

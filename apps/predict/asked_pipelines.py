@@ -161,23 +161,23 @@ def avatar(each: AskedPipeline, name: str, variant: Variant = NEWEST, precision:
     plan = ScenePlan(checked.config, checked.assets)
     plans = [plan.decide(frame).plan for frame in range(min(scene.frames, MOST_FRAMES))]
     seen = [
-        (one.shape, checked.config.networks_of(one.seen), len(one.seen))
+        (one.shape, checked.config.networks_of(one.seen), len(one.seen), one.meshes)
         if one.shape and one.work is FrameWork.FULL
         else None
         for one in plans
     ]
-    distinct = list(dict.fromkeys(one for one in seen if one is not None)) or [(_own(files[0].shape), (0,), 1)]
+    distinct = list(dict.fromkeys(one for one in seen if one is not None)) or [(_own(files[0].shape), (0,), 1, 1.0)]
     by_kind = {
         (shape, used): painting([files[number] for number in used], shape, {"scene": each.what})
-        for shape, used, _ in distinct
+        for shape, used, *_ in distinct
     }
-    networks, avatars = (
-        tuple(by_kind[shape, used] for shape, used, _ in distinct),
-        tuple(count for *_, count in distinct),
-    )
+    networks = tuple(by_kind[shape, used] for shape, used, *_ in distinct)
+    avatars, meshes = zip(*((count, drawn) for *_, count, drawn in distinct), strict=True)
     frames = tuple(SKIPS if one is None else distinct.index(one) for one in seen)
     fps, unit, computes = each.fps or scene.fps, each.unit or INFER[1], Computes(precision=precision)
-    return Tenant(name, each.text, networks, frames, fps, unit, variant, avatars=avatars, computes=computes)
+    return Tenant(
+        name, each.text, networks, frames, fps, unit, variant, avatars=avatars, meshes=meshes, computes=computes
+    )
 
 
 def _own(shape: Sequence[int]) -> Shape:

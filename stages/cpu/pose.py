@@ -44,7 +44,8 @@ class SeenAvatar:
     """An avatar on the screen.
 
     `level`: an index into `DETAILS`. `error_px`: bound of the error of both levels on the picture, pixels. `mesh`:
-    level of the mesh, 0 for the whole mesh. `triangles`: number of triangles of that level.
+    level of the mesh, 0 for the whole mesh. `triangles`: number of triangles of that level. `share`: its vertices, as a
+    share of the whole mesh's.
     """
 
     rect: Rect
@@ -52,6 +53,7 @@ class SeenAvatar:
     error_px: float
     mesh: int = 0
     triangles: int = 0
+    share: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -156,7 +158,9 @@ class ModelledBody:
         if rect is None:
             return None
         grown = widened(rect, choice.error_px, output)
-        return SeenAvatar(grown, choice.level, choice.error_px, choice.mesh.level, len(mesh.shaped.body.faces))
+        share = len(mesh.shaped.vertices) / len(self.shaped.vertices)
+        triangles = len(mesh.shaped.body.faces)
+        return SeenAvatar(grown, choice.level, choice.error_px, choice.mesh.level, triangles, share)
 
 
 def widened(rect: Rect, error_px: float, output: Shape) -> Rect:
@@ -196,6 +200,11 @@ class FramePlan:
     shape: Shape | None
     density: float | None
     seen: Mapping[int, SeenAvatar]
+
+    @property
+    def meshes(self) -> float:
+        """The vertices that are drawn, in whole meshes of an avatar."""
+        return sum(one.share for one in self.seen.values())
 
 
 @dataclass(frozen=True)

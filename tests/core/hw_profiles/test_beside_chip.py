@@ -143,17 +143,21 @@ def test_an_avatar_alone_is_what_predict_says_of_its_network() -> None:
 
 
 def test_every_avatar_in_view_is_posed_and_drawn() -> None:
-    """Three in view: three poses, the vertices of three; one tensor, one picture. Of one and three in turns, two."""
+    """Three in view: three poses, the vertices of three; one tensor, one picture. Of one and three in turns, two.
+
+    With levels of a mesh, the vertices of three may be those of half a mesh.
+    """
     one, app = avatar(), CHIP.application
     three = replace(one, name="three", avatars=(3,))
     turns = replace(one, name="turns", networks=one.networks * 2, avatars=(1, 3), frames=(0, 1))
-    single, many, mean = (together(CHIP, [each], CORNERS).stages_ms[0] for each in (one, three, turns))
+    coarse = replace(three, meshes=(0.5,))
+    single, many, mean, few = (together(CHIP, [each], CORNERS).stages_ms[0] for each in (one, three, turns, coarse))
     gpu = CHIP.units["gpu"].clock(CORNERS[1])
     vertices_ms = app.vertices.or_else(0) * app.raster_ns_per_vertex.or_else(0) / gpu / 1e6
     assert vertices_ms > 0.01
-    for found, more in ((many, 2), (mean, 1)):
+    for found, more, meshes in ((many, 2, 3), (mean, 1, 2), (few, 2, 0.5)):
         assert found["pose"] == pytest.approx((1 + more) * single["pose"], abs=1e-5)
-        assert found["raster"] == pytest.approx(single["raster"] + more * vertices_ms, abs=1e-5)
+        assert found["raster"] == pytest.approx(single["raster"] + (meshes - 1) * vertices_ms, abs=1e-5)
         assert all(found[stage] == single[stage] for stage in ("infer", "composite", "present"))
 
 
@@ -226,21 +230,21 @@ def test_what_is_said_of_a_machine_and_of_turns() -> None:
 def test_a_scene_is_planned_frame_by_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames of 64x96 and 32x32 with some that skip; a network for each shape and what is in view, as they come.
 
-    Avatar c has a network of its own, so its frame has two tensors.
+    In the last one a quarter of a mesh is drawn. Avatar c has a network of its own, so its frame has two tensors.
     """
     full, reuse = FrameWork.FULL, FrameWork.REUSE
     wide, small = (64, 96), (32, 32)
     works: list[Any] = [
-        (full, wide, "a"),
-        (reuse, wide, "a"),
-        (full, small, "abc"),
-        (full, wide, "ab"),
-        (full, wide, "b"),
+        (full, wide, "a", 1.0),
+        (reuse, wide, "a", 1.0),
+        (full, small, "abc", 2.5),
+        (full, wide, "ab", 2.0),
+        (full, wide, "b", 0.25),
     ]
 
     def decide(frame: int) -> Any:
-        work, shape, seen = works[frame % len(works)]
-        return SimpleNamespace(plan=SimpleNamespace(work=work, shape=shape, seen=seen))
+        work, shape, seen, meshes = works[frame % len(works)]
+        return SimpleNamespace(plan=SimpleNamespace(work=work, shape=shape, seen=seen, meshes=meshes))
 
     scene = SimpleNamespace(frames=700, fps=24.0)
     config = SimpleNamespace(scene=scene, networks_of=lambda seen: (0, 1) if "c" in seen else (0,))
@@ -259,10 +263,12 @@ def test_a_scene_is_planned_frame_by_frame(monkeypatch: pytest.MonkeyPatch) -> N
         (64, 96, 12, ((12, *wide),)),
         (64, 32, 12, ((12, *small), (8, *small))),
         (64, 96, 12, ((12, *wide),)),
+        (64, 96, 12, ((12, *wide),)),
     ]
-    assert found.networks[0] is found.networks[2] and found.avatars == (1, 3, 2)
-    assert found.frames == (0, SKIPS, 1, 2, 0) * 120
-    works[:] = [(FrameWork.NONE, None, "")]
+    assert found.networks[0] is found.networks[2] is found.networks[3] and found.avatars == (1, 3, 2, 1)
+    assert found.meshes == (1.0, 2.5, 2.0, 0.25)
+    assert found.frames == (0, SKIPS, 1, 2, 3) * 120
+    works[:] = [(FrameWork.NONE, None, "", 0.0)]
     (nobody,) = sources.tenants(["home.toml"])
     assert (nobody.fps, nobody.frames[:2], nobody.networks[0].height) == (24.0, (SKIPS, SKIPS), 80)
 

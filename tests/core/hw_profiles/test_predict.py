@@ -231,7 +231,9 @@ def test_stages_beside_the_network_by_hand(monkeypatch: pytest.MonkeyPatch, layo
         }
     )
     units = {"cpu": known(clock=lambda corner: corner / 4), "gpu": known(clock=lambda corner: corner / 2)}
-    plan: Any = known(network=known(layout=layout, channels=10, pixels=100), variant=known(batch=2), avatars=2)
+    plan: Any = known(
+        network=known(layout=layout, channels=10, pixels=100), variant=known(batch=2), avatars=2, meshes=None
+    )
     monkeypatch.setattr("trilane.hw_profiles.application._network_ms", lambda *_: {("infer", "dsp"): 7.0})
     found = stage_times_ms(known(application=app, units=units), plan, (1, 1, 1))  # type: ignore[arg-type]
     assert list(found) == [

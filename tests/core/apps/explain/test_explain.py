@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -27,7 +28,8 @@ from trilane.apps.explain.scene_plan import (
     least_frame_ms,
     phases,
 )
-from trilane.avatars.bundle import load_bundle
+from trilane.avatars.bundle import add_mesh_levels, load_bundle
+from trilane.avatars.mesh_levels import MeshLevel
 from trilane.avatars.network_file import reshaped
 from trilane.body.joints import Skeleton
 from trilane.body.skinning import DETAILS, CpuSkinner
@@ -219,6 +221,23 @@ def test_phases_and_the_fixed_square_count_the_avatars_in_view(tiny_bundle: Path
         assert (row["cost"]["work_ms"], row["cost"]["frame_ms"]) == (cost.work_ms, cost.frame_ms)
         assert row["saved"]["work_ms"] == fixed.work_ms - cost.work_ms
     assert document["totals"]["fixed_work_ms"] == pytest.approx(4 * costs.of((512, 512), 2).work_ms)
+
+
+def test_a_level_of_the_mesh_costs_its_vertices_and_the_fixed_square_the_whole_mesh(
+    tiny_bundle: Path, tmp_path: Path
+) -> None:
+    bundle = load_bundle(shutil.copytree(tiny_bundle, tmp_path / "levelled"))
+    shaped, none = bundle.shaped_body(), np.zeros((1, 54), np.float32)
+    faces, uv_faces = (rows[:9].copy() for rows in (shaped.body.faces, shaped.body.uv_faces))
+    add_mesh_levels(bundle, [MeshLevel(faces, uv_faces, np.zeros(1, np.float32), none, none, 0.0)])
+    (tmp_path / "small.toml").write_text(SCENE.format(bundle=bundle.folder))
+    (row,) = json.loads(explained(tmp_path, "--json", "--frames", "2").stdout)["phases"]
+    costs = CostModel([bundle.read_network()], CHIP, CAP)
+    shape, share = tuple(row["tensor"]), len(np.unique(faces)) / len(shaped.vertices)
+    assert row["avatars"][0]["mesh"]["level"] == 1
+    cost = costs.of(shape, 1, meshes=share)
+    assert row["cost"]["work_ms"] == cost.work_ms < costs.of(shape, 1).work_ms
+    assert row["saved"]["work_ms"] == costs.of((512, 512), 1).work_ms - cost.work_ms
 
 
 def test_a_frame_without_network_takes_as_long_as_its_busiest_core() -> None:
