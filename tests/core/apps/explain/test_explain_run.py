@@ -14,13 +14,22 @@ from typing import Any
 import pytest
 
 from support.run_folders import write_run
-from trilane.apps.explain.explained_run import COLUMNS, Joins, explain_frame, explain_run, join_text, write_jobs
+from trilane.apps.explain.explained_run import (
+    COLUMNS,
+    Joins,
+    RunExplanation,
+    explain_frame,
+    explain_run,
+    join_text,
+    open_journal,
+    write_jobs,
+)
 from trilane.apps.explain.reasons import MOST_SAMPLES, EvenSample, ShownFrame, advice, notes
 from trilane.apps.watch.followed_run import CUT_OFF
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.application import application_graph
 from trilane.pipeline.critical_path import WORK, Budget, Paths
-from trilane.pipeline.journal import NAME, Accounted, Begun, JournalWriter, Record, Stepped, Worked, journal_of
+from trilane.pipeline.journal import NAME, Accounted, Begun, JournalWriter, Record, Said, Stepped, Worked, journal_of
 from trilane.pipeline.timeline import ExplainedJob, Presented, Timeline
 from trilane.pipeline.unit_history import JOIN, IdleSlice
 from trilane.scheduler.events import Graph, Input, Settings, StageSpec, UnitDied
@@ -244,6 +253,15 @@ def test_a_run_that_goes_on_is_explained_so_far(folder: Path, tmp_path: Path, co
     assert 10 < found["frames"] < 39
     out, _ = command("explain", tmp_path / "run", "--json")
     assert json.loads(out) == json.loads(json.dumps(found))
+
+
+def test_messages_are_those_of_the_report_or_of_the_journal_so_far(folder: Path) -> None:
+    begun, records = open_journal(folder)
+    explanation = RunExplanation(begun, None, 1)
+    for record in (*records, Said(1, "the chip is hot"), Said(2, "it is cool")):
+        explanation.add(record)
+    assert explanation.document()["messages"] == ["the chip is hot", "it is cool"]
+    assert explain_run(folder)["messages"] == json.loads((folder / "report.json").read_text())["messages"] == []
 
 
 def test_a_run_is_found_by_its_name_below_runs(

@@ -20,6 +20,7 @@ from trilane.apps.cli.inspect import lines
 from trilane.apps.inspect import inspection
 from trilane.apps.inspect.inspect_file import inspect_file, kind_of
 from trilane.apps.inspect.inspection import Length, drawn_cameras, drawn_skeletons
+from trilane.avatars.bundle import bundle_folder
 from trilane.body.joints import JOINT_NAMES
 from trilane.errors import BadInputError
 
@@ -102,6 +103,11 @@ def test_a_camera(inputs: dict[str, Path]) -> None:
     assert document["facts"]["extent_m"] == [0.4, 0.0, 0.0]
     assert document["facts"]["path_m"] == 0.4
     assert document["detected"]["axes"] == "Z up"
+
+
+def test_an_avatar_is_validated_if_it_has_the_figures(inputs: dict[str, Path]) -> None:
+    assert inspect_file(inputs["avatar"]).facts["validated"] is False
+    assert inspect_file(bundle_folder("default")).facts["validated"] is True
 
 
 def test_a_picture_and_a_film(inputs: dict[str, Path], tmp_path: Path) -> None:
