@@ -3,9 +3,10 @@
 The room is the built-in background: a wooden floor at y = 0 and walls, as a mesh and two textures. Rule: mesh and
 textures are computed from constants and a fixed seed, and the room always holds the camera.
 
-Background bytes are copied unchanged, as sRGB; everything blended over them is blended in linear light. The planes come
-from the scene file; nothing is detected here. A contact shadow is a disc under a joint, which grows and fades with the
-height of its joint above the floor.
+Background bytes are copied unchanged, as sRGB; everything blended over them is blended in linear light. A shadow only
+multiplies light, which a sum on sRGB numbers does too, so its bytes are not converted. The planes come from the scene
+file; nothing is detected here. A contact shadow is a disc under a joint, which grows and fades with the height of its
+joint above the floor.
 
 A body fills about half of its rectangle, and a software driver takes as long for an unchanged pixel as for any other.
 Therefore the network's picture is cut into bands of rows. Each band is cut to the columns between its first and last
@@ -226,7 +227,8 @@ def spans(shown: Mask, margin: int) -> F32:
     return np.asarray(edges / (width, height, width, height), np.float32)
 
 
-# joint, radius on the floor in metres, strength there, height in metres over which it fades to 1/e
+# joint, radius on the floor in metres, strength there (at most 0.72, see `shadow.frag`), height in metres over which it
+# fades to 1/e
 DISCS = (
     ("left_ankle", 0.15, 0.65, 0.18),
     ("right_ankle", 0.15, 0.65, 0.18),
@@ -341,18 +343,19 @@ class ShadowPainter:
     def draw(self, view: Floats, projection: Floats, blobs: F32) -> None:
         """Darken the target in use.
 
-        `blobs` (N,4) float32: x, z, radius in metres, strength 0..1.
+        `blobs` (N,4) float32: x, z, radius in metres, strength 0 to 0.72.
         """
         if not len(blobs) or eye_of(view)[1] <= 0:
             return
         self._ctx.enable_only(moderngl.BLEND)
-        self._ctx.blend_func = moderngl.ZERO, moderngl.ONE_MINUS_SRC_ALPHA
+        self._ctx.blend_func = moderngl.ONE, moderngl.SRC_ALPHA
+        self._ctx.blend_equation = moderngl.FUNC_REVERSE_SUBTRACT
         upload(self._ctx, self._program["clip_from_world"], target_clip(view, projection))
         padded = np.zeros((self._count, 4), np.float32)
         padded[: len(blobs)] = blobs
         upload(self._ctx, self._program["blob"], padded)
-        with opengl.srgb_target():
-            self._discs.render(vertices=6 * len(blobs))
+        self._discs.render(vertices=6 * len(blobs))
+        self._ctx.blend_equation = moderngl.FUNC_ADD
 
 
 class AvatarPainter:

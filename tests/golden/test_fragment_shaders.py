@@ -134,9 +134,9 @@ def test_a_layer_is_quantised_and_clamped_before_the_target_clamps(gl: Any) -> N
         np.testing.assert_allclose(found * 255, expected, atol=1e-4)
 
 
-@pytest.mark.parametrize("strength", [1.0, 0.35])
+@pytest.mark.parametrize("strength", [0.72, 0.35])
 def test_a_shadow_falls_off_as_one_minus_r_squared_squared(gl: Any, strength: float) -> None:
-    """Black, of alpha strength (1 - r²)², 0 beyond the rim; nothing beyond the disc's square."""
+    """Light is multiplied by 1 - strength (1 - r²)², sRGB numbers accordingly; nothing beyond the disc's square."""
     shape = (16, 16)
     look_down = np.array([(1, 0, 0, 0), (0, 0, 1, 0), (0, 1, 0, 0), (0, 0, 0, 1.0)])  # clip x, y = world x, z
     uniforms = {"clip_from_world": look_down.T, "blob": np.array([(0.25, -0.125, 0.5, strength)])}
@@ -144,12 +144,13 @@ def test_a_shadow_falls_off_as_one_minus_r_squared_squared(gl: Any, strength: fl
     column, row = centres(shape)
     x, z = (2 * column - 1 - 0.25) / 0.5, (2 * row - 1 + 0.125) / 0.5
     inside = (np.abs(x) < 1) & (np.abs(z) < 1)
-    expected = strength * np.maximum(1 - x * x - z * z, 0) ** 2
+    light = 1 - strength * np.maximum(1 - x * x - z * z, 0) ** 2
     assert inside.sum() == 64
-    np.testing.assert_allclose(found[inside][:, 3], expected[inside], atol=NEAR)
-    assert not found[inside][:, :3].any()
+    kept = found[inside][:, 3]
+    np.testing.assert_allclose(kept, light[inside] ** (1 / 2.4), atol=0.0007)
+    np.testing.assert_allclose(found[inside][:, :3], np.tile(0.055 * (1 - kept[:, None]), 3), atol=NEAR)
     assert (found[~inside] == -7).all()
-    assert (expected[inside] == 0).any()
+    assert (light[inside] == 1).any()
 
 
 def sheet(across: F64, along: F64, dx: F64, dy: F64) -> F64:

@@ -13,6 +13,7 @@ from trilane.errors import MissingPartError, TrilaneError, UnitLostError
 from trilane.scene.schema import PlaneSpec
 from trilane.stages.gpu import opengl
 from trilane.stages.gpu.composite_painters import (
+    DISCS,
     Extent,
     floor_discs,
     floor_texture,
@@ -155,6 +156,11 @@ SHADOWS = {
     "head": (0.30, 0.45, 0.30),
     "wrist": (0.16, 0.45, 0.15),
 }
+
+
+def test_no_disc_is_darker_than_the_shader_computes() -> None:
+    """Beyond 0.72, the polynomial of `shadow.frag` leaves the power."""
+    assert max(strength for _, _, strength, _ in DISCS) <= 0.72
 
 
 @pytest.mark.parametrize("height", [-0.3, 0.0, 0.2, 0.45])
