@@ -57,12 +57,16 @@ REFERENCE = Variant()
 class Plan:
     """One application on one chip.
 
-    `network`: network that runs. `unit`: unit that runs it, gpu or dsp. `variant`: how the stages are joined.
-    `gpu_share`: part of the network's products that the GPU does while the DSP does the rest, 0 to below 1. `most_fps`:
-    rate that the application is held to, as by a display; None for the display's own. Policies that release frames at a
-    rate have the rate in their variant. `stretch`: factor on the network's expected time. `avatars`: number of avatars
-    in view; they share one tensor. `meshes`: their vertices, in whole meshes of an avatar; None for all of them. Raises
-    BadInputError for a value outside its range.
+    `network`: network that runs.
+    `unit`: unit that runs it, gpu or dsp.
+    `variant`: how the stages are connected and scheduled.
+    `gpu_share`: share of the network's products that the GPU does while the DSP does the rest, 0 to below 1.
+    `most_fps`: largest rate of shown frames, as if a display had this rate; None for the display of the profile.
+    `stretch`: factor on the network's expected time.
+    `avatars`: number of avatars in view; they share one tensor.
+    `meshes`: number of their vertices over that of an avatar's whole mesh; None for whole meshes.
+
+    Raises BadInputError for a value outside its range.
     """
 
     network: Network

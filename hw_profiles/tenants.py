@@ -152,12 +152,16 @@ def check_rate(name: str, fps: float) -> None:
 class Tenant:
     """An avatar, or a network by itself, as a `Pipeline`.
 
-    `networks`: one network for each shape of the tensor, number of avatars in view and levels of their meshes.
-    `frames`: for each frame, the place of its network in `networks`, or `SKIPS`; the list starts over after its end.
-    `unit`: unit of the network. `variant`: how the stages are joined. `is_bare`: whether there is nothing but the
-    network, whose result is due when the next frame comes. `avatars`: number of avatars in view for each of `networks`;
-    empty for one each. `meshes`: their vertices, in whole meshes, for each of `networks`; empty for whole ones.
-    `computes`: how the networks compute. Raises BadInputError for a unit or a rate out of range.
+    `networks`: one network for each combination of tensor shape, number of avatars in view and levels of their meshes.
+    `frames`: for each frame, the index of its network in `networks`, or `SKIPS`; after its end the list starts over.
+    `unit`: unit of the network.
+    `variant`: how the stages are connected and scheduled.
+    `is_bare`: whether it consists only of the network, whose result is due when the next frame comes.
+    `avatars`: number of avatars in view for each of `networks`; empty for one avatar each.
+    `meshes`: number of their vertices over that of a whole mesh, for each of `networks`; empty for whole meshes.
+    `computes`: precision and runtime of the networks.
+
+    Raises BadInputError for a unit or a rate out of range.
     """
 
     name: str

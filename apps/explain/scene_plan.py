@@ -3,8 +3,8 @@
 Rule: the run's own pose stage decides. `ScenePlan` measures how far a level of detail moves vertices on the picture,
 against the whole body in float64. Costs are computed, never measured, by the same model as `trilane predict`; joints
 count for each avatar in view, and vertices for the level of its mesh. Every figure says whether it is a bound, measured
-or computed. The drawing shows the plan, not the painted frame: the bodies' vertices, their rectangles and the tensor's,
-for a frame of each phase.
+or computed. The drawing shows the plan for a frame of each phase, not the painted frame: the bodies' vertices, the
+bodies' rectangles and the tensor's crop rectangles.
 """
 
 from __future__ import annotations
@@ -452,11 +452,11 @@ class CostModel:
     def _of(
         self, shape: Shape | None, avatars: int = 1, networks: Networks = FIRST, meshes: float | None = None
     ) -> FrameCost:
-        """Return the cost of a frame whose tensors have `shape`, None for no tensor, with `avatars` avatars in view.
+        """Return the cost of a frame with `avatars` avatars in view. `shape`: shape of its tensors; None for no tensor.
 
-        `networks`: numbers of the networks that paint them, each on a tensor. `meshes`: their vertices, in whole
-        meshes; None for all. A frame with nobody in view still counts one avatar's pose, because the pose stage looks
-        for somebody.
+        `networks`: numbers of the networks that paint the avatars, each on a tensor of its own. `meshes`: number of
+        their vertices over that of a whole mesh; None for whole meshes. With nobody in view, the pose of one avatar
+        still counts, because the pose stage looks for somebody.
         """
         plan = replace(self._plan(shape, avatars, networks), meshes=meshes)
         times = stage_times_ms(self._chip, plan, self._corners)
