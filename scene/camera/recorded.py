@@ -331,7 +331,7 @@ def _ups_and_rights(turns: F64, quarter: int) -> tuple[F64, F64]:
 
 
 def _price(turns: F64, up: F64, quarter: int) -> float | None:
-    """Return the cost of a guess by horizons and lines of sight; None if the pictures' own up is not up.
+    """Return the cost of a guess by horizons and lines of sight; None if it turns the pictures upside down or sideways.
 
     `turns` (N, 3, 3): camera axes. `up` (3,): guessed up. `quarter`: guessed number of quarter turns of the pictures.
     """
