@@ -247,8 +247,8 @@ def limb_turns(bone: F64, recorded: F64, carrier: F64, evidence: Sequence[Eviden
     """Return global rotations (T, 3, 3) that take the avatar's rest `bone` (3,) to the recorded directions (T, 3).
 
     `carrier` (T, 3, 3): rotations whose change over time the twist follows.
-    `evidence`: evidence for the constant part of the twist. Without evidence, the rest bone is laid on the recorded
-    bone by the least angle.
+    `evidence`: evidence for the constant part of the twist. Without evidence, the rest bone is laid by the least angle
+    on the mean recorded direction in the carrier's axes.
     """
     target = unit(recorded)
     within = unit(turned(transposed(carrier), target).mean(axis=0))
