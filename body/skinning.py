@@ -5,10 +5,10 @@ of detail may keep only the K largest weights of a vertex, scaled to sum to 1. T
 bound. The last level leaves nothing out.
 
 Proof. Let w be a vertex's weights, w' its weights at the level, and p its rest position. Let c_b be the centre of joint
-b, t_b the angle by which b is turned, and y_b the position to which joint b alone moves p. As in `weight_error_bound`,
-the change of weights moves the vertex by at most sum_b |E_b| |y_b - y_parent|, with E_b the sum of w' - w over b and
-the joints below b. The turn of b moves p by |y_b - y_parent| = 2 sin(t_b / 2) dist(p, axis of b) <= 2 sin(t_b / 2) |p -
-c_b|.
+b, and t_b the angle by which b is turned. Let y_b be the position to which joint b alone moves p. Let E_b be the sum of
+w' - w over b and the joints below b. As in `weight_error_bound`, the change of weights moves the vertex by at most
+sum_b |E_b| |y_b - y_parent|. The turn of b moves p by |y_b - y_parent| = 2 sin(t_b / 2) dist(p, axis of b) <= 2 sin(t_b
+/ 2) |p - c_b|.
 
 Pose blend shapes move p by at most r = sum_b r_b |R_b - I|, with r_b the norm of the vertex's block of blend shapes of
 joint b. If they are left out, the skinned vertex moves by at most r, because skinning averages rigid motions. If they

@@ -9,8 +9,8 @@ density. At density 1, tensor pixels coincide with pixels of the picture, and th
 Avatars of different networks have separate tensors of one shape; `apart` lays out the avatars of each network.
 
 **Error.** `error_px` converts an error in metres to pixels, with a proved bound. Let a vertex have the clip coordinates
-X, Y, W, and let r_x, r_y, r_w be the first three numbers of the clip matrix's rows 0, 1 and 3. With x = X / W and y = Y
-/ W, an error d of the vertex moves it on the picture by
+X, Y, W. Let r_x, r_y, r_w be the first three numbers of the clip matrix's rows 0, 1 and 3. With x = X / W and y = Y /
+W, an error d of the vertex moves it on the picture by
 
     (x' - x, y' - y) = J d / (W + r_w . d),   with the rows r_x - x r_w and r_y - y r_w of J,
 

@@ -30,7 +30,7 @@ from trilane.scene.lens import Known, Lens, cover
 from trilane.scene.recordings import natural
 from trilane.scene.rotations import quat_from_matrix
 
-#: Numbers in names are times only if the share LEAST_IN_STEP of neighbours is one step apart, and the film has fewer
+#: Numbers in names are times if the share LEAST_IN_STEP of neighbours is one step apart. Also, the film must have fewer
 #: than MOST_MISSING frames per picture.
 LEAST_IN_STEP, MOST_MISSING = 0.5, 4
 NAMED_GAPS = 3

@@ -5,7 +5,7 @@
 **Tensor.** A network paints a body best at about the size at which it was trained, whatever the distance. At a much
 smaller size it loses the face; at a much larger size it paints ragged edges. Therefore each visible avatar gets the
 number of pixels for which its network was trained. A body with more pixels on the picture than in its tensor loses
-detail, so it gets up to `MOST_GROWTH` times that number (docs/decisions/planner.md has the figures).
+detail. Such a body gets up to `MOST_GROWTH` times that number (docs/decisions/planner.md has the figures).
 
 Avatars of different networks have separate tensors of one shape. The network that needs the most pixels sets a frame's
 budget, and the least dense tensor sets its density.

@@ -1,7 +1,7 @@
 """Loads the camera of a scene: a built-in one by name, or a file whose format is found from its content.
 
-The scene may state the format. Otherwise a folder is recognised by the names of its files, and a text by its column
-names, or else by the number of columns and what they hold. A file that fits a second format, or another order of
+The scene may state the format. Otherwise a folder is recognised by the names of its files. A text is recognised by its
+column names, or else by the number of columns and their content. A file that fits a second format, or another order of
 columns, is refused. The message then names both possibilities, and the key that decides. A note gives the reason of
 each guess.
 """
@@ -99,9 +99,9 @@ EXACT = 1e-6
 #: Directions count as equal above these mean cosines: the camera's movement and an axis of the camera; an axis of the
 #: camera and one of the world.
 ALONG, UPRIGHT = 0.9, 0.7
-#: Least distance of a point that a camera goes round, and the largest share of that distance by which its lines of
-#: sight may miss the point. A person who pans holds the camera nearer than this to the axis of the turn; such lines of
-#: sight meet behind the camera.
+#: Least distance of a point that a camera goes round, and by how much lines of sight may miss the point, as a share of
+#: its distance. A person who pans holds the camera nearer than this to the axis of the turn; such lines of sight meet
+#: behind the camera.
 LEAST_AWAY, MOST_MISSED = 1.0, 0.2
 #: Range of depths below 0, metres, of a camera held by a person, if Y is down and the floor is at 0. With Y up, no
 #: camera is that low. In a phone's world, the origin is where the phone was, so no camera is that low either.
@@ -223,8 +223,8 @@ def _require_pose(path: Path, layout: TableLayout) -> None:
 def _require_clock(path: Path, numbers: F64, others: Iterable[int]) -> None:
     """Raise BadInputError if a column of `numbers` (N, columns) other than the first looks like times.
 
-    `others`: indices of columns to check. A column looks like times if its numbers are as large as times since 1970, or
-    if they grow evenly while those of the first column do not.
+    `others`: indices of columns to check. A column looks like times if its numbers are as large as times since 1970. It
+    also looks like times if it grows evenly and the first column does not.
     """
     if len(numbers) < LEAST_ROWS:
         return

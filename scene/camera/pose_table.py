@@ -398,8 +398,8 @@ MATRIX = 12
 ROW_ORDER = "the order r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
 #: Largest deviation of a quaternion's length from 1; rounding to two decimal places changes the length by 0.01 at most.
 MOST_OFF = 0.02
-#: A column is a clock if all steps differ from their median by less than the share EVEN, and no clock if a step differs
-#: by UNEVEN or more. It is judged only if it has LEAST_OF_A_CLOCK rows.
+#: A column is a clock if all steps differ from their median by less than the share EVEN. A column is no clock if a step
+#: differs by UNEVEN or more. It is judged only if it has LEAST_OF_A_CLOCK rows.
 EVEN, UNEVEN, LEAST_OF_A_CLOCK = 0.01, 0.5, 8
 
 

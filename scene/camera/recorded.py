@@ -9,10 +9,10 @@ NeRF have no unit, but many are in metres. Their scale is guessed only if the vi
 fits.
 
 **Up.** People hold a camera level. Each axis of the world is tried with each quarter turn of the picture. A guess costs
-more the farther the horizon is from level, the more steeply the camera looks down or up, and the more this elevation
-changes. It also costs more if the axis is not the format's usual one, or if the picture is turned. The cheapest guess
-wins; if another guess is nearly as cheap, a note names it. If no axis fits, and the horizons agree on a direction
-between the axes, that direction is up.
+more if the horizon is far from level, if the camera looks steeply down or up, or if this elevation changes. A guess
+also costs more if the axis is not the format's usual one, or if the picture is turned. The cheapest guess wins; if
+another guess is nearly as cheap, a note names it. If no axis fits, and the horizons agree on a direction between the
+axes, that direction is up.
 """
 
 from __future__ import annotations
@@ -171,9 +171,9 @@ UP: dict[str, tuple[float, float, float]] = {
 }
 #: A picture's up is up in the world only if their mean cosine is above this.
 LEAST_UP_COSINE = 0.3
-#: Costs: per radian by which the horizon is off level (root mean square), per radian by which the elevation of the line
-#: of sight varies (standard deviation), and for a view along the vertical. People turn round, but seldom look up and
-#: down.
+#: Costs per radian by which the horizon is off level (root mean square), and per radian by which the elevation of the
+#: line of sight varies (standard deviation). The third is the cost of a view along the vertical. People turn round, but
+#: seldom look up and down.
 PER_ROLL, PER_TILT, PER_PITCH = 2.0, 1.0, 0.5
 
 
@@ -203,8 +203,8 @@ ANY_WORLD = _Prices(axis=0.2, turn=0.4, between=0.25, nadir=0.5, nadir_deg=5.0)
 LEVELLED = _Prices(axis=0.4, turn=0.1, between=None, nadir=0.3, nadir_deg=18.0)
 #: Costs that compare horizons alone.
 FREE = _Prices(axis=0.0, turn=0.0, between=None, nadir=0.0, nadir_deg=18.0)
-#: A direction between the axes is believed if the cameras pan by at least LEAST_PAN, radians (root mean square), and if
-#: its cosine with every axis is at most MOST_AXIS_COSINE.
+#: A direction between the axes is believed if the cameras pan by at least LEAST_PAN, radians (root mean square). Also,
+#: its cosine with every axis must be at most MOST_AXIS_COSINE.
 LEAST_PAN, MOST_AXIS_COSINE = 0.15, 0.995
 #: The world's axes count as the first picture's axes (OpenGL or optical) if their cosines are above this. A note then
 #: says OF_FIRST, as nothing else shows this case.
@@ -331,7 +331,7 @@ def _ups_and_rights(turns: F64, quarter: int) -> tuple[F64, F64]:
 
 
 def _price(turns: F64, up: F64, quarter: int) -> float | None:
-    """Return the cost of a guess by horizons and lines of sight; None if the pictures' own up is not up.
+    """Return the cost of a guess by horizons and lines of sight; None if it turns the pictures upside down or sideways.
 
     `turns` (N, 3, 3): camera axes. `up` (3,): guessed up. `quarter`: guessed number of quarter turns of the pictures.
     """

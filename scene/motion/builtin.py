@@ -6,7 +6,7 @@ that feet do not slide. All times wrap around the cycle. Positions are in metres
 
 Tables state the times of steps, walks, turns and waves; the curves between them are computed. A cycle ends where it
 began. A `side` is +1 for left and -1 for right. In the poses of arms and hands, rotations are relative to the parent
-joint, from the T pose, with +X left, +Y up and +Z ahead.
+joint, from the T pose. Axes are +X left, +Y up and +Z ahead.
 """
 
 from __future__ import annotations

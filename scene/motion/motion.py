@@ -168,8 +168,9 @@ class Motion:
 BODY_JOINT_COUNT = 22
 #: Most frames that are examined, evenly spread over the motion.
 MOST_LOOKED_AT = 200
-#: A person lies, or stands on the hands, if the median height of the lowest joint is in LIES_M and 80 % of the heights
-#: are within LIES_SPREAD_M; metres. Joints of a lying person are up to half a trunk's depth above the floor.
+#: A person lies, or stands on the hands, if the median height of the lowest joint is in LIES_M. Also, 80 % of the
+#: heights must be within LIES_SPREAD_M; metres. Joints of a lying person are up to half a trunk's depth above the
+#: floor.
 LIES_M, LIES_SPREAD_M = (-0.02, 0.17), 0.08
 #: The same ranges for a person who stands or walks. Toes are 2 to 5 cm above the floor, and floors of recordings are
 #: off by centimetres.

@@ -154,7 +154,7 @@ class FoundTable:
         return bool(key) and self.table.get(key) is not None
 
     def array(self, key: str) -> NDArray[Any]:
-        """Return the value of `key` as an array. Raises BadInputError when it is not one."""
+        """Return the value of `key` as an array. Raises BadInputError when the value is not an array of numbers."""
         value = self.table[key]
         array = array_of(value)
         if array is None:

@@ -5,8 +5,8 @@ which frames the person stands, and whether a skeleton is built like the avatar'
 
 **Trunk.** Hip line, trunk line and shoulder line define coordinate frames, in the same way for the recording and for
 the avatar at rest. A joint's rotation takes the avatar's frame to the recorded one. Programs put the joints of the
-trunk at different depths in the body. Therefore, in a skeleton that is not built like the avatar's, the constant pitch
-of each part comes from the moments at which the person stands straight.
+trunk at different depths in the body. Therefore, if a skeleton is not built like the avatar's, moments at which the
+person stands straight determine the constant pitch of each part.
 
 **Limbs.** A bone points where the recorded bone points. Its twist about its length follows the file's own rotations, so
 that it never flips when the limb is straight. These rotations are right except for one constant angle. The angle is
@@ -247,8 +247,8 @@ def limb_turns(bone: F64, recorded: F64, carrier: F64, evidence: Sequence[Eviden
     """Return global rotations (T, 3, 3) that take the avatar's rest `bone` (3,) to the recorded directions (T, 3).
 
     `carrier` (T, 3, 3): rotations whose change over time the twist follows.
-    `evidence`: evidence for the constant part of the twist; without any, this part is the least from the rest pose to
-    the carrier.
+    `evidence`: evidence for the constant part of the twist. Without evidence, the rest bone is laid by the least angle
+    on the mean recorded direction in the carrier's axes.
     """
     target = unit(recorded)
     within = unit(turned(transposed(carrier), target).mean(axis=0))
@@ -441,9 +441,9 @@ def turns_of_trunk(recorded: Trunk, rest: Trunk, stands: NDArray[np.bool_], own:
 def with_neck_on(line: F64, turns: dict[str, F64], rest: Tracks) -> dict[str, F64]:
     """Return `turns` with spine1 and spine2 turned once more, so that the neck is in the direction `line` (T, 3).
 
-    `line`: vector from the pelvis, of any length. The neck is at q + R c: R is the rotation to find, c the vector from
-    the lowest joint of the spine to the highest, and q the sum of the other bones. The neck must also be at s times the
-    unit vector of `line`. Therefore s is chosen so that the neck is |c| from q.
+    `line`: vector from the pelvis, of any length. The neck is at q + R c, with R the rotation to find. c is the vector
+    from the lowest joint of the spine to the highest, and q the sum of the other bones. The neck must also be at s
+    times the unit vector of `line`. Therefore s is chosen so that the neck is |c| from q.
     """
     joint = {name: rest.places[name][0] for name in ("pelvis", *SPINE, "neck")}
     along = unit(line)
