@@ -1,5 +1,5 @@
 #version 330
-// Writes how much light a contact shadow takes away, as alpha; it falls smoothly to 0 at the rim.
+// Writes the share of light that a contact shadow removes, as alpha. The share falls smoothly to 0 at the rim.
 
 in vec2 v_place;
 flat in float v_strength;
