@@ -74,7 +74,7 @@ def read_graph(path: Path, input_shapes: Mapping[str, Shape] | None = None) -> G
 def _checked(
     data: bytes, folder: Path, given: Sequence[tuple[str, Shape]]
 ) -> tuple[onnx.ModelProto, NumberFormat, Work]:
-    """Return (graph, number format, work) of a file's bytes; raises UnexpectedValue.
+    """Return (graph, number format, work) of a file's bytes. Raises UnexpectedValue.
 
     `folder`: folder of the file.
     `given`: shapes of inputs by name.

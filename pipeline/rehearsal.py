@@ -67,7 +67,7 @@ class Chain:
     def frame(self, number: int, rung: int = 0) -> dict[str, Done]:
         """Let every stage do frame `number`, one stage after the other, and return the answers by stage.
 
-        Raises UnitError when a stage fails or does not answer, and KeyboardInterrupt when interrupted.
+        Raises UnitError if a stage fails or does not answer, and KeyboardInterrupt when interrupted.
         """
         slots = [-1, *(self._frames % count for count in self._slots), -1]
         self._frames += 1
@@ -136,7 +136,7 @@ def rehearse(
     `frames`: numbers of the frames that are done.
     `assets`, `starter`: arrays and fork server, as for a run.
 
-    Raises TrilaneError when a unit cannot start or a stage fails, and KeyboardInterrupt when interrupted.
+    Raises TrilaneError if a unit cannot start or a stage fails, and KeyboardInterrupt when interrupted.
     """
     with contextlib.ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts())
@@ -248,7 +248,7 @@ def try_in_turns(
     `assets`, `starter`: arrays and fork server, as for a run.
     `is_enough`: function that is called with the rounds so far.
 
-    Raises TrilaneError when a unit cannot start or a stage fails, and KeyboardInterrupt when interrupted.
+    Raises TrilaneError if a unit cannot start or a stage fails, and KeyboardInterrupt when interrupted.
     """
     rounds: list[Round] = []
     cores = sorted({core for group in groups for place in group.places for own in place.values() for core in own})

@@ -438,7 +438,7 @@ class Graph:
 def chain(stages: Iterable[tuple[str, str]], edge: str, latency_to: str) -> Graph:
     """Return the graph of `stages`, pairs of a name and its unit, with `edge` as the rule of every edge.
 
-    Raises ValueError when two stages have the same name, and when `latency_to` is none of them.
+    Raises ValueError if two stages have the same name, or if `latency_to` is none of them.
     """
     specs = tuple(StageSpec(name, unit) for name, unit in stages)
     return Graph(specs, (edge,) * (len(specs) - 1), latency_to)

@@ -74,7 +74,7 @@ def _stages(config: RunConfig) -> Iterator[PipelineStage]:
 def run_avatar(
     config: RunConfig, assets: Assets, *, edge: str = DEFAULT_EDGE, frames: int | None = None, **options: Any
 ) -> RunResult:
-    """Run the avatar of `config`; raises as `run_pipeline` does.
+    """Run the avatar of `config`. Raises as `run_pipeline` does.
 
     `assets`: arrays of the same avatars and scene, from `trilane.stages.avatar_assets.pack_assets`.
     `edge`: rule of every edge.
@@ -139,7 +139,7 @@ def tried(
     limit_s: float = math.inf,
     least: int = 1,
 ) -> list[Round]:
-    """Return the measured rounds of `placements`, which run in turns; raises as `measured_times` does.
+    """Return the measured rounds of `placements`, which run in turns. Raises as `measured_times` does.
 
     `checked`: run to measure.
     `rounds`: number of rounds, on frames spread over the scene.

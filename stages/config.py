@@ -176,7 +176,7 @@ class RunConfig(StrictModel):
         return units
 
     def opened_window(self) -> LiveWindow | None:
-        """Map the window and return it, if any. Raises OSError when its maker is gone."""
+        """Map the window and return it, if any. Raises OSError if its maker is gone."""
         output = self.scene.output
         return None if self.window is None else LiveWindow.opened(self.window, output.height, output.width)
 

@@ -92,7 +92,7 @@ class Segment:
         require_name(self._path, self._digests.fileno())
 
     def add(self, frame: int, pixels: NDArray[np.uint8], repeats: bool = False) -> None:
-        """Add frame number `frame` to the video; raises UnwrittenError.
+        """Add frame number `frame` to the video. Raises UnwrittenError.
 
         `pixels`: (height, width, 3) RGB.
         `repeats`: whether the pixels equal those of the last call, which are already converted for the encoder.

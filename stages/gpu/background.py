@@ -67,7 +67,7 @@ A_VIDEO = "a video, a picture, or a folder of pictures"
 
 
 def look_at_picture(path: Path) -> Stored:
-    """Return size and turn of the picture in `path`, from its head. Raises BadInputError."""
+    """Return size and turn of the picture in `path`, without decoding it. Raises BadInputError if that fails."""
     with _opened(path) as image:
         return Stored((image.height, image.width), QUARTERS.get(_orientation(image), 0))
 

@@ -85,7 +85,10 @@ class DrawnFrames:
 
 
 class StillBackground:
-    """Keeps a background that does not change. `target`: framebuffer with one RGBA colour attachment of 8 bits."""
+    """Keeps the pixels of a background, so that one that does not change is drawn only once.
+
+    `target`: framebuffer with one RGBA colour attachment of 8 bits.
+    """
 
     def __init__(self, target: Any) -> None:
         self._target = target
