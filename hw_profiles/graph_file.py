@@ -158,7 +158,11 @@ def _tensors(model: onnx.ModelProto) -> Iterator[TensorProto]:
 
 
 def _numbers(model: onnx.ModelProto) -> NumberFormat:
-    """Return the graph's number format: `w8a8` if layers have integer types or read dequantised activations."""
+    """Return the graph's number format.
+
+    It is `w8a8` if a layer is an integer operator or reads dequantised activations, else `float`. `not said` means that
+    a float layer has a weight that a caller may replace, as the graph lists it as an input.
+    """
     graph, constants = model.graph, constant_tensors(model.graph)
     dequantised = {
         name

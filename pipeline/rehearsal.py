@@ -94,9 +94,9 @@ class Chain:
 def on_rungs(chain: Chain, frames: Sequence[int], rungs: int, follow: Sequence[str]) -> list[StageAlone]:
     """Return the isolated time of each stage of `follow` on each rung of a ladder.
 
-    Each time is the median over `frames`. All frames are done on one rung before the next rung, so that no frame
-    follows itself. With several frames, the first frame of each rung warms up. If a further rung does not make a stage
-    faster, the stage is left out. An example is a scene with nobody on the screen in these frames.
+    Each time is the median over `frames`. All frames are done on one rung before the next rung, so that no stage does
+    the same frame twice in a row. With several frames, the first frame of each rung warms up. If a further rung does
+    not make a stage faster, the stage is left out. An example is a scene with nobody on the screen in these frames.
 
     `rungs`: number of rungs.
 

@@ -319,7 +319,7 @@ NO_SLOT: Final = 255
 def packed(slots: Sequence[int]) -> int:
     """Return the slots of a job's inputs as one number, with the first input in the lowest byte; -1 without inputs.
 
-    `slots`: slot of each input; -1 for an input that takes the newest frame, while there is none.
+    `slots`: slot of each input; -1 for an input of the newest frame that has no frame yet.
     """
     if len(slots) == 1:
         return slots[0] if slots[0] >= 0 else NO_SLOT

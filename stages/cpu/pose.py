@@ -153,9 +153,9 @@ class ModelledBody:
         return DetailChoice(mesh, level if self.details else FINEST, errors[level])
 
     def _moved_m(self, level: MeshLevel, posed: Posed, stretch: Stretch, w: float) -> float:
-        """Return the bound on the error of `level` in metres.
+        """Return a bound on the error of `level`, metres, in the pose `posed`.
 
-        If its least error in any pose is already above the budget, return that.
+        If the level's least error in any pose is already above the budget, that least error is returned.
         """
         if error_px(level.least_m, stretch, w) > self.budget_px:
             return level.least_m

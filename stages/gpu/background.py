@@ -134,7 +134,7 @@ def open_background(path: Path, shape: Shape, fps: float, camera: CameraPath | N
     """Return the opened background in `path`; a folder's pictures follow each other at `fps`. Raises BadInputError.
 
     `shape`: (height, width) of its pictures.
-    `camera`: camera of the scene, to whose views the pictures may belong; None: they belong to none.
+    `camera`: camera of the scene. The pictures may belong to its views; None: they belong to no views.
     """
     turned = () if camera is None else camera.optics.turned
     if camera is not None and camera.is_held:
@@ -238,7 +238,7 @@ def check_pictures(path: Path, fps: float, frames: int, camera: CameraPath) -> N
 
     `fps`: rate at which a folder's pictures follow each other, and the frames of the run.
     `frames`: number of frames of the run.
-    `camera`: camera of the scene, to whose views the pictures may belong.
+    `camera`: camera of the scene. The pictures may belong to its views.
     """
     if path.is_dir():
         for _ in _checked(_shown(path, fps, frames, camera)):
