@@ -50,7 +50,7 @@ LIMIT_S = 0.5  # seconds after the warm-up after which no further frame begins
 class Chain:
     """Sends single frames through the stages of `graph`, which must be a chain.
 
-    `processes`: for each unit, the processes to which it belongs; its process is ready and has no job.
+    `processes`: by unit, the `UnitProcesses` that has the unit's process. The process must be ready and have no job.
     `whole`: whether the last stage takes part.
     """
 

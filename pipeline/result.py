@@ -173,7 +173,7 @@ class JournalFile:
 
 
 class JobSource(Protocol):
-    """The clock of the run (`trilane.pipeline.realtime_clock.RealtimeClock`)."""
+    """The part of `trilane.pipeline.realtime_clock.RealtimeClock` from which a run's result takes the jobs."""
 
     @property
     def waiting(self) -> int:
