@@ -64,7 +64,7 @@ class Residual:
 
     @property
     def left_out_error(self) -> float:
-        """Relative error of the fit to all other measurements."""
+        """Relative error of the prediction that the fit to all other measurements gives."""
         return self.left_out_ms / self.measured_ms - 1
 
 

@@ -360,10 +360,12 @@ def solve(
     prior: tuple[Numbers, Numbers],
     start: Numbers | None = None,
 ) -> Fitted:
-    """Return the most probable numbers.
+    """Return the most probable numbers of an engine.
 
+    `engine`: engine to fit.
+    `chips`: names of the chips of the rows.
     `data`: rows to fit.
-    `prior`: logarithms of the values, and spreads, before the fit.
+    `prior`: (logarithms of the numbers, their standard deviations) before the fit.
     `start`: numbers at which the search begins; None for the prior.
     """
     mean, spread = (numbers.flat for numbers in prior)
@@ -421,7 +423,7 @@ class LeftOut(NamedTuple):
 
 
 def folds(networks: Sequence[str], seed: int = 0) -> Iterator[frozenset[str]]:
-    """Yield FOLDS disjoint parts of the networks, drawn by `seed`; the network ALWAYS is in none of them."""
+    """Yield FOLDS disjoint parts of the networks, drawn at random with `seed`. No part has the network ALWAYS."""
     others = sorted(set(networks) - {ALWAYS})
     drawn = np.random.default_rng(seed).permutation(len(others))
     for fold in range(FOLDS):

@@ -74,7 +74,7 @@ def read_graph(path: Path, input_shapes: Mapping[str, Shape] | None = None) -> G
 def _checked(
     data: bytes, folder: Path, given: Sequence[tuple[str, Shape]]
 ) -> tuple[onnx.ModelProto, NumberFormat, Work]:
-    """Return (graph, number format, work) of a file's bytes; raises UnexpectedValue.
+    """Return (graph, number format, work) of a file's bytes. Raises UnexpectedValue.
 
     `folder`: folder of the file.
     `given`: shapes of inputs by name.
@@ -158,7 +158,11 @@ def _tensors(model: onnx.ModelProto) -> Iterator[TensorProto]:
 
 
 def _numbers(model: onnx.ModelProto) -> NumberFormat:
-    """Return the graph's number format: `w8a8` if layers have integer types or read dequantised activations."""
+    """Return the graph's number format.
+
+    It is `w8a8` if a layer is an integer operator or reads dequantised activations, else `float`. `not said` means that
+    a float layer has a weight that a caller may replace, as the graph lists it as an input.
+    """
     graph, constants = model.graph, constant_tensors(model.graph)
     dequantised = {
         name

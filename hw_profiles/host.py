@@ -148,7 +148,7 @@ def _listed(text: str, listed: str) -> tuple[int, ...]:
 def host_cores(numbers: Sequence[int]) -> tuple[CpuCore, ...]:
     """Return the cores with these numbers, with their siblings and speeds from the kernel.
 
-    If the kernel does not say so, a core has no siblings and is as fast as the other cores.
+    Cores for which the kernel does not state these have no siblings and are equally fast.
     """
     root = machine.here.sys / "devices/system/cpu"
     siblings = {number: _number(root / f"cpu{number}/topology/thread_siblings_list", number) for number in numbers}

@@ -3,7 +3,7 @@
     time = price(profile, work, "dsp", corners_of(profile, "burst"))
     time.total_ms, time.operators[0].bound, interval(profile, work, time).why
 
-`job_ms` is the part that belongs to no operator: waking the unit, conversion of the input. An operator that the
+`job_ms` is the part that belongs to no operator: the unit wakes, and the input is converted. An operator that the
 runtime folds into another one is not listed. `predict_network` adds power, rates and the course over minutes; other
 units are idle.
 """

@@ -196,7 +196,7 @@ def _picture_tensors(graph: Any, inputs: list[str]) -> int:
 
 
 def graph_facts(model: Any) -> dict[str, Any]:
-    """Return the facts of a network for reports; raises as `count_work` does.
+    """Return the facts of a network for reports. Raises as `count_work` does.
 
     `parameters` is the number of weight elements, and `gmac` the number of multiply-accumulates in 1e9.
     """

@@ -378,7 +378,7 @@ def first_result(node: Any) -> str:
 
 
 def _kind(node: Any) -> str:
-    """Return the type of the float operator that does the same work; empty for an unknown domain."""
+    """Return the type of the float operator that does the same work as `node`; empty for an unknown domain."""
     return PLAIN.get(node.op_type, node.op_type) if node.domain in DOMAINS else ""
 
 

@@ -377,8 +377,9 @@ def steady_ms(run: Simulation, stop_ns: int, repeats: int) -> float:
 
 
 def over_ends(ms_at: Callable[[Ends], float], is_unsure: bool = True) -> FrameInterval:
-    """Return a time with its interval, from the times if all stages are at the low or at the high end of theirs.
+    """Return a time with its interval.
 
+    The ends of the interval are the times that result if all stages have the low ends, or the high ends, of theirs.
     The errors of all stages count as one error, because they come from one model of one chip, or from one run.
 
     `ms_at`: function that returns the time in ms at an end.
@@ -412,7 +413,7 @@ def _intervals(
     }
 
     def around_mean(key: str, mean: float) -> dict[str, float]:
-        """Return the interval around `mean`: the relative changes in the short runs, which all have the same jitter."""
+        """Return the interval around `mean`, with the relative width that the three short runs give for `key`."""
         usual = runs["expected"][key]["mean"]
         _, low, high = over_ends(lambda end: mean * runs[end][key]["mean"] / usual if usual else mean)
         return {"low": low, "high": high}

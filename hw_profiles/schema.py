@@ -279,7 +279,7 @@ class Unit(ProfileTable):
 
     @property
     def slower(self) -> float:
-        """How many times as long as by its numbers the unit takes, as measured; 1 for a unit without measurement."""
+        """The measured time of the unit divided by the time that its numbers give; 1 without a measurement."""
         return 1.0 if self.measured is None else self.measured.slower[self.threads]
 
     @property

@@ -184,7 +184,7 @@ class _Chip:
         return moved + sum(self._keep(name, index) for name in (layer.writes, *layer.more))
 
     def _keep(self, name: str, index: int) -> int:
-        """Put the result `name` of the layer `index` on the chip; return the elements that are moved out for it."""
+        """Put the result `name` of the layer `index` on the chip. Return how many elements are moved out for it."""
         size, soon, gone = self._sizes[name], self._next(name, index), 0
         if soon == len(self._layers):
             return size

@@ -499,7 +499,7 @@ class Budget:
         self._keep()
 
     def _keep(self) -> None:
-        """Store whole blocks; when there are MOST_BLOCKS, merge each two neighbours into one."""
+        """Store whole blocks. As soon as there are MOST_BLOCKS, merge each two neighbours into one."""
         while len(self._open) >= self._merged:
             block: dict[Part, int] = {}
             for each in self._open[: self._merged]:

@@ -153,7 +153,7 @@ class PipelineStage(Described):
 
 
 class PipelineEdge(Described):
-    """The slots behind a stage, which the next stage reads; in a graph, all readers of the stage read them.
+    """The slots that a stage writes. The next stage reads them; in a graph, all readers of the stage do.
 
     `payload_bytes`: size of every packet's payload.
     `header`: dtype of every packet's header, made by `trilane.transport.packets.header_dtype`.
@@ -213,7 +213,7 @@ class Pipeline(Described):
             self._check_headers(self.edges_into(self.bypass[1]))
 
     def _check_headers(self, names: tuple[str, ...]) -> None:
-        """Raise UnexpectedValue when the edges at a bypass's end have different headers."""
+        """Raise UnexpectedValue if the edges `names`, which meet at the end of a bypass, have different headers."""
         headers = {edge.header for name, edge in zip(self.edge_names, self.edges, strict=True) if name in names}
         if len(headers) > 1:
             raise UnexpectedValue(f"different headers of edges {', '.join(names)}", "one, as a bypass joins them")
@@ -281,7 +281,7 @@ class Pipeline(Described):
         return tuple(stage for stage in self.stages if stage.unit == unit)
 
     def with_rule(self, rule: str) -> Pipeline:
-        """Return the same pipeline with `rule` for every edge; raises BadInputError for a rule that does not fit."""
+        """Return the same pipeline with `rule` for every edge. Raises BadInputError for a rule that does not fit."""
         changed = self.model_copy(update={"edges": tuple(e.model_copy(update={"rule": rule}) for e in self.edges)})
         try:
             edge_rule(rule)

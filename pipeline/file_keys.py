@@ -165,7 +165,7 @@ def _bytes_of(dtype: str) -> int:
 
 
 def port_type(text: object) -> PortType:
-    """Return the type that a text such as `u8 256x256x3` states; raises UnexpectedValue for another text."""
+    """Return the type that a text such as `u8 256x256x3` states. Raises UnexpectedValue for another text."""
     expected = f"a type and sizes, such as 'u8 256x256x3', of at most {MOST_PORT_BYTES >> 20} MiB"
     found = re.fullmatch(r"(\w+) (\d{1,9}(?:x\d{1,9}){0,7})", text) if isinstance(text, str) else None
     if found is None:

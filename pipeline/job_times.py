@@ -180,10 +180,12 @@ def preempted_ns(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int) -> int:
 
 
 def lost_in_job(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int, has_device: bool) -> Lost:
-    """Return the times that a job of `wall_ns` lost.
+    """Return the times that a job lost because its unit was preempted or asleep.
 
-    The unit was busy for the rest of the job. Without a device the rest is at most `cpu_ns`.
+    The unit was busy for the rest of the job. Without a device, the rest is at most `cpu_ns`.
 
+    `wall_ns`: length of the job.
+    `cpu_ns`, `delay_ns`: CPU time and run delay of the unit's threads in the job, summed over the threads.
     `cores`: number of the unit's cores.
     `has_device`: whether a device (a graphics card, a modelled chip) works while the unit's threads sleep.
     """
@@ -433,7 +435,7 @@ def availability() -> str:
 
 
 def _open(kind: CounterReading) -> int:
-    """Open a counter and return its file; raises OSError."""
+    """Open a counter and return its file. Raises OSError."""
     flags = INHERIT | EXCLUDE_KERNEL | EXCLUDE_HYPERVISOR
     attributes = ATTR.pack(kind.kind, ATTR.size, kind.config, 0, 0, ENABLED_TIME | RUNNING_TIME, flags, 0, 0, 0)
     return machine.here.open_counter(attributes, CLOSE_ON_EXEC)

@@ -128,7 +128,8 @@ class JournalWriter:
     If the file cannot be written, such as on a full disk, one method raises an UnwrittenError. After that, nothing more
     is written.
 
-    `path`: path of a file that does not exist yet; raises OSError if the file cannot be made.
+    `path`: path of a file that does not exist yet.
+    Raises OSError if the file cannot be made.
     `failure`: the UnwrittenError that was raised, or None.
     """
 
@@ -249,7 +250,7 @@ class JournalReader:
 
 
 def journal_in(folder: Path) -> Path | None:
-    """Return the path of a run folder's journal, or None; raises BadInputError for anything that is not a file."""
+    """Return the path of a run folder's journal, or None. Raises BadInputError for anything that is not a file."""
     path = folder / NAME
     if path.exists() and not path.is_file():
         require_file(path, EXPECTED)

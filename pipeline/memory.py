@@ -63,7 +63,10 @@ class EdgeRegion(Model):
 
 @contextlib.contextmanager
 def edge_regions(pipeline: Pipeline) -> Iterator[dict[str, EdgeRegion]]:
-    """Yield a region for each edge, by the edge's name; raises TrilaneError when there is too little memory."""
+    """Within the context, each edge has a region of memory: yield the regions by the edges' names.
+
+    Raises TrilaneError if there is too little memory.
+    """
     regions: dict[str, EdgeRegion] = {}
     try:
         for name, edge in zip(pipeline.edge_names, pipeline.edges, strict=True):
@@ -86,7 +89,7 @@ _KINDS = "?biufcmMSU"  # kinds of NumPy types whose values contain no Python obj
 def share_assets(assets: Assets) -> int:
     """Return a descriptor of sealed memory that holds `assets`.
 
-    Raises TrilaneError when there is too little memory, and for arrays of another kind than numbers, times and text.
+    Raises TrilaneError if there is too little memory, and for arrays of another kind than numbers, times and text.
     """
     index, end = _index(assets)
     free = machine.here.free_bytes()

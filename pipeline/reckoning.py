@@ -313,17 +313,17 @@ class Reckoning:
             self._budget.present(explained)
 
     def close(self) -> Reckoned:
-        """Return the result; called after the last job."""
+        """Return the result. It is called after the last job."""
         budget = self._budget.close()
         bound = _bound(self._budget, self._unit_of, self._what_if.close())
         return Reckoned(budget, self.sharing.close(), {**self._efficiencies.close(), **bound})
 
 
 def _bound(budget: Budget, unit_of: Mapping[str, str], slowed: Slowed | None) -> dict[str, Any]:
-    """Return `bottleneck` and `bound` of a report; both None where there is no path.
+    """Return `bottleneck` and `bound` of a report; both are None if there is no path.
 
-    The bound is what costs most when it is slowed; without a replay that can be trusted, what has most of the path.
-    Where most of the path is no unit's, that is the bottleneck, whatever slowing a unit costs.
+    The bound is the unit, and the stage, that costs most if it is slowed. If the replay cannot be trusted, it is the
+    one with the largest part of the path. If that part belongs to no unit, its owner is the bottleneck in any case.
     """
     names = budget.names(unit_of)
     path = {kind: budget.largest(name_of) for kind, name_of in names.items()}

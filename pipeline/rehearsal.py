@@ -50,7 +50,7 @@ LIMIT_S = 0.5  # seconds after the warm-up after which no further frame begins
 class Chain:
     """Sends single frames through the stages of `graph`, which must be a chain.
 
-    `processes`: for each unit, the processes to which it belongs; its process is ready and has no job.
+    `processes`: by unit, the `UnitProcesses` that has the unit's process. The process must be ready and have no job.
     `whole`: whether the last stage takes part.
     """
 
@@ -67,7 +67,7 @@ class Chain:
     def frame(self, number: int, rung: int = 0) -> dict[str, Done]:
         """Let every stage do frame `number`, one stage after the other, and return the answers by stage.
 
-        Raises UnitError when a stage fails or does not answer, and KeyboardInterrupt when interrupted.
+        Raises UnitError if a stage fails or does not answer, and KeyboardInterrupt when interrupted.
         """
         slots = [-1, *(self._frames % count for count in self._slots), -1]
         self._frames += 1
@@ -94,9 +94,9 @@ class Chain:
 def on_rungs(chain: Chain, frames: Sequence[int], rungs: int, follow: Sequence[str]) -> list[StageAlone]:
     """Return the isolated time of each stage of `follow` on each rung of a ladder.
 
-    Each time is the median over `frames`. All frames are done on one rung before the next rung, so that no frame
-    follows itself. With several frames, the first frame of each rung warms up. If a further rung does not make a stage
-    faster, the stage is left out. An example is a scene with nobody on the screen in these frames.
+    Each time is the median over `frames`. All frames are done on one rung before the next rung, so that no stage does
+    the same frame twice in a row. With several frames, the first frame of each rung warms up. If a further rung does
+    not make a stage faster, the stage is left out. An example is a scene with nobody on the screen in these frames.
 
     `rungs`: number of rungs.
 
@@ -136,7 +136,7 @@ def rehearse(
     `frames`: numbers of the frames that are done.
     `assets`, `starter`: arrays and fork server, as for a run.
 
-    Raises TrilaneError when a unit cannot start or a stage fails, and KeyboardInterrupt when interrupted.
+    Raises TrilaneError if a unit cannot start or a stage fails, and KeyboardInterrupt when interrupted.
     """
     with contextlib.ExitStack() as stack:
         interrupts = stack.enter_context(Interrupts())
@@ -248,7 +248,7 @@ def try_in_turns(
     `assets`, `starter`: arrays and fork server, as for a run.
     `is_enough`: function that is called with the rounds so far.
 
-    Raises TrilaneError when a unit cannot start or a stage fails, and KeyboardInterrupt when interrupted.
+    Raises TrilaneError if a unit cannot start or a stage fails, and KeyboardInterrupt when interrupted.
     """
     rounds: list[Round] = []
     cores = sorted({core for group in groups for place in group.places for own in place.values() for core in own})

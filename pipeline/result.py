@@ -173,7 +173,7 @@ class JournalFile:
 
 
 class JobSource(Protocol):
-    """The clock of the run (`trilane.pipeline.realtime_clock.RealtimeClock`)."""
+    """The part of `trilane.pipeline.realtime_clock.RealtimeClock` from which a run's result takes the jobs."""
 
     @property
     def waiting(self) -> int:
@@ -211,7 +211,7 @@ class RunRecord(Protocol):
         """Note that the loop begins. `pids`: function that returns the present process id of each unit."""
 
     def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
-        """Record a step of `core` whose actions were carried out; raises `failure` if there is one."""
+        """Record a step of `core` whose actions were carried out. Raises `failure` if there is one."""
 
     def say(self, text: str) -> None:
         """Record a message to a person."""
@@ -309,7 +309,7 @@ class _JournaledRun:
             self._sample(now_ns, core)
 
     def _write(self) -> None:
-        """Write the steps and jobs since the last call; raises UnwrittenError if they cannot be written."""
+        """Write the steps and jobs since the last call. Raises UnwrittenError if they cannot be written."""
         add, told = self._writer.add, 0
         jobs = self._source.ended() if self._source is not None else []
         for stopped in self._source.stopped() if self._source is not None else []:
@@ -345,7 +345,7 @@ class _JournaledRun:
             self._writer.flush()
 
     def flush(self) -> None:
-        """Write everything that was recorded to the file; raises UnwrittenError if it cannot be written."""
+        """Write everything that was recorded to the file. Raises UnwrittenError if it cannot be written."""
         self._write()
         self._writer.flush()
 

@@ -78,7 +78,7 @@ class ReportingGovernor(ClockGovernor, Protocol):
 
     @property
     def power_w(self) -> float | None:
-        """The mean power of the run so far in watts; None when it is not known."""
+        """The mean power of the run so far in watts; None if it is not known."""
 
     @property
     def temperatures_c(self) -> Mapping[str, float]:
@@ -221,7 +221,7 @@ class _Run:
         self._outcome = Outcome(OutcomeKind.ABORTED)
 
     def execute(self) -> None:
-        """Do all steps; raises as `run_pipeline` does."""
+        """Do all steps. Raises as `run_pipeline` does."""
         self._startup_ms = start_units(self._processes, self._core.graph.units, self._interrupts)
         self.pids = self._processes.pids
         graph, settings = self._core.graph, self._core.settings

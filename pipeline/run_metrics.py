@@ -98,7 +98,7 @@ class FrameTimes(TimeSummary):
     `ema20_min`, `ema20_max`: smallest and largest exponential average over 20 frames; null without a frame time.
     `jitter`: mean absolute difference of successive frame times; null for fewer than two.
     `mean_low`, `mean_high`: bounds of the 95 % interval of the mean, from the scatter of this run's frames (batch
-    means); null when there are too few frames.
+    means); null if there are too few frames.
     """
 
     ema20_min: float | None
@@ -479,5 +479,5 @@ class RunMetrics(PolicyMetrics):
 
 
 def metrics_of(ledger_report: Mapping[str, Any]) -> RunMetrics:
-    """Return the figures from the keys of `Ledger.report()` and further keys; raises ValueError for a wrong key."""
+    """Return the figures from the keys of `Ledger.report()` and further keys. Raises ValueError for a wrong key."""
     return RunMetrics.model_validate(ledger_report)

@@ -77,7 +77,7 @@ class Gone(NamedTuple):
 
 
 class EndedJob(NamedTuple):
-    """A job of whose end the scheduler has heard. `event`: event with its times."""
+    """A job that has ended, as far as the scheduler has heard. `event`: event with the job's times."""
 
     handed: Handed
     event: JobDone

@@ -251,7 +251,7 @@ class IdleCutter:
     """Divides the idle time of `units` into slices, in the order of their ends, during a run or after it.
 
     For each step the caller calls `settle` and then `step`. After that it calls `account` for each account that follows
-    the step, and `job` for each job of whose end the scheduler heard in the step. After the last step it calls `end`.
+    the step, and `job` for each job whose end the scheduler heard in the step. After the last step it calls `end`.
     `settle` and `end` return the slices that are complete.
     """
 
@@ -284,7 +284,7 @@ class IdleCutter:
             self._hold(unit.note_idle(since_ns, OVERHEAD))
 
     def job(self, unit: UnitHistory, job: JobRecord) -> None:
-        """Note a job of whose end the last step heard; a unit's jobs come in the order of their ends."""
+        """Note a job whose end the last step heard; a unit's jobs come in the order of their ends."""
         self._hold(unit.cut(job))
 
     def end(self) -> list[IdleSlice]:

@@ -319,7 +319,7 @@ def _threads() -> set[int]:
 
 
 def build_stages(spec: UnitSpec) -> list[BoundStage]:
-    """Return the unit's stages, bound to their slots, in the order of `spec.stages`; raises what a factory raises."""
+    """Return the unit's stages, bound to their slots, in the order of `spec.stages`. Raises what a factory raises."""
     sys.path[:0] = map(str, spec.module_folders)
     unit = UnitContext(spec.unit, spec.settings, map_assets(spec.assets_fd))
     stages = [factory_named(stage.factory)(stage.settings, unit) for stage in spec.stages]
@@ -336,7 +336,7 @@ def build_stages(spec: UnitSpec) -> list[BoundStage]:
 
 
 def factory_named(name: str) -> StageFactory:
-    """Return the factory that `module:name` names; raises ImportError or AttributeError."""
+    """Return the factory that `module:name` names. Raises ImportError or AttributeError."""
     module, _, attribute = name.partition(":")
     factory: StageFactory = getattr(import_module(module), attribute)
     return factory

@@ -145,7 +145,7 @@ class UnitProcesses:
             self._register(fd, partial(_swallow, fd))
 
     def start(self, unit: str) -> None:
-        """Start a new process for the unit; raises TrilaneError or OSError.
+        """Start a new process for the unit. Raises TrilaneError or OSError.
 
         The next message of the unit is `Ready`, `Failed` or the end of the process.
         """
@@ -351,7 +351,7 @@ def start_units(processes: UnitProcesses, units: Iterable[str], interrupts: Inte
 
 
 def listen_before_run(processes: UnitProcesses, interrupts: Interrupts) -> list[UnitMessage]:
-    """Return the next messages; raises UnitError when a unit failed or ended, KeyboardInterrupt when interrupted."""
+    """Return the next messages. Raises UnitError if a unit failed or ended, KeyboardInterrupt when interrupted."""
     messages = processes.listen(POLL_MS)
     if interrupts.count:
         raise KeyboardInterrupt

@@ -252,12 +252,12 @@ class Core:
         self.flow.pass_on(stage, job, end_ns)
 
     def ready_ns(self, job: Job) -> int | None:
-        """Return the time at which the inputs of a job were there; None when its frame is gone."""
+        """Return the time at which the inputs of a job were there; None if its frame is gone."""
         frame = self.frames.get(job.frame) or self.flow.gone.get(job.frame)
         return None if frame is None else frame.ready_ns[self._stage_named[job.stage].position]
 
     def _on_skip(self, stage: StageState, frame: FrameState) -> None:
-        """Note that the frame takes the bypass; raises ValueError if none begins at `stage`."""
+        """Note that the frame takes the bypass. Raises ValueError if none begins at `stage`."""
         if self.bypass is None or stage is not self.bypass.begin:
             raise ValueError(f"stage {stage.name} skips, but no bypass begins there")
         frame.skips = True

@@ -319,7 +319,7 @@ NO_SLOT: Final = 255
 def packed(slots: Sequence[int]) -> int:
     """Return the slots of a job's inputs as one number, with the first input in the lowest byte; -1 without inputs.
 
-    `slots`: slot of each input; -1 for an input that takes the newest frame, while there is none.
+    `slots`: slot of each input; -1 for an input of the newest frame that has no frame yet.
     """
     if len(slots) == 1:
         return slots[0] if slots[0] >= 0 else NO_SLOT
@@ -438,7 +438,7 @@ class Graph:
 def chain(stages: Iterable[tuple[str, str]], edge: str, latency_to: str) -> Graph:
     """Return the graph of `stages`, pairs of a name and its unit, with `edge` as the rule of every edge.
 
-    Raises ValueError when two stages have the same name, and when `latency_to` is none of them.
+    Raises ValueError if two stages have the same name, or if `latency_to` is none of them.
     """
     specs = tuple(StageSpec(name, unit) for name, unit in stages)
     return Graph(specs, (edge,) * (len(specs) - 1), latency_to)

@@ -118,7 +118,7 @@ def stale_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
 
 
 def _parts(stage: StageState, frame: int, newer: int, frames: Mapping[int, FrameState]) -> bool:
-    """Return whether a frame between the skipping frames `frame` and `newer` is still on its way to the stage."""
+    """Return whether a frame between `frame` and `newer`, which skip, is still on its way to the stage."""
     return any(frame < number < newer and state.position < stage.position for number, state in frames.items())
 
 
@@ -246,7 +246,7 @@ class Flow:
         return self._is_awaited(behind, state) and bool(state.begun & self.main & ~(behind.before | behind.bit))
 
     def _is_awaited(self, behind: StageState, state: FrameState) -> bool:
-        """Return whether a reader of the stage that is no side work waits for the frame."""
+        """Return whether a reader of the stage waits for the frame. Readers that are side work do not count."""
         waiting = state.todo & ~state.begun & self.main
         return any(waiting & reader.bit for reader in behind.readers)
 

@@ -53,7 +53,7 @@ class Bound:
 class _Arc(NamedTuple):
     """A wait of the job `to` for the job `job`, both indices in `_Waits.stages`.
 
-    The job `to` of the hyperperiod `tokens` later begins at least `ns` after the begin of `job`.
+    `to` means this job in the hyperperiod that is `tokens` later. It begins at least `ns` after the begin of `job`.
 
     `stream`: stage for whose slot the job waits; "" for another wait.
     `in_flight`: whether the job waits because of the limit of frames in flight.
@@ -107,7 +107,7 @@ class _Waits:
                 yield stage.name
 
     def _of_frames(self) -> Iterator[_Arc]:
-        """Yield the waits for inputs, and for the job before on the same stage."""
+        """Yield the waits of jobs for their inputs, and for the earlier job of the same stage."""
         for index, name in enumerate(self.names):
             for frame in range(0, self.hyperperiod, self.periods[name]):
                 yield self._arc(name, frame, name, frame + self.periods[name])

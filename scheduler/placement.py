@@ -13,8 +13,8 @@ conditions hold:
 - *A unit does one job at a time.* Its jobs of a frame take at most T.
 - *A core does one thing at a time.* The time that all units need on a core is at most T. A unit with one thread and
   several cores *floats*: the kernel runs it on any core that is free. For every set of cores, the work that cannot go
-  to other cores is at most what the set can do in T. From this the share is subtracted that the kernel fails to use. By
-  Hall's condition the work can be divided exactly if this holds for all sets.
+  to other cores is at most what the set can do in T, less the share that the kernel fails to use. By Hall's condition
+  the work can be divided exactly if this holds for all sets.
 - *Each of a job's parallel regions waits for its slowest thread.* Let other units have core c for the share o(c) of the
   time. A job of several threads goes on only while all its cores are free. If the other units come independently, this
   share of the time is the product of 1 - o(c) over its cores. The job's time divided by this share is at most T.

@@ -92,7 +92,7 @@ POLICIES = {
 
 
 def policy_named(name: str) -> Policy:
-    """Return the row of `POLICIES`; raises UnexpectedValue for an unknown name."""
+    """Return the row of `POLICIES`. Raises UnexpectedValue for an unknown name."""
     if name not in POLICIES:
         raise UnexpectedValue(f"policy {name!r}", f"one of {', '.join(POLICIES)}")
     return POLICIES[name]
@@ -285,7 +285,7 @@ class WorkLadder:
         """Begin at rung 0.
 
         `stages`: stages of the chain.
-        `works`: work of each rung in thousandths, ALL first, falling.
+        `works`: work of each rung in thousandths, in falling order from ALL.
         `follow`: names of the stages whose time follows the work.
         `period_ns`: period of frames, more than 0.
         `deadline_ns`: longest time from a frame's release to its presentation; 0: none.

@@ -95,7 +95,7 @@ def _fields_of(item: Any) -> dict[str, Any]:
 
 
 def read(path: Path) -> Recording:
-    """Return the recording at `path`; raises BadInputError naming the line that is not part of a recording."""
+    """Return the recording at `path`. Raises BadInputError naming the line that is not part of a recording."""
     number = 0
     try:
         with path.open(encoding="utf-8") as file:
@@ -147,12 +147,12 @@ def row_of(item: Event | Action) -> list[Any]:
 
 
 def events_of(rows: Iterable[Sequence[Any]]) -> tuple[Event, ...]:
-    """Return the events that were written as `rows`; raises UnexpectedValue for a row that is no event."""
+    """Return the events that were written as `rows`. Raises UnexpectedValue for a row that is no event."""
     return tuple(_parse(row, _EVENTS) for row in rows)
 
 
 def actions_of(rows: Iterable[Sequence[Any]]) -> tuple[Action, ...]:
-    """Return the actions that were written as `rows`; raises UnexpectedValue for a row that is no action."""
+    """Return the actions that were written as `rows`. Raises UnexpectedValue for a row that is no action."""
     return tuple(_parse(row, _ACTIONS) for row in rows)
 
 
@@ -169,7 +169,7 @@ def _listed(row: Mapping[str, Any], key: str, forms: dict[str, tuple[Any, dict[s
 
 
 def _form(name: Any, forms: dict[str, tuple[Any, dict[str, Any]]]) -> tuple[Any, dict[str, Any]]:
-    """Return the row of `forms` for `name`; raises UnexpectedValue for an unknown name."""
+    """Return the row of `forms` for `name`. Raises UnexpectedValue for an unknown name."""
     if not isinstance(name, str) or name not in forms:
         raise UnexpectedValue(repr(str(name)[:80]), f"one of {', '.join(forms)}")
     return forms[name]
@@ -191,7 +191,7 @@ def _parse(row: Sequence[Any], forms: dict[str, tuple[Any, dict[str, Any]]]) -> 
 
 
 def graph_of(data: Mapping[str, Any]) -> Graph:
-    """Return the graph that was written as `data`; raises KeyError or TypeError for other data."""
+    """Return the graph that was written as `data`. Raises KeyError or TypeError for other data."""
     bypass = data["bypass"]
     ends = None if bypass is None else (bypass[0], bypass[1])
     stages = tuple(_stage_of(stage) for stage in data["stages"])
@@ -205,6 +205,6 @@ def _stage_of(data: Mapping[str, Any]) -> StageSpec:
 
 
 def settings_of(data: Mapping[str, Any]) -> Settings:
-    """Return the settings that were written as `data`; raises TypeError for other data."""
+    """Return the settings that were written as `data`. Raises TypeError for other data."""
     fields: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
     return Settings(**fields)

@@ -74,7 +74,7 @@ TURNS: Final[dict[str, Callable[[Sequence[Waiting]], Waiting]]] = {
 
 
 def _turns_named(name: str) -> Callable[[Sequence[Waiting]], Waiting]:
-    """Return the row of `TURNS`; raises UnexpectedValue for an unknown name."""
+    """Return the row of `TURNS`. Raises UnexpectedValue for an unknown name."""
     if name not in TURNS:
         raise UnexpectedValue(f"turns {name!r}", f"one of {', '.join(TURNS)}")
     return TURNS[name]
@@ -212,7 +212,7 @@ class BesideDriver:
                 self._push(at_ns, line.number, event)
 
     def run(self) -> list[Outcome]:
-        """Run until every `Core` finishes; raises RuntimeError when nothing can ever happen again."""
+        """Run until every `Core` finishes. Raises RuntimeError if nothing can ever happen again."""
         while not all(line.core.finished for line in self.lines):
             self._advance(self._next_ns())
             while self._step_one():

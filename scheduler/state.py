@@ -62,7 +62,7 @@ TABLE: dict[type, tuple[int, int, int, int]] = {
 
 
 def state_after(unit: str, state: int, event: type) -> int:
-    """Return the state that follows `state`, or IGNORED; raises UnitLifeError if the table refuses the event."""
+    """Return the state that follows `state`, or IGNORED. Raises UnitLifeError if the table refuses the event."""
     after = TABLE[event][state]
     if after == REFUSED:
         raise UnitLifeError(f"unit {unit} is {STATES[state]}: {event.__name__} cannot happen")
@@ -147,7 +147,7 @@ class UnitState:
             self.queue_capacity = HELD_JOBS if self.duty == FULL_DUTY else 1
 
     def expected_end_ns(self) -> int:
-        """Return when the running job should end by its stage's estimate; raises IndexError when no job runs."""
+        """Return when the running job should end by its stage's estimate. Raises IndexError if no job runs."""
         name = self.queue[0].stage
         for stage in self.stages:
             if stage.name == name:

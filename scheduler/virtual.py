@@ -142,7 +142,7 @@ class VirtualDriver:
             self._push(at_ns, FAULT, event)
 
     def run(self) -> Outcome:
-        """Run until the core finishes; raises RuntimeError when nothing can ever happen again."""
+        """Run until the core finishes. Raises RuntimeError if nothing can ever happen again."""
         collects = gc.isenabled()
         gc.disable()  # a run makes no cycles, and looking for them takes a tenth of its time
         try:
@@ -229,7 +229,7 @@ def simulate(
     `graph`, `settings`, `service`, `keep`, `driver`: arguments of VirtualDriver.
     `target_period_ns`: as in `trilane.scheduler.ledger.Books`.
 
-    Raises ValueError for an unknown policy or edge, and RuntimeError when nothing can ever happen again.
+    Raises ValueError for an unknown policy or edge, RuntimeError if nothing can ever happen again.
     """
     virtual = VirtualDriver(graph, settings, service, keep=keep, books=Books(target_period_ns), **driver)
     outcome = virtual.run()

@@ -1,5 +1,5 @@
 #version 330
-// One triangle over the whole viewport at the greatest depth: a greater-than test passes where something was drawn.
+// One triangle over the whole viewport at the greatest depth. A greater-than test passes where something was drawn.
 
 void main() {
     vec2 place = vec2((gl_VertexID << 1) & 2, gl_VertexID & 2);

@@ -14,10 +14,10 @@ uint word(vec4 real) {
 }
 
 #ifdef DEFERRED
-// All channels of a texel lie side by side, eight to a uvec4: a pixel reads three cache lines, not eight. The low halves
-// of its words are four channels, the high halves the next four.
+// All channels of a texel lie side by side, so a pixel reads three cache lines, not eight. A uvec4 holds eight of them:
+// the low halves of its words are four channels, the high halves are the next four.
 uniform usampler2D neural;
-uniform float unit; // what the texture's numbers have to be multiplied by when their bits are read as those of a float
+uniform float unit; // factor on the texture's numbers, because their bits are read as those of a float
 uniform sampler2D uv_image;
 
 vec4 low(uvec4 halves) {
@@ -28,7 +28,7 @@ vec4 high(uvec4 halves) {
     return uintBitsToFloat(((halves >> 3u) & 0x0fffe000u) | (halves & 0x80000000u));
 }
 
-// Interpolates so that four equal numbers stay as they are.
+// Interpolates between four numbers. The formula gives exactly the same number if all four are equal.
 vec4 between(vec4 a, vec4 b, vec4 c, vec4 d, vec2 share) {
     vec4 upper = a + share.x * (b - a);
     vec4 lower = c + share.x * (d - c);

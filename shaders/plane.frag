@@ -17,7 +17,7 @@ float line(vec2 metres, vec2 pixel_metres) {
 void main() {
     vec2 pixel_metres = fwidth(v_metres);
     vec2 inner = abs(fract(v_metres / STEP + 0.5) - 0.5) * STEP;
-    float crowded = clamp(2.0 * max(pixel_metres.x, pixel_metres.y) / STEP, 0.0, 1.0); // 1 where lines are too close to be told apart
+    float crowded = clamp(2.0 * max(pixel_metres.x, pixel_metres.y) / STEP, 0.0, 1.0); // 1 where the lines merge
     float shown = max(line(inner, pixel_metres) * (1.0 - crowded), line(v_half - abs(v_metres), pixel_metres));
     pixel = vec4(1.0, 1.0, 1.0, mix(SHEET, LINE, shown));
 }

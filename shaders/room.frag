@@ -1,5 +1,5 @@
 #version 330
-// Draws the room: texture and light are multiplied as sRGB bytes, because both were painted for that.
+// Draws the room. Texture and light are multiplied as sRGB values, because both were painted for that.
 
 uniform sampler2D detail;
 

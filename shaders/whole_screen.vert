@@ -1,5 +1,5 @@
 #version 330
-// One triangle over the whole target; `place` is 0..1 from the first row and column of the target's memory.
+// One triangle over the whole target. `place` is 0 at the first row and column of the target's memory, 1 at the last.
 
 out vec2 place;
 

@@ -1,10 +1,10 @@
-"""The avatar's stages, one folder per unit, and what joins them: packets, assets, configuration, the avatar's pipeline.
+"""The avatar's stages, one folder per unit, with their packets, assets, configuration and pipeline.
 
-It may use `scene/`, `avatars/`, `hw_profiles/`, `pipeline/` and the folders below them. This file imports nothing, so
-that the fork server can start with the names below before anything slow is imported.
+It may use `scene/`, `avatars/`, `hw_profiles/`, `pipeline/` and the layers below them. This file imports nothing, so
+that the fork server gets the names below before a slow import.
 """
 
-#: Factory of each stage; the parts of the network share one.
+#: Factory of each stage; all parts of a network that is cut have the same one.
 FACTORIES = {
     "pose": "trilane.stages.cpu.pose:build",
     "raster": "trilane.stages.gpu.raster:build",
@@ -12,5 +12,5 @@ FACTORIES = {
     "composite": "trilane.stages.gpu.composite:build",
     "present": "trilane.stages.cpu.present:build",
 }
-#: Modules that the fork server imports: units then start in milliseconds.
+#: Modules that the fork server imports, so that units start in milliseconds.
 PRELOAD = tuple(factory.partition(":")[0] for factory in FACTORIES.values())

@@ -1,7 +1,7 @@
-"""The arrays that the parent has loaded for a scene and its avatars, and that every unit maps.
+"""The assets of a run of the avatar: arrays that the parent loads, and that every unit maps.
 
-Rule: files are opened once. Names begin with what they belong to: `body0/` and `avatar0/` of the first distinct bundle,
-`network0/` of the first distinct network, `scene/`.
+Rule: files are opened once. The prefix of a name says what the array belongs to: `body0/` and `avatar0/` to the first
+distinct bundle, `network0/` to the first distinct network, `scene/` to the scene.
 """
 
 from __future__ import annotations
@@ -33,10 +33,12 @@ BODY_ARRAYS = tuple(field.name for field in fields(Body) if field.name not in ("
 
 @dataclass(frozen=True)
 class AvatarData:
-    """One distinct bundle, loaded.
+    """The loaded content of one distinct bundle.
 
-    `texture`: (H,W,C) float32. `levels`: smaller levels of the texture, see `pack_levels`.
-    `mesh_levels`: levels of the mesh, finest first.
+    `shaped`: body with the avatar's shape.
+    `texture`: neural texture (H,W,C) float32.
+    `levels`: smaller levels of the texture, packed by `pack_levels`; None if it has none.
+    `mesh_levels`: levels of the mesh, the finest first.
     """
 
     bundle: Bundle
@@ -48,7 +50,7 @@ class AvatarData:
 
 
 def load_avatar(bundle: Bundle) -> AvatarData:
-    """Load everything that a run needs from `bundle`. Raises BadInputError."""
+    """Return the content of `bundle` that a run needs. Raises BadInputError."""
     shaped = bundle.shaped_body()
     texture, network, levels = bundle.read_texture(), bundle.read_network(), bundle.read_levels()
     return AvatarData(bundle, shaped, texture, network, levels, bundle.read_mesh_levels(shaped))
@@ -57,7 +59,7 @@ def load_avatar(bundle: Bundle) -> AvatarData:
 def networks_of_avatars(avatars: Sequence[AvatarData]) -> list[int]:
     """Return the number of the network that paints each of `avatars`.
 
-    Avatars share a network, and so a tensor, where its file and the encoding of its input are the same.
+    Avatars share a network, and therefore a tensor, if its file and the encoding of its input are the same.
     """
     kinds = [(one.network.digest, one.bundle.manifest.network.input) for one in avatars]
     known = list(dict.fromkeys(kinds))
@@ -65,7 +67,7 @@ def networks_of_avatars(avatars: Sequence[AvatarData]) -> list[int]:
 
 
 def pack_assets(avatars: Sequence[AvatarData], staged: Staged) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a run: those of each distinct avatar in order, of each distinct network, and the scene's."""
+    """Return the arrays of a run by name: of each distinct avatar in order, of each distinct network, of the scene."""
     arrays: dict[str, NDArray[Any]] = {}
     for number, avatar in enumerate(avatars):
         body, scale = avatar.shaped.body, avatar.bundle.manifest.network.input
@@ -86,9 +88,9 @@ def pack_assets(avatars: Sequence[AvatarData], staged: Staged) -> dict[str, NDAr
 
 
 def with_network(assets: Assets, network: NetworkFile) -> dict[str, NDArray[Any]]:
-    """Return `assets` with another `network` for all avatars, and with the scale and zero point of its input.
+    """Return `assets` with `network` for all avatars, and with the scale and zero point of its input.
 
-    Raises BadInputError for avatars of several networks.
+    Raises BadInputError if the assets have several networks.
     """
     only_network_of(assets)
     encoding = np.array([network.input.scale, network.input.zero_point])
@@ -114,7 +116,7 @@ def distinct(config: RunConfig) -> list[Path]:
 
 
 def shaped_body(assets: Assets, number: int) -> ShapedBody:
-    """Return the body of distinct avatar `number`."""
+    """Return the body of the distinct avatar `number`."""
     own = _with_prefix(assets, f"body{number}/")
     arrays: dict[str, Any] = {name: own.get(name) for name in BODY_ARRAYS}  # `posedirs` and `offsets` may be None
     hands = (own[HANDS[0]], own[HANDS[1]])
@@ -123,25 +125,25 @@ def shaped_body(assets: Assets, number: int) -> ShapedBody:
 
 
 def texture_of(assets: Assets, number: int) -> F32:
-    """Return the neural texture (H,W,C) of distinct avatar `number`."""
+    """Return the neural texture (H,W,C) of the distinct avatar `number`."""
     return assets[f"avatar{number}/texture"]
 
 
 def levels_of(assets: Assets, number: int) -> F32 | None:
-    """Return smaller levels of the neural texture of distinct avatar `number`, if it has any."""
+    """Return the smaller levels of the neural texture of the distinct avatar `number`; None if it has none."""
     return assets.get(f"avatar{number}/levels")
 
 
 def mesh_levels_of(assets: Assets, number: int) -> tuple[MeshLevel, ...]:
-    """Return the levels of the mesh of distinct avatar `number`, finest first; maybe none."""
+    """Return the levels of the mesh of the distinct avatar `number`, the finest first; empty if it has none."""
     arrays = _with_prefix(assets, f"meshes{number}/")
     return levels_from_arrays(arrays) if arrays else ()
 
 
 def bodies_drawn(config: RunConfig, assets: Assets, number: int) -> list[ShapedBody]:
-    """Return the bodies of distinct avatar `number` that frames may show: the whole one, then its levels.
+    """Return the bodies of the distinct avatar `number` that frames may show: the whole body, then its mesh levels.
 
-    Where everything is modelled it is the whole one alone.
+    If everything is modelled (`RunConfig.budget_px` is 0), there is only the whole body.
     """
     whole = shaped_body(assets, number)
     levels = mesh_levels_of(assets, number) if config.budget_px else ()
@@ -149,7 +151,7 @@ def bodies_drawn(config: RunConfig, assets: Assets, number: int) -> list[ShapedB
 
 
 def quantisation_of(assets: Assets, number: int) -> Quantisation:
-    """Return how distinct avatar `number` is packed for the network."""
+    """Return scale and zero point of the network's input for the distinct avatar `number`."""
     scale, zero_point = assets[f"avatar{number}/input"].tolist()
     return Quantisation(scale, int(zero_point))
 
@@ -164,9 +166,11 @@ def networks_of(assets: Assets) -> list[NetworkFile]:
 
 
 def painting(networks: Sequence[NetworkFile], shape: Shape, facts: Mapping[str, str]) -> Network:
-    """Return what paints a frame, as one network of the cost model: each of `networks`, on a tensor of `shape`.
+    """Return all `networks`, each on a tensor of `shape`, as one network for predictions.
 
-    The tensors count as one, as high as all of them. `facts`: what reports call it.
+    Its input is as high as all tensors together.
+
+    `facts`: keys that identify the network in reports.
     """
     work = one_after_the_other([count_work(reshaped(network, *shape).model) for network in networks])
     channels = max(network.channels for network in networks)
@@ -174,7 +178,7 @@ def painting(networks: Sequence[NetworkFile], shape: Shape, facts: Mapping[str, 
 
 
 def only_network_of(assets: Assets) -> NetworkFile:
-    """Return the network that all avatars share. Raises BadInputError where there are several."""
+    """Return the network that all avatars share. Raises BadInputError if there are several networks."""
     first, *others = networks_of(assets)
     if others:
         raise BadInputError(

@@ -1,7 +1,7 @@
-"""The avatar's pipeline as `trilane.pipeline` runs it: its stages, what passes between them, and its rehearsal.
+"""The avatar's pipeline for `trilane.pipeline`: its stages, the sizes of its edges, and its rehearsal.
 
-Everything that the run must know about the avatar is stated here, as data; no other module of the run knows an avatar.
-A rehearsal runs the stages one after the other and measures what each needs from its unit, before they share the cores.
+This module describes the avatar as data for the run; no module of `trilane.pipeline` knows an avatar. A rehearsal runs
+the stages one after the other, before they share the cores, and measures the work of each.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from trilane.units import AFTER_INFER, BEFORE_INFER, BYPASS, LATENCY_TO, UNITS
 
 
 def avatar_pipeline(config: RunConfig, assets: Assets, edge: str = DEFAULT_EDGE) -> Pipeline:
-    """Return the pipeline of `config`, every edge with the rule `edge`. Raises BadInputError for an unknown rule."""
+    """Return the pipeline of `config`. `edge`: rule of every edge. Raises BadInputError for an unknown rule."""
     header = pose_dtype(len(config.avatar_dirs))
     return Pipeline(
         stages=tuple(_stages(config)),
@@ -47,7 +47,7 @@ def avatar_pipeline(config: RunConfig, assets: Assets, edge: str = DEFAULT_EDGE)
 
 
 def edge_bytes(config: RunConfig, assets: Assets) -> dict[str, int]:
-    """Return the payload bytes of each edge, for the largest tensors that the scene's size allows."""
+    """Return the payload bytes of each edge, for the largest tensors of the run, in the order of the edges."""
     output, names = config.scene.output, config.infer_names
     pixels = config.max_tensor_pixels * config.network_count
     crossings = crossing_bytes(config, only_network_of(assets)) if config.cuts else []
@@ -74,12 +74,12 @@ def _stages(config: RunConfig) -> Iterator[PipelineStage]:
 def run_avatar(
     config: RunConfig, assets: Assets, *, edge: str = DEFAULT_EDGE, frames: int | None = None, **options: Any
 ) -> RunResult:
-    """Run the avatar of `config`.
+    """Run the avatar of `config`. Raises as `run_pipeline` does.
 
-    `assets`: arrays of the same avatars and scene, see `trilane.stages.avatar_assets.pack_assets`.
+    `assets`: arrays of the same avatars and scene, from `trilane.stages.avatar_assets.pack_assets`.
     `edge`: rule of every edge.
-    `frames`: number of frames; None for the scene's.
-    `options`: further arguments of `run_pipeline`. Raises as `run_pipeline`.
+    `frames`: number of frames; None for the scene's number.
+    `options`: further arguments of `run_pipeline`.
     """
     pipeline = avatar_pipeline(config, assets, edge)
     if len(config.works) > 1 and not config.pace_ns:
@@ -87,14 +87,17 @@ def run_avatar(
     return run_pipeline(pipeline, frames or config.scene.frames, fps=config.scene.fps, assets=assets, **options)
 
 
-FRAMES = 12  # frames of a rehearsal, evenly over the scene; the first two warm up
+FRAMES = 12  # frames of a rehearsal, spread evenly over the scene; the first two warm up
 
 
 def thread_counts(cores: int, rule: Placement) -> dict[str, list[int]]:
-    """Return the numbers of threads, beside 1, that each unit is measured with: those that a placement may give it.
+    """Return the numbers of threads, apart from 1, with which each unit is measured.
 
-    Every unit is measured with the number that the `rule` for any run, or the options, give it. The network is also
-    measured with 2 to 4 threads, half of the cores, all cores, and all but those of the other units.
+    Each unit is measured with its number in `rule`. The network's unit is also measured with 2 to 4 threads, and with a
+    thread for half of the cores, for all but two, for all but one, and for all cores.
+
+    `cores`: number of cores.
+    `rule`: placement that suits any run, with the cores that the options choose.
     """
     counts = {unit: {place.threads} for unit, place in rule.items()}
     counts["dsp"] |= {*range(2, min(cores, 4) + 1), cores // 2, cores - 2, cores - 1, cores}
@@ -102,11 +105,14 @@ def thread_counts(cores: int, rule: Placement) -> dict[str, list[int]]:
 
 
 def measured_times(checked: Checked, cores: Sequence[CpuCore], rule: Placement, starter: UnitStarter) -> Rehearsed:
-    """Measure what each unit needs for a frame.
+    """Return the measured work of each unit for a frame.
 
-    `checked`: run to measure. `cores`: available cores. `rule`: placement whose numbers of threads are measured too.
-    `starter`: fork server. Raises TrilaneError when a unit cannot start or a stage fails, KeyboardInterrupt when
-    interrupted.
+    `checked`: run to measure.
+    `cores`: available cores.
+    `rule`: placement whose numbers of threads are measured too.
+    `starter`: fork server.
+
+    Raises TrilaneError if a unit cannot start or a stage fails, KeyboardInterrupt if interrupted.
     """
     fastest = [core.number for core in sorted(cores, key=lambda core: (-core.permille, core.number))]
     one = {unit: Place((fastest[0],), 1) for unit in UNITS}
@@ -133,13 +139,15 @@ def tried(
     limit_s: float = math.inf,
     least: int = 1,
 ) -> list[Round]:
-    """Measure frame times of `placements`, in turns.
+    """Return the measured rounds of `placements`, which run in turns. Raises as `measured_times` does.
 
-    `rounds`: number of rounds, on frames from all over the scene. `limit_s`: seconds after which no further round
-    begins. `least`: number of rounds that are done in any case.
-    `checked`, `starter`, and the errors raised: as in `measured_times`.
+    `checked`: run to measure.
+    `rounds`: number of rounds, on frames spread over the scene.
+    `starter`: fork server.
+    `limit_s`: time in seconds after which no further round begins.
+    `least`: number of rounds that are done in any case.
     """
-    # Placements with equal threads differ in cores alone, so one pipeline serves all of them.
+    # Placements with equal threads differ only in cores, so the same processes serve all of them.
     groups: dict[tuple[tuple[int, bool], ...], list[int]] = {}
     for number, placement in enumerate(placements):
         settings = settings_of(placement).values()
@@ -165,9 +173,9 @@ def tried(
 
 @contextmanager
 def _thrown_away(checked: Checked) -> Iterator[RunConfig]:
-    """Yield the configuration with only one tensor shape, which is prepared soonest, and a folder that is then removed.
+    """Yield the configuration of `checked` with a single tensor shape and a temporary run folder.
 
-    No shape of the same size has more than 25/16 of its area.
+    A single shape is prepared faster than many. No shape of the same size has more than 25/16 of its area.
     """
     with tempfile.TemporaryDirectory(prefix="trilane-rehearsal-") as folder:
         height, width = one_shape(checked.config)
@@ -176,7 +184,10 @@ def _thrown_away(checked: Checked) -> Iterator[RunConfig]:
 
 
 def _spinning(placement: Placement, cores: int) -> dict[str, Any]:
-    """Return settings in which a unit's threads spin if there are cores for it alone, as they then do in the run."""
+    """Return settings in which a unit's threads spin if there are enough cores for the unit to share none in the run.
+
+    `cores`: number of available cores.
+    """
     return {
         unit: settings.model_copy(update={"spin": 1 < settings.threads <= cores - len(UNITS) + 1})
         for unit, settings in settings_of(placement).items()
@@ -184,6 +195,6 @@ def _spinning(placement: Placement, cores: int) -> dict[str, Any]:
 
 
 def one_shape(config: RunConfig) -> Shape:
-    """Return the tensor shape nearest to a square, apart from those that are only used when frames are late."""
+    """Return the most square tensor shape, apart from shapes that are only used when frames would be late."""
     large = [shape for shape in config.buckets if 2 * shape[0] * shape[1] > config.max_tensor_pixels]
     return min(large, key=lambda shape: (abs(shape[0] - shape[1]), shape))

@@ -27,13 +27,14 @@ from trilane.unexpected_value import UnexpectedValue
 from trilane.units import UnitName
 
 #: One avatar of a frame.
+#: `avatar`: number of the avatar in the scene.
 #: `joints`: skinning matrices, metres, world space, row-major 3x4: x_world = sum_k w_k (joints_k @ [x_rest, 1]).
 #: `pose_feature`: (R - I) row-major of joints 1..54; multiplies the body's `posedirs`.
 #: `rect`: crop rectangle x0, y0, x1, y1 in normalised device coordinates, y up: the mesh's rectangle clipped to
 #: [-1, 1], grown to the tensor's aspect so that tensor pixels are square; the grown part may exceed the screen.
-#: `tensor_rect`: top, left, height, width in tensor pixels that the crop rectangle fills.
-#: `mesh`: level of the mesh that is drawn, 0 the whole one, then the avatar's `MeshLevel`s, finest first.
-#: `visible`: 0 when nothing of the avatar is on screen; the other fields are then unspecified.
+#: `tensor_rect`: top, left, height, width of the tensor's part that shows the crop rectangle, in tensor pixels.
+#: `mesh`: level of the mesh that is drawn: 0 for the whole mesh, then the avatar's `MeshLevel`s, the finest first.
+#: `visible`: 0 if nothing of the avatar is on screen; the other fields are then unspecified.
 AVATAR_DTYPE = np.dtype(
     [
         ("avatar", "<i4"),
@@ -51,11 +52,15 @@ AVATAR_DTYPE = np.dtype(
 def pose_dtype(avatars: int) -> np.dtype[Any]:
     """Return the layout of the header of a packet with `avatars` avatars.
 
-    `work`: a number of `FrameWork`. `picture`: number of the frame whose picture of the avatars is shown, -1 when none
-    is. `repeats`: for a composited frame, 0 when it was drawn, else 1 + the number of the drawn frame with the same
-    bytes. `media_time_s`: time in motion and camera. `view`: matrix from world to camera. `projection`: OpenGL clip
-    matrix; both are row-major for column vectors. `tensor_shape`: height, width of this frame's tensor (the shape
-    bucket).
+    `avatar_count`: number of avatars.
+    `work`: a number of `FrameWork`.
+    `picture`: number of the frame whose picture of the avatars is shown; -1 if none is.
+    `repeats`: 0 for a composited frame that was drawn; otherwise 1 + the number of the drawn frame with the same bytes.
+    `media_time_s`: time in motion and camera.
+    `tensor_shape`: (height, width) of this frame's tensor (the shape bucket).
+    `view`: matrix from world to camera, row-major for column vectors.
+    `projection`: OpenGL clip matrix, row-major for column vectors.
+    `avatars`: AVATAR_DTYPE of each avatar.
     """
     return header_dtype(
         [
@@ -73,10 +78,12 @@ def pose_dtype(avatars: int) -> np.dtype[Any]:
 
 
 def posed_vertices(payload: U8, counts: Sequence[int]) -> list[F32]:
-    """Return views (V,3) float32 into the payload of the pose edge, one for each avatar of `counts` vertices.
+    """Return a view (V,3) float32 into the payload of the pose edge for each avatar: its skinned vertices.
 
-    They hold skinned vertices in the body's order, metres, world space, when the CPU unit skins; an empty payload has
-    none. A level of the mesh has fewer vertices and fills the beginning of its view.
+    The vertices are in the body's order, in metres, in world space. A level of the mesh has fewer vertices than the
+    whole mesh, and fills the beginning of its view.
+
+    `counts`: number of vertices of each avatar; empty if the GPU unit skins.
     """
     views, start = [], 0
     for count in counts:
@@ -87,19 +94,19 @@ def posed_vertices(payload: U8, counts: Sequence[int]) -> list[F32]:
 
 
 def posed_vertices_bytes(counts: Sequence[int]) -> int:
-    """Return bytes that `posed_vertices` needs."""
+    """Return the size in bytes of a payload for `posed_vertices`."""
     return sum(counts) * 3 * np.dtype(np.float32).itemsize
 
 
-MAX_CHANNELS = 16  # channels of a tensor: the most that the GPU packs in one pass
-PAINTED_CHANNELS = 4  # of a network's picture: red, green, blue, alpha
+MAX_CHANNELS = 16  # most channels of a tensor, which the GPU packs in one pass
+PAINTED_CHANNELS = 4  # channels of a network's picture: red, green, blue, alpha
 
 
 @dataclass(frozen=True)
 class Quantisation:
-    """How the tensor's bytes stand for real numbers: real = (q - zero_point) * scale, q in 0..255.
+    """Scale and zero point of a tensor's bytes: real = (q - zero_point) * scale, q from 0 to 255.
 
-    Raises BadInputError for a scale that is not positive or a zero point that is not a byte.
+    Raises BadInputError for a scale that is not positive, or a zero point that is no byte.
     """
 
     scale: float
@@ -113,7 +120,7 @@ class Quantisation:
 
 
 class NetworkCut(StrictModel):
-    """A cut of the network at the quantised tensor `at`; the part behind it runs on `unit`."""
+    """A cut of the network at the quantised tensor `at`; the part after the cut runs on `unit`."""
 
     at: str
     unit: UnitName
@@ -127,20 +134,20 @@ class RunConfig(StrictModel):
     `avatar_dirs`: bundle folder of each avatar of the scene.
     `units`: cores and threads of each unit.
     `runtime`: name of the DSP unit's inference runtime.
-    `networks`: number of the network that paints each avatar; empty where one paints all. Each network has a tensor of
-    its own in a slot, all of one shape.
-    `shapes`: tensor shapes where the scene plans the tensor; else those of its size are used.
-    `changes`: for each of `works`, the times in seconds at which a planned tensor changes, with its shape from then on;
-    empty where that was not foreseen.
+    `networks`: number of the network that paints each avatar; empty if one network paints all. Each network has its own
+    tensor in a slot, and all tensors have one shape.
+    `shapes`: tensor shapes if the scene plans the tensor; empty: the shapes of the scene's size.
+    `changes`: for each of `works`, pairs of a time in seconds at which a planned tensor changes, and its shape from
+    then on; empty if the changes were not foreseen.
     `own_pixels`: number of pixels of the tensor with which the network was trained.
-    `works`: sizes of a planned tensor in thousandths of those pixels, the largest first; the run steps down to a
-    further one when frames would be late.
+    `works`: sizes of a planned tensor in thousandths of `own_pixels`, the largest first. The run steps down to smaller
+    ones if frames would be late.
     `record`: whether the frames are encoded to a video.
-    `posed_vertices`: number of vertices of each avatar when the CPU unit skins; empty when the GPU unit does.
-    `pace_ns`: least duration of a stage's job, ns.
+    `posed_vertices`: number of vertices of each avatar if the CPU unit skins; empty if the GPU unit does.
+    `pace_ns`: least time of a job in ns, by stage.
     `cuts`: cuts of the network; its first part runs on the DSP unit.
     `kept`: numbers of frames whose presented pictures are kept, to compare them after the run.
-    `window`: shared memory in which somebody watches the pictures and steers the camera during the run; None for none.
+    `window`: file of the window, the shared memory for watching the run and steering its camera; None: no window.
     """
 
     scene: Scene
@@ -169,7 +176,7 @@ class RunConfig(StrictModel):
         return units
 
     def opened_window(self) -> LiveWindow | None:
-        """Map the window and return it, if any. Raises OSError when its maker is gone."""
+        """Map the window and return it, if any. Raises OSError if its maker is gone."""
         output = self.scene.output
         return None if self.window is None else LiveWindow.opened(self.window, output.height, output.width)
 
@@ -179,36 +186,36 @@ class RunConfig(StrictModel):
 
     @property
     def tensor_budgets(self) -> tuple[TensorBudget, ...]:
-        """Budgets of a planned tensor, one for each of `works`."""
+        """The budget of a planned tensor for each of `works`."""
         whole = TensorBudget(self.own_pixels, self.scene.most_side**2)
         return tuple(whole.scaled(work) for work in self.works)
 
     @property
     def budget_px(self) -> float:
-        """Largest error of a vertex on the picture in pixels; 0 when everything is modelled."""
+        """The largest error of a vertex on the picture in pixels; 0 if everything is modelled."""
         return self.scene.error_budget_px if self.scene.plan == "planned" else 0.0
 
     @property
     def network_count(self) -> int:
-        """Number of networks, each of which paints some of the avatars."""
+        """The number of networks; each paints some of the avatars."""
         return len(set(self.networks)) or 1
 
     def network_of(self, avatar: int) -> int:
-        """Return the number of the network that paints avatar number `avatar`."""
+        """Return the number of the network that paints the avatar with the number `avatar`."""
         return self.networks[avatar] if self.networks else 0
 
     def networks_of(self, avatars: Iterable[int]) -> tuple[int, ...]:
-        """Return the numbers of the networks that paint `avatars`, given by their numbers."""
+        """Return the numbers of the networks that paint the avatars with the numbers `avatars`, ascending."""
         return tuple(sorted({self.network_of(avatar) for avatar in avatars}))
 
     @property
     def infer_units(self) -> tuple[str, ...]:
-        """Unit of each part of the network, in the order of the parts."""
+        """The unit of each part of the network, in the order of the parts."""
         return ("dsp", *(cut.unit for cut in self.cuts))
 
     @property
     def infer_names(self) -> tuple[str, ...]:
-        """Names of the stages that run the parts: `infer`, `infer-2`, ..."""
+        """The names of the stages that run the parts: `infer`, `infer-2`, ..."""
         return ("infer", *(f"infer-{number}" for number in range(2, len(self.cuts) + 2)))
 
     @property
@@ -217,9 +224,11 @@ class RunConfig(StrictModel):
 
 
 def network_parts(payload: U8, networks: int, shapes: Sequence[Shape], channels: int) -> list[U8]:
-    """Return the part of a slot that belongs to each of so many `networks`.
+    """Return the part of a slot that belongs to each network, as views.
 
-    `shapes`: shapes that a tensor may have; each part has room for the largest. `channels`: most channels of a pixel.
+    `networks`: number of networks.
+    `shapes`: shapes that a tensor may have; each part has room for the largest.
+    `channels`: most channels of a pixel.
     """
     size = channels * max(math.prod(shape) for shape in shapes)
     return [payload[number * size : (number + 1) * size] for number in range(networks)]

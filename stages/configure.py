@@ -1,7 +1,7 @@
-"""Turns the options of a run into a RunConfig, every part of which is checked.
+"""Turns the options of a run into a RunConfig, and checks all its parts.
 
-Rule: motion, camera, background, avatar and runtime are opened and checked here, in the parent. A bad input then ends
-the command before a process is started or a file is made.
+Rule: motion, camera, background, avatar and runtime are opened and checked here, in the parent. Therefore a bad input
+ends the command before a process is started or a file is made.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from trilane.units import HOST
 
 ROOM = "room"
 COMMAND_LINE = "command line"
-#: Options of a run that have another name than their key of a scene.
+#: Key of a scene for each option of a run that has another name.
 KEYS = {"picture": "output"}
 
 GlFacts = Callable[[], dict[str, Any] | None]
@@ -48,10 +48,12 @@ GlFacts = Callable[[], dict[str, Any] | None]
 class Checked:
     """A configuration that can be run.
 
-    `assets`: arrays that were loaded to check it, as the units take them. `notes`: notes of the loads on their sources.
-    `accuracy`: result of `accuracy_of` for each avatar, by its name. `asked_cores`: cores of units that the options ask
-    for. `placement`: facts from `trilane.stages.placing` about the units' cores. `losses`: loss of each distinct avatar
-    in smaller tensors.
+    `assets`: arrays that were loaded to check the configuration, in the form that units take.
+    `notes`: sentences about its sources and choices, for a person.
+    `accuracy`: result of `accuracy_of` for each avatar, by its name.
+    `asked_cores`: cores that the options request for units.
+    `placement`: facts from `trilane.stages.placing` about the units' cores; None before.
+    `losses`: measured image error of each distinct avatar in smaller tensors.
     """
 
     config: RunConfig
@@ -68,10 +70,10 @@ class Checked:
 
 
 def requested_scene(options: RunOptions) -> Scene:
-    """Return the scene file with the options laid over it. Raises BadInputError.
+    """Return the scene of the scene file, changed by the options. Raises BadInputError.
 
     An option that is a key of the scene replaces its value. A motion or camera from the options drops the format that
-    the scene states for its own file; a built-in camera drops all that the scene states about it.
+    the scene states for its own file. A built-in camera drops all keys that the scene states about its camera file.
     """
     values = load_scene(find_scene(options.scene))
     here = Path.cwd()
@@ -94,13 +96,16 @@ def requested_scene(options: RunOptions) -> Scene:
 
 
 def _camera(values: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """Return the scene's `values` for another `source`: without the format of a file, for a built-in one all of it."""
+    """Return the camera's keys for another `source`.
+
+    A built-in camera drops all of FILE_KEYS from `values`, another file drops only the format.
+    """
     dropped = FILE_KEYS if source.startswith(BUILT_IN_PREFIX) else ("format",)
     return {key: value for key, value in values.items() if key not in dropped} | {"source": source}
 
 
 def _picture(text: str) -> dict[str, int]:
-    """Parse WIDTHxHEIGHT as the scene's `output`. Raises BadInputError."""
+    """Return the scene's key `output` from the text WIDTHxHEIGHT. Raises BadInputError."""
     match = re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", text)
     if match is None:
         raise BadInputError("--picture", repr(text), "WIDTHxHEIGHT in pixels, such as 640x480")
@@ -115,10 +120,12 @@ def configure(
     needs_person: bool = False,
     say: Callable[[str], object] = lambda _: None,
 ) -> Checked:
-    """Check every part of what the options ask for. Raises BadInputError or MissingPartError.
+    """Return the checked configuration of the run that the options request. Raises BadInputError or MissingPartError.
 
+    `out_dir`: run folder.
+    `gl`: function that returns facts about the OpenGL driver.
     `needs_person`: whether to refuse a recorded camera that does not show the person in half of the frames.
-    `say`: function that is given sentences while such a refusal takes time.
+    `say`: function that is called with sentences while this check takes long.
     """
     scene = requested_scene(options)
     if scene.plan == "full":
@@ -177,7 +184,10 @@ def configure(
 
 
 def requested_runtime(asked: str) -> tuple[str, str]:
-    """Return the runtime and why: as asked, else the fastest installed one. Raises BadInputError, MissingPartError."""
+    """Return (runtime, reason): the requested one, or for `auto` the fastest installed one.
+
+    Raises BadInputError, MissingPartError.
+    """
     if asked == "auto":
         return fastest_runtime(load_profile(HOST), installed())
     if asked not in RUNTIMES:
@@ -187,7 +197,7 @@ def requested_runtime(asked: str) -> tuple[str, str]:
 
 
 def requested_cuts(texts: Sequence[str], networks: Sequence[NetworkFile]) -> tuple[NetworkCut, ...]:
-    """Parse `TENSOR=UNIT` texts as cuts of the one of `networks`. Raises BadInputError, also for several networks."""
+    """Return the cuts that the texts `TENSOR=UNIT` request. Raises BadInputError, also for cuts of several networks."""
     if texts and len(networks) > 1:
         raise BadInputError("--split", f"{len(networks)} networks in the scene", "a scene of one network")
     cuts = []
@@ -211,7 +221,7 @@ def _footage(scene: Scene) -> Footage | None:
 
 
 def _check_pictures(scene: Scene, staged: Staged) -> None:
-    """Raise BadInputError when a picture that the run shows cannot be decoded."""
+    """Raise BadInputError if a picture of the background that the run shows cannot be decoded."""
     if scene.background != ROOM:
         from trilane.stages.gpu.background import check_pictures
 
@@ -219,9 +229,10 @@ def _check_pictures(scene: Scene, staged: Staged) -> None:
 
 
 def _accuracy(avatars: Sequence[tuple[AvatarData, int]], drawn: DrawnAs) -> dict[str, Any]:
-    """Return the error of each avatar's pictures by its name; equal names get their folders.
+    """Return the result of `accuracy_of` for each avatar by its name; for equal names the key contains the folder.
 
-    `avatars`: each with the number of avatars in its tensor.
+    `avatars`: pairs of an avatar and the number of avatars that share its tensor.
+    `drawn`: how the run draws avatars.
     """
     bundles = [(avatar.bundle, sharing) for avatar, sharing in avatars]
     names = Counter(bundle.manifest.name for bundle, _ in bundles)
@@ -234,7 +245,10 @@ def _accuracy(avatars: Sequence[tuple[AvatarData, int]], drawn: DrawnAs) -> dict
 
 
 def skinning_unit(asked: str, gl: GlFacts = gl_facts) -> tuple[str, str]:
-    """Return `cpu` or `gpu`, and why: as asked, else the GPU where the driver is hardware. Raises BadInputError."""
+    """Return (`cpu` or `gpu`, reason): the requested unit, or for `auto` the GPU if the driver is hardware.
+
+    Raises BadInputError for another word.
+    """
     if asked in ("cpu", "gpu"):
         return asked, "as asked"
     if asked != "auto":
@@ -245,9 +259,9 @@ def skinning_unit(asked: str, gl: GlFacts = gl_facts) -> tuple[str, str]:
 
 
 def required_machine(gl: GlFacts = gl_facts) -> dict[str, Any]:
-    """Return facts about this machine. Raises MissingPartError when no OpenGL context can be made.
+    """Return facts about this machine.
 
-    Raises TrilaneError when memory is what it lacks.
+    Raises MissingPartError if no OpenGL context can be made, TrilaneError if memory is short.
     """
     driver = gl()
     if driver is None and (short := shortage()):

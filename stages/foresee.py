@@ -1,11 +1,12 @@
-"""Looks at the tensors of a scene before the run: how many pixels they may have, and which shapes they take.
+"""Chooses the tensors of a scene before the run: how many pixels they may have, and which shapes are prepared.
 
-The bounds and layouts are those of the run, on a fixed number of frames spread over the scene. Where these frames lie
-close enough to each other, the changes of the tensor's shape are foreseen too.
+The choice uses the bounds and layouts of the run, on a fixed number of frames spread over the scene. If these frames
+are close enough to each other, the changes of the tensor's shape are foreseen too.
 
-A tensor has all the pixels that its network was trained for, or fewer where a scene allows it. A policy that releases
-frames at a rate may step down, so that frames are in time. An error budget in dB limits how far, by the avatars'
-measured figures; without such a policy the smallest size within the budget is taken.
+A tensor has the number of pixels that its network was trained for, or fewer if the scene allows it. Under a policy that
+releases frames at a rate, a run may step down to smaller tensors so that frames are in time. An error budget in dB
+limits the smallest size, by the avatars' measured errors. Under other policies the smallest size within the budget is
+used.
 """
 
 from __future__ import annotations
@@ -50,10 +51,11 @@ KEY = "error_budget_db"
 
 
 def tensor_works(scene: Scene, policy: str, losses: Sequence[SizeLoss]) -> tuple[tuple[int, ...], str]:
-    """Return `RunConfig.works` of a scene under `policy`, and a note for a person, which may be empty.
+    """Return (`RunConfig.works` of a scene under `policy`, note for a person, which may be empty).
 
-    `losses`: measured losses of the scene's avatars. Raises BadInputError if `policy` is an error budget and
-    an avatar has no measured losses.
+    `losses`: measured image errors of the scene's avatars in smaller tensors.
+
+    Raises BadInputError if the scene has an error budget and an avatar has no measured errors.
     """
     if not scene.plans_tensor:
         return (ALL_WORK,), ""
@@ -75,13 +77,13 @@ def tensor_works(scene: Scene, policy: str, losses: Sequence[SizeLoss]) -> tuple
     return (within if paced else within[-1:]), said
 
 
-#: Number of frames to look at, over all avatars, and the least for each avatar.
+#: Number of frames to examine: divided by the number of avatars, and the least number of the result.
 FORESEEN_FRAMES, LEAST_FRAMES = 96, 24
-#: Most frames between two looks for changes to be foreseen.
+#: Largest distance in frames between two examined frames with which changes are foreseen.
 MOST_APART = 15
-#: Most shapes of each size that is stepped down to.
+#: Most shapes of each smaller size to which a run may step down.
 MOST_SMALLER = 3
-#: A network that is ready to run holds each tensor once, and a runtime may keep a second copy in its own layout.
+#: Number of copies of each tensor in a prepared network: a runtime may keep a second copy in its own layout.
 COPIES = 2
 MB = 1_000_000
 BYTE_TYPES = (2, 3)  # ONNX's uint8 and int8
@@ -92,13 +94,14 @@ Changes = tuple[tuple[tuple[float, Shape], ...], ...]
 
 @dataclass(frozen=True)
 class Foreseen:
-    """The result of a look ahead.
+    """The result of `foresee`.
 
-    `shapes`: shapes to make ready. `frames`: numbers of the frames that were looked at. `seen`: number of them that
-    show somebody.
-    `changes`: for each budget, the times in seconds at which the tensor changes, with its shape from then on; empty
-    where that is not foreseen.
-    `left_out`: number of the smaller sizes without a shape, because `memory_mb` has no room for one.
+    `shapes`: shapes to prepare.
+    `frames`: numbers of the examined frames.
+    `seen`: number of examined frames that show somebody.
+    `left_out`: number of smaller sizes without a shape, because `memory_mb` has no room for one.
+    `changes`: for each budget, pairs of a time in seconds at which the tensor changes, and its shape from then on;
+    empty if the changes are not foreseen.
     """
 
     shapes: ShapeSet
@@ -109,7 +112,7 @@ class Foreseen:
 
     @property
     def note(self) -> str:
-        """Note about the shapes for a person."""
+        """A sentence about the shapes, for a person."""
         names = ", ".join(f"{height}x{width}" for height, width in self.shapes.shapes)
         looked_at = f"somebody is seen in {self.seen} of {len(self.frames)} frames looked at"
         if self.changes:
@@ -120,9 +123,9 @@ class Foreseen:
         return text
 
     def notes(self, memory_mb: int) -> tuple[str, ...]:
-        """Return `note`, and notes on what does not fit into `memory_mb`: smaller sizes, or even a single network.
+        """Return `note`, and sentences about sizes or a network that do not fit into `memory_mb`.
 
-        Memory is computed, not measured.
+        The memory is computed, not measured.
         """
         notes = [self.note]
         if self.left_out:
@@ -139,7 +142,7 @@ class Foreseen:
 
 @dataclass(frozen=True)
 class Painted:
-    """The `networks` of a scene, and the number of the one that paints each avatar; `by` is empty where one does."""
+    """The networks of a scene. `by`: number of the network that paints each avatar; empty if one network paints all."""
 
     networks: Sequence[NetworkFile]
     by: Sequence[int] = ()
@@ -151,9 +154,9 @@ def foresee(
     """Return the tensor shapes that `scene` needs.
 
     `bodies`: bodies of its avatars, in order.
-    `painted`: networks that paint them.
-    `budgets`: budgets of its tensors, the largest first; the run steps down to the others, where memory has room for
-    them.
+    `painted`: networks that paint the avatars.
+    `budgets`: budgets of its tensors, the largest first. The run may step down to the smaller ones, if memory has room
+    for their shapes.
     """
     count = min(scene.frames, max(FORESEEN_FRAMES // len(bodies), LEAST_FRAMES))
     frames = tuple(index * scene.frames // count for index in range(count))
@@ -183,7 +186,7 @@ def foresee(
             found = joined(found, ShapeSet(larger, math.ceil(per_pixel * sum(map(area, larger))), 0))
             changes.append(tuple((frame / scene.fps, shape) for frame, shape in foreseen))
         elif are_close:
-            # Without shapes of its own, this budget's tensors change as those of the larger one do.
+            # Without shapes of its own, this budget's tensors change at the same times as the larger budget's.
             changes.append(changes[-1])
         chosen = joined(chosen, found)
     return Foreseen(chosen, frames, len(seen), left_out, tuple(changes))
@@ -197,10 +200,13 @@ def _foreseen(
     networks: Sequence[int],
     room: tuple[int, int],
 ) -> tuple[tuple[Shape, ...], tuple[tuple[int, Shape], ...]]:
-    """Return further shapes to make ready, which spare changes because they suit more frames, and all changes then.
+    """Return (further shapes to prepare, changes of the tensor's shape with them); larger shapes need fewer changes.
 
-    `shapes`: shapes that are ready anyway. `networks`: network of each avatar; empty where one paints all. `room`: most
-    further shapes, and most pixels that they may have together.
+    `looks`: examined frames.
+    `output`: (height, width) of the picture.
+    `shapes`: shapes that are prepared anyway.
+    `networks`: network of each avatar; empty if one paints all.
+    `room`: (most further shapes, most pixels of all of them together).
     """
     most = budget.most_of(max(len(look.rects) for look in looks))
     larger = larger_shapes(shapes, most)
@@ -216,7 +222,7 @@ def _foreseen(
 def foreseen_rects(
     scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], frames: Sequence[int]
 ) -> Iterator[Mapping[int, Rect]]:
-    """Yield the rectangles of the visible avatars, by their numbers, for each of `frames`."""
+    """Yield the rectangle of each visible avatar, by its number, for each of `frames`."""
     distinct = {id(body): MeshBounds(body, standoff_m=CLOTHES_STANDOFF_M) for body in bodies}
     skeletons = [Skeleton(body.joints, body.body.parents) for body in bodies]
     for frame in frames:
@@ -233,7 +239,7 @@ def foreseen_rects(
 
 
 def bytes_per_pixel(network: NetworkFile) -> float:
-    """Return the memory of `network`, ready to run, for each pixel of its tensor: COPIES of all its byte tensors."""
+    """Return the bytes of memory of the prepared `network` per pixel of its tensor: COPIES of all its byte tensors."""
     _, height, width, _ = network.shape
     if not network.model.graph.value_info:
         network = reshaped(network, height + STRIDE, width)

@@ -1,6 +1,6 @@
-"""Facts about the machine that made a measurement; every reported number has them beside it.
+"""Facts about the machine that made a measurement. Every reported number has them beside it.
 
-Rule: only what was read or tried on this machine is stated; what could not be read is absent, never guessed.
+Rule: a fact was read or tried on this machine. A fact that could not be read is absent; none is guessed.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 from trilane import machine
 from trilane.pipeline.job_times import availability
 
-#: Instruction sets that decide how fast INT8 and FP32 networks run; a network's speed means nothing without them.
+#: Instruction sets that decide how fast INT8 and FP32 networks run on a CPU.
 CPU_FLAGS = (
     "avx2", "fma", "f16c", "avx512f", "avx512bw", "avx512_vnni", "avx_vnni", "avx512_bf16", "amx_tile", "amx_int8",
     "sha_ni",
@@ -43,7 +43,7 @@ GL_LIMITS = (
 
 
 def package_version(name: str) -> str | None:
-    """Return the version of an installed distribution, or None."""
+    """Return the version of distribution `name`; None if it is not installed."""
     try:
         return importlib.metadata.version(name)
     except importlib.metadata.PackageNotFoundError:
@@ -51,12 +51,12 @@ def package_version(name: str) -> str | None:
 
 
 def versions_with(package: str) -> list[str]:
-    """Return the versions of all packages that times depend on, including a runtime's `package`."""
+    """Return the names and versions of all packages that times depend on. `package`: distribution of a runtime."""
     return [f"{name} {package_version(name)}" for name in dict.fromkeys(("trilane", *PACKAGES, package))]
 
 
 def cpu_facts() -> dict[str, Any]:
-    """Return model, instruction flags and cores; `cores_allowed` are those that this process may run on."""
+    """Return model, architecture, instruction sets and cores; `cores_allowed`: cores that this process may use."""
     flags = machine.here.cpu_flags()
     return {
         "model": machine.here.cpu_model(),
@@ -68,7 +68,7 @@ def cpu_facts() -> dict[str, Any]:
 
 
 def open_gl() -> dict[str, Any]:
-    """Make a context in this process and describe it. Raises MissingPartError when none can be made."""
+    """Open an OpenGL context in this process and describe it. Raises MissingPartError if none can be opened."""
     from trilane.stages.gpu.opengl import describe, open_context
 
     context = open_context()
@@ -85,9 +85,9 @@ def open_gl() -> dict[str, Any]:
 
 @cache
 def gl_facts() -> dict[str, Any] | None:
-    """Return facts about the OpenGL driver that EGL gives; None when none works.
+    """Return facts about the OpenGL driver that EGL gives; None if no driver works.
 
-    It is tried in a process of its own, because a driver may crash.
+    A process of its own tries the driver, because a driver may crash.
     """
     command = [sys.executable, "-P", "-c", GL_PROGRAM]
     try:
@@ -99,7 +99,7 @@ def gl_facts() -> dict[str, Any] | None:
 
 
 def runtime_facts() -> dict[str, Any]:
-    """Return the inference runtimes and what they can run on."""
+    """Return the installed inference runtimes and what each can run on."""
     import onnxruntime
 
     facts: dict[str, Any] = {"onnxruntime": list(onnxruntime.get_available_providers())}
@@ -111,10 +111,7 @@ def runtime_facts() -> dict[str, Any]:
 
 
 def machine_facts(gl: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Return all facts that stand beside a measurement.
-
-    `gl`: result of `gl_facts`, where it was called.
-    """
+    """Return all facts that stand beside a measurement. `gl`: result of `gl_facts`; None if it was not called."""
     packages = {name: package_version(name) for name in (*PACKAGES, *OPTIONAL_PACKAGES)}
     return {
         "system": machine.here.system(),

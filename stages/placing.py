@@ -1,13 +1,13 @@
 """Chooses the cores of a run's units: as asked; else by the shortest frames, tried or predicted; else by a rule.
 
-A run that is long enough is rehearsed for a moment: what each unit needs for a frame is measured, with every number of
-threads that it may have. The few placements with the least predicted frame times are then tried with real frames. Both
-results are kept for the next run of the same network, shapes, runtime, output and machine. The rule of
-`trilane.hw_profiles.host` places a run that is too short to gain by this, or is held to a chip's pace.
+A run that is long enough is rehearsed first. The rehearsal measures the time that each unit needs for a frame, with
+each number of threads that it may have. The few placements with the shortest predicted frames are then tried with real
+frames. Both results are kept for the next run with the same network, shapes, runtime, output and machine. The rule of
+`trilane.hw_profiles.host` places a run that is too short to gain by a rehearsal or is held to a chip's pace.
 
-Nothing is tried while other programs use the cores. A floating unit dodges such programs and a pinned one waits, so
-frame times would say more about those programs than about the placements. The prediction decides then, a note says so,
-and the next run looks again.
+Nothing is tried while other programs use the cores: a floating unit avoids these programs, but a pinned unit waits for
+them, so frame times would depend more on the programs than on the placements. The prediction then decides, a note says
+so, and the next run looks again.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ from trilane.stages.dsp.runtime import RUNTIMES
 from trilane.stages.machine_facts import cpu_facts, versions_with
 from trilane.units import BEFORE_INFER, NS_PER_MS, UNITS
 
-#: Least number of frames; shorter runs gain less than a rehearsal costs.
+#: Least number of frames of a run that is rehearsed; shorter runs gain less than a rehearsal costs.
 LEAST_FRAMES = 100
 CACHE, TRIAL_CACHE = "placement-3", "placement-trial-2"
 MOST_LOGICAL, MOST_CORES = 8, 16
@@ -71,11 +71,14 @@ MEASURING = "measuring the stages for their placement on cores (once for this av
 def placed(
     checked: Checked, policy: str, starter: UnitStarter, driver: str = "", say: Callable[[str], None] = lambda _: None
 ) -> Checked:
-    """Return `checked` with its units on the cores that are best for it, and with a note on them.
+    """Return `checked` with its units on the cores that are best for it, and with a note that names them.
 
-    `policy`: policy of the run. `starter`: fork server. `driver`: OpenGL driver, which the times depend on. `say`: is
-    called with a message before something takes seconds. Raises TrilaneError when a unit cannot start or a stage fails,
-    KeyboardInterrupt when interrupted.
+    `checked`: run to place.
+    `policy`: policy of the run.
+    `starter`: fork server.
+    `driver`: OpenGL driver, which the times depend on.
+    `say`: is called with a message before work that takes seconds.
+    Raises TrilaneError if a unit cannot start or a stage fails, KeyboardInterrupt if interrupted.
     """
     asked = {unit: Place(own, len(own)) for unit, own in checked.asked_cores.items()}
     cores = host_cores(sorted({*usable_cores(), *(core for place in asked.values() for core in place.cores)}))
@@ -111,22 +114,22 @@ def placed(
 
 
 def considered(cores: Sequence[CpuCore], asked: Placement) -> list[CpuCore]:
-    """Return the cores to place units on: all of them, or fewer where there are more than MOST_LOGICAL.
+    """Return the cores to place units on: all `cores`, or some of them if there are more than MOST_LOGICAL.
 
-    Fewer means one of each physical core, and the first MOST_CORES of these: placements on more are too many to list.
-    Cores that were `asked` for stay.
+    Placements on more cores would be too many to list. Only one logical core of each physical core then stays, and only
+    the first MOST_CORES of these. Cores of the `asked` placement always stay.
     """
     if len(cores) <= MOST_LOGICAL:
         return list(cores)
     fixed = {core for place in asked.values() for core in place.cores}
-    # Reversed, so that the first core of each physical one is kept.
+    # Reversed, so that the first logical core of each physical core is kept.
     first = {core.physical: core.number for core in reversed(cores)}
     chosen_numbers = {*sorted(first.values())[:MOST_CORES], *fixed}
     return [core for core in cores if core.number in chosen_numbers]
 
 
 def times_rows(times: Times) -> list[dict[str, Any]]:
-    """Return the measured times: a row for each unit and number of threads, times in ms."""
+    """Return the measured times as rows, one for each unit and number of threads. Times are in ms."""
     return [
         {"unit": unit, "threads": threads, "ms": work.serial_ns / NS_PER_MS, "core_ms": work.core_ns / NS_PER_MS}
         for unit, works in times.items()
@@ -135,7 +138,7 @@ def times_rows(times: Times) -> list[dict[str, Any]]:
 
 
 def _why_not(checked: Checked, cores: Sequence[CpuCore]) -> str:
-    """Say why nothing is measured; empty when it is."""
+    """Return why nothing is measured for this run; empty if it is measured."""
     if len(checked.asked_cores) == len(UNITS):
         return "as asked"
     if len(cores) == 1:
@@ -172,9 +175,9 @@ def _reason(facts: Mapping[str, Any]) -> str:
 def rehearsed(
     checked: Checked, starter: UnitStarter, driver: str = "", say: Callable[[str], None] = lambda _: None
 ) -> tuple[Rehearsed, str]:
-    """Return the times that place a run of `checked`, and when they were measured, UTC: now, or for an earlier run.
+    """Return (the times that place a run of `checked`, when they were measured, UTC). They may be an earlier run's.
 
-    Parameters and errors are those of `placed`.
+    Parameters and errors are as in `placed`.
     """
     cores, rule = host_cores(usable_cores()), rule_placement(usable_cores(), {})
     return _kept(checked, cores, rule, starter, [*_made_from(checked, cores, rule), driver], say)
@@ -188,7 +191,7 @@ def _kept(
     made_from: Sequence[str],
     say: Callable[[str], None],
 ) -> tuple[Rehearsed, str]:
-    """Return what each unit needs for a frame, and when that was measured, UTC."""
+    """Return (the time that each unit needs for a frame, when it was measured, UTC)."""
 
     def measured() -> dict[str, NDArray[Any]]:
         say(MEASURING)
@@ -211,7 +214,7 @@ def _kept(
 
 
 def _made_from(checked: Checked, cores: Sequence[CpuCore], rule: Placement) -> list[str]:
-    """Return everything that the times depend on."""
+    """Return everything that the times depend on, as text."""
     config = checked.config
     said = config.model_dump_json(exclude={"out_dir", "units", "scene", "pace_ns"})
     scene = config.scene.model_dump_json(exclude={"name", "frames", "fps"})
@@ -220,9 +223,9 @@ def _made_from(checked: Checked, cores: Sequence[CpuCore], rule: Placement) -> l
     return [said, scene, *machine, *networks, *versions_with(RUNTIMES[config.runtime].package)]
 
 
-#: Number of rounds in which placements are tried; after TRY_S seconds, only LEAST_ROUNDS are completed.
+#: Number of rounds in which placements are tried. After TRY_S seconds no round starts, except the first LEAST_ROUNDS.
 ROUNDS, LEAST_ROUNDS, TRY_S = 6, 3, 5.0
-#: Largest share of the cores that other programs may have while placements are compared, and seconds of looking at it.
+#: Largest share of the cores that other programs may use while placements are compared, and how long it is measured.
 MOST_OTHERS, LOOK_S = 0.1, 0.25
 PREDICTED = "the least predicted frame time"
 TRYING = "trying {} placements with frames of the scene (once for this avatar, scene and machine) ..."
@@ -233,7 +236,9 @@ Arrays = Mapping[str, NDArray[Any]]
 class TriedPlacement(NamedTuple):
     """The result of trying placements.
 
-    `best`: index of the one to take. `why`: reason in words. `frame_ms`: frame times of those that were tried.
+    `best`: index of the placement to take.
+    `why`: reason in words.
+    `frame_ms`: frame times of the placements, ms; empty if none was tried.
     """
 
     best: int
@@ -242,7 +247,7 @@ class TriedPlacement(NamedTuple):
 
 
 class _BusyError(Exception):
-    """Other programs have so large a `share` of the cores that frame times cannot be compared."""
+    """Other programs use too many of the cores to compare frame times. `share`: share of the cores that they use."""
 
     def __init__(self, share: float) -> None:
         super().__init__()
@@ -257,18 +262,22 @@ def choice(
     say: Callable[[str], None] = lambda _: None,
     kept: Callable[[Callable[[], Arrays]], Arrays] = lambda make: make(),
 ) -> TriedPlacement:
-    """Choose the one of `candidates` with the shortest frames; the first one where nothing is tried.
+    """Return which of `candidates` has the shortest frames; the first one if nothing is tried.
 
-    `checked`: run to place. `cores`: available cores. `starter`: fork server. `say`: is called with a message before
-    this takes seconds. `kept`: returns what its argument makes, now or in an earlier run. Raises TrilaneError when a
-    unit cannot start or a stage fails, KeyboardInterrupt when interrupted.
+    `checked`: run to place.
+    `cores`: available cores.
+    `candidates`: placements to compare, the one with the shortest predicted frames first.
+    `starter`: fork server.
+    `say`: is called with a message before work that takes seconds.
+    `kept`: returns what its argument makes, from a cache or by calling it.
+    Raises TrilaneError if a unit cannot start or a stage fails, KeyboardInterrupt if interrupted.
     """
     if len(candidates) == 1:
         return TriedPlacement(0, PREDICTED)
 
     def measured() -> Arrays:
         others = OtherPrograms(cores)
-        # The share is counted in steps of 10 ms, so a shorter look would say little.
+        # The system counts time in steps of 10 ms, so a shorter measurement would say little.
         time.sleep(LOOK_S)
         _refuse_when_busy(others.share())
         say(TRYING.format(len(candidates)))

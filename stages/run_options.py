@@ -1,7 +1,7 @@
-"""The options of a run, each as one field: its help text, default, range, unit and words.
+"""The options of a run. Each is one field, with its help text, default, range, unit and words.
 
-The command line, `trilane.run`, sweeps, the dashboard's controls and the report read their options from the fields.
-Rule: no other list of the options exists. A field is plain data; `configure` finds out whether a file exists.
+The command line, `trilane.run`, sweeps, the dashboard's controls and the report read their options from these fields.
+Rule: no other list of the options exists. The fields are plain data; `configure` looks whether files exist.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ RUNTIME_HELP: Final = "auto, ort, openvino, qnn or cuda; auto is the fastest ins
 SIZE_HELP: Final = "Tensor size in pixels: HEIGHTxWIDTH, or a side S for areas up to SxS."
 WIDTH_HELP: Final = "Width of the network: 64 is full; all channel counts scale with it."
 
-#: Word for the calibration of the network in the avatar's own file.
+#: Word for the calibration that the avatar's own network file has.
 AS_IT_IS: Final = "as-it-is"
 #: Methods of `trilane.training.quantising.calibration`, repeated here because that module takes long to import.
 METHODS: Final = ("minmax", "percentile", "entropy")
-#: Calibration method of an untrained network that none was asked for, and number of views where none is given.
+#: Calibration method of an untrained network if none is asked for, and number of views if none is given.
 METHOD, VIEWS = "minmax", 5
 MOST_VIEWS: Final = 1000
 #: Numbers of channels that the packed pass draws (`stages/gpu/raster.py`).
@@ -36,9 +36,9 @@ CHANNELS: Final = (4, 8, 12, 16)
 
 
 def calibration_of(text: str) -> tuple[str, int] | None:
-    """Parse `text`, METHOD or METHOD:VIEWS, into method and number of views; None for `AS_IT_IS`.
+    """Return (method, number of views) of `text`, METHOD or METHOD:VIEWS; None for `AS_IT_IS`.
 
-    Raises UnexpectedValue.
+    Raises UnexpectedValue for any other text.
     """
     method, colon, views = text.partition(":")
     if text == AS_IT_IS:
@@ -52,7 +52,7 @@ def calibration_of(text: str) -> tuple[str, int] | None:
 
 
 def _cores(value: object) -> object:
-    """Accept {"dsp": [0, 1]}, which programs give."""
+    """Return the texts of the option, also for a mapping such as {"dsp": [0, 1]}, which programs give."""
     if not isinstance(value, Mapping):
         return texts_of(value)
     return tuple(f"{unit}={','.join(map(str, own))}" for unit, own in value.items())
@@ -176,11 +176,11 @@ class RunOptions(Options):
 
     @property
     def remakes_avatar(self) -> bool:
-        """Return whether the run's avatar differs from that of the scene's files in its network or its texture."""
+        """Whether the run's avatar has another network or texture than the avatar in the scene's files."""
         return any(value not in (None, AS_IT_IS) for value in (self.width, self.channels, self.calibration))
 
     def check_together(self) -> None:
-        """Raise BadInputError for options that a scene does not take, and that lack or exclude another one."""
+        """Raise BadInputError if a scene does not take an option, or if options need or exclude each other."""
         if self.changes:
             raise BadInputError("options", "--set without a pipeline file", "a .toml file with [stages] before it")
         if (self.profile is not None) != self.pace:

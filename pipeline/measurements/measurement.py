@@ -191,7 +191,7 @@ class Found:
         self._made.append(replace(measurement, name=measurement.name[:LONGEST_NAME] or UNNAMED))
 
     def take_back(self, names: set[str], row: str, reason: str) -> None:
-        """Remove measurements that `add` has taken, by name, and refuse `row` for the reason."""
+        """Remove the measurements `names`, which `add` has taken, and refuse `row` for `reason`."""
         self._made = [each for each in self._made if each.name not in names]
         self.refuse(row, reason)
 

@@ -180,7 +180,7 @@ def _of_events(events: Sequence[Any]) -> Found:
 
 
 def _events_by_line(text: str) -> tuple[list[Any], list[str]]:
-    """Return (events, places of the lines that are no event) of a list that is cut off, with an event a line."""
+    """Return (events, places of the lines that are no event) of a cut-off list that has one event on each line."""
     events, broken = [], []
     for number, line in enumerate(text.splitlines(), 1):
         bare = line.strip().removeprefix('{"traceEvents":').removeprefix("[").removesuffix("]").rstrip(", ")

@@ -494,7 +494,7 @@ def _loadgen(run: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _of_older_app(found: Found, row: str, run: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the table that newer versions state, with the mean computed: duration of all queries by their number."""
+    """Return the table that newer versions state. Its mean is the duration of all queries divided by their number."""
     info = run.get("loadgen_info")
     info = info if isinstance(info, dict) else {}
     key = next((key for key in ("duration", "duration_ms") if key in info), "duration" if info else WHOLE_MS)

@@ -1,4 +1,4 @@
 """The stages of a pipeline file: blocks, networks and own code, each with arrays as its ports.
 
-Each module has one factory, `build`. What a block needs of the file is in `trilane.pipeline.file_keys`.
+Each module has the factories of its stages. The keys of a block in the file are in `trilane.pipeline.file_keys`.
 """

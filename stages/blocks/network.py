@@ -1,18 +1,18 @@
 """A network as a stage: `onnx = "net.onnx"` of a pipeline file, in a runtime that reads and writes the slots.
 
-Rule: an input that has the network's type is read where it lies, and an output is written where it is read; nothing is
-copied. A picture is prepared first, into memory of the stage's own, as the block `prepare` does it. A newest frame that
-is not there counts as zeros.
+Rule: the runtime reads an input with the network's type directly from its slot, and writes an output directly to its
+slot. A picture is first prepared into memory of the stage, as the block `prepare` does it. If there is no newest frame
+yet, the input is zeros.
 
-Networks as they come, of any number types, inputs and outputs, in each of the runtimes.
+The module runs networks of any number types, inputs and outputs, in each of the runtimes:
 
     engine = engine_of(path, "openvino", {"image": (1, 3, 224, 224)}, options)
     call = engine.bound({"image": pictures}, {"scores": scores})
     call()
 
-Rule: inputs are read and outputs are written where they lie; only `cuda` copies. A runtime runs the whole network or
-refuses it, and none falls back to another. The number types are those of the file: unlike an avatar's network, one of
-floats is computed in these floats.
+Rule: only the runtime `cuda` copies inputs and outputs. A runtime runs the whole network or refuses it, and none falls
+back to another. The number types are those of the file: a float network is computed in floats, unlike an avatar's
+network.
 """
 
 from __future__ import annotations
@@ -39,19 +39,20 @@ ORT, OPENVINO, QNN, CUDA = "ort", "openvino", "qnn", "cuda"
 
 
 class LoadedNetwork(Protocol):
-    """A loaded network. `outputs`: names of its outputs, in its order."""
+    """A loaded network. `outputs`: names of its outputs, in the network's order."""
 
     outputs: Sequence[str]
 
     def bound(self, inputs: Named, outputs: Named) -> Callable[[], object]:
-        """Return a call that computes `outputs` from `inputs`, by name; the arrays are C-contiguous and outlive it.
+        """Return a function that computes `outputs` from `inputs`, both arrays by name.
 
-        All inputs are given. An output that is left out is computed, and nobody gets it.
+        The arrays must be C-contiguous, and outlive the function. All inputs must be given. An output that is left out
+        is computed, but not stored.
         """
 
 
 class OpenvinoEngine:
-    """A compiled model of OpenVINO, with one infer request; requests have memory of their own, so there is but one."""
+    """A compiled model of OpenVINO, with only one infer request, because each request has memory of its own."""
 
     def __init__(self, openvino: Any, compiled: Any) -> None:
         self._openvino = openvino
@@ -75,16 +76,18 @@ class OpenvinoEngine:
 
 
 def _writeable(array: NDArray[Any]) -> NDArray[Any]:
-    """Return the same memory as an array that may be written: OpenVINO takes no other, also for what it only reads."""
+    """Return a writeable array on the same memory, because OpenVINO takes only writeable arrays, even as inputs."""
     memory = (ctypes.c_char * array.nbytes).from_address(array.ctypes.data)
     return np.frombuffer(memoryview(memory), array.dtype).reshape(array.shape)
 
 
 def engine_of(path: Path, runtime: str, shapes: Shapes, options: RuntimeOptions) -> LoadedNetwork:
-    """Load the network in `path`.
+    """Return the loaded network in `path`.
 
-    `shapes`: shape of each input by name. Raises BadInputError for a network that the runtime does not load,
-    MissingPartError for a runtime that is not there.
+    `runtime`: name of the runtime.
+    `shapes`: shape of each input by name.
+
+    Raises BadInputError for a network that the runtime does not load, MissingPartError for an absent runtime.
     """
     return _ENGINES[resolve(runtime)](path, shapes, options)
 
@@ -115,7 +118,7 @@ def _openvino(path: Path, shapes: Shapes, options: RuntimeOptions) -> LoadedNetw
         "INFERENCE_NUM_THREADS": options.threads,
         "NUM_STREAMS": 1,
         "ENABLE_CPU_PINNING": False,
-        "INFERENCE_PRECISION_HINT": "f32",  # else floats become bfloat16 on processors that have it
+        "INFERENCE_PRECISION_HINT": "f32",  # otherwise floats become bfloat16 on processors that have it
     }
     try:
         core = openvino.Core()
@@ -138,8 +141,8 @@ _ENGINES: Mapping[str, Callable[[Path, Shapes, RuntimeOptions], LoadedNetwork]] 
 class _Fed(NamedTuple):
     """An input of the network.
 
-    `own`: memory of the stage's own, which a prepared picture or zeros lie in.
-    `preparation`: how a picture gets there; None where the slot is read as it is.
+    `own`: memory of the stage for a prepared picture or for zeros.
+    `preparation`: conversion of a picture into this memory; None if the slot is read directly.
     """
 
     name: str
@@ -149,9 +152,10 @@ class _Fed(NamedTuple):
 
 
 class Network(PortedStage):
-    """Runs one inference for a frame.
+    """Runs one inference for each frame.
 
-    Keys: `onnx`, `runtime`, and `inputs`: the type of each input of the network, by name, in its order.
+    Its keys are `onnx`, `runtime`, and `inputs`, the type of each input of the network by name, in the network's order.
+
     Raises BadInputError for a network that the runtime does not load, MissingPartError for an absent runtime.
     """
 
@@ -172,7 +176,7 @@ class Network(PortedStage):
         return _Fed(name, wanted[name], own, preparation)
 
     def ready(self) -> None:
-        """Run once on zeros: the first run of a session allocates its memory."""
+        """Run once on zeros, because the first run of a session allocates its memory."""
         outputs = self._outputs[0] if self._outputs else {}
         self.work(0, [None] * len(self._fed), outputs)
         for array in outputs.values():
@@ -193,7 +197,7 @@ class Network(PortedStage):
         return {}
 
     def _bound(self, sources: Sequence[NDArray[Any]], outputs: Arrays) -> Callable[[], object]:
-        """Return the call from these inputs to these outputs."""
+        """Return the function that computes `outputs` from `sources`, the array of each input."""
         given = {fed.name: array.reshape(fed.type.shape) for fed, array in zip(self._fed, sources, strict=True)}
         return self._engine.bound(given, {name or self._engine.outputs[0]: array for name, array in outputs.items()})
 

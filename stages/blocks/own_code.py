@@ -1,18 +1,18 @@
-"""Own code as a stage: `python = "module:factory"` of a pipeline file.
+"""The user's own code as a stage: `python = "module:factory"` of a pipeline file; and the blocks `busy` and `discard`.
 
-`factory(settings)` is called once in the unit's process and returns something callable. That is called for each frame
-with an array for each input: a named port as a keyword, a lone input without a name as the only argument. A newest
-frame that is not there is None. It returns a dict of arrays by port, or the array of the only port. If it has a
-parameter `out`, it gets the arrays to fill, by port, and may return None.
+`factory(settings)` is called once in the unit's process and returns a callable. The callable is called for each frame
+with an array for each input: a named port as a keyword argument, a single input without a name as the only argument. If
+there is no newest frame yet, the argument is None. The callable returns a dict of arrays by port, or the array of the
+only port. If it has a parameter `out`, it gets the arrays to fill, by port, and may return None.
 
-Where a bypass begins, it has an attribute `skips`, which is read after each frame: true sends the frame to the bypass.
-If it has a method `forget`, that is called before the first frame, and when what earlier frames brought to the bypass's
-end is gone.
+If a bypass begins at the stage, the callable has an attribute `skips`, which is read after each frame: true sends the
+frame to the bypass. If it has a method `forget`, the method is called when the next frame must not rely on earlier
+frames (`SkippingStage.forget`).
 
-Rule: what it returns must have the type that the file says; nothing is cast or broadcast in silence. An error says
+Rule: a returned array must have the type that the file states; nothing is cast or broadcast silently. An error says
 which stage, file and line it comes from.
 
-The blocks `busy`, a load that is made up, and `discard`, which takes frames and does nothing with them.
+The block `busy` is an artificial load, and `discard` takes frames and does nothing with them.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ OUT, SKIPS, FORGET = "out", "skips", "forget"
 
 
 class OwnCode(PortedStage):
-    """A stage that calls a person's own code. Raises BadInputError for a module or factory that is not there."""
+    """A stage that calls the user's own code. Raises BadInputError for a module or factory that does not exist."""
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         super().__init__(settings)
@@ -70,7 +70,7 @@ class OwnCode(PortedStage):
             self._guarded(own)
 
     def _write(self, found: object, outputs: Arrays) -> None:
-        """Copy what the code returned to its slot. Raises TrilaneError."""
+        """Copy the arrays that the code returned to the output slot. Raises TrilaneError for other values."""
         if not isinstance(found, dict):
             found = dict.fromkeys(outputs, found) if len(outputs) == 1 else found
         self._check(found, outputs)
@@ -79,7 +79,7 @@ class OwnCode(PortedStage):
             target[...] = found[name]
 
     def _check(self, found: object, outputs: Arrays) -> None:
-        """Check what the code returned. Raises TrilaneError."""
+        """Raise TrilaneError if the code returned other ports, types or shapes than the file states."""
         if not isinstance(found, dict) or found.keys() != outputs.keys():
             said = f"a dict of {', '.join(map(str, found))}" if isinstance(found, dict) else type(found).__name__
             ports = ", ".join(name or "one array" for name in outputs)
@@ -101,7 +101,7 @@ class OwnCode(PortedStage):
         return found
 
     def _guarded(self, call: Callable[..., Any], *args: Any, **named: Any) -> Any:
-        """Return what a call returns; an error in it names the stage, and the file and line of the code."""
+        """Return the result of a call; an error in it becomes a TrilaneError with stage, file and line of the code."""
         try:
             return call(*args, **named)
         except (TrilaneError, ModuleNotFoundError):
@@ -114,7 +114,7 @@ class OwnCode(PortedStage):
 
 
 def _is_own(file: str) -> bool:
-    """Whether a file of a traceback is a person's own code: neither this one nor part of the import machinery."""
+    """Return whether a file of a traceback is the user's code: not this file, and no part of the import machinery."""
     return Path(file) != Path(__file__) and not file.startswith("<") and "/importlib/" not in file
 
 
@@ -133,12 +133,12 @@ def _shown(array: object) -> str:
 
 
 def build(settings: Mapping[str, Any], unit: UnitContext) -> OwnCode:  # noqa: ARG001 - a factory's signature
-    """Build the stage; imports its module. Raises BadInputError, TrilaneError."""
+    """Build the stage, and import the user's module. Raises BadInputError, TrilaneError."""
     return OwnCode(settings)
 
 
 class Busy(PortedStage):
-    """Works for a stated time of its core, and writes zeros; it sends as many frames to a bypass as the file says."""
+    """Works for the CPU time `load_ms`, and writes zeros; it sends the frames to a bypass that the file names."""
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         super().__init__(settings)
@@ -146,7 +146,7 @@ class Busy(PortedStage):
         self._way = None if said is None else BypassKeys.model_validate(said)
 
     def work(self, frame: int, arrays: Sequence[NDArray[Any] | None], outputs: Arrays) -> Mapping[str, float]:  # noqa: ARG002
-        # CPU time, because a stage that lost its core to another has its work still before it.
+        # CPU time, because a stage without its core does no work.
         end_ns = time.thread_time_ns() + round(self.settings.keys["load_ms"] * NS_PER_MS)
         while time.thread_time_ns() < end_ns:
             pass

@@ -1,21 +1,20 @@
-"""The blocks of pictures: `prepare` makes of one what a network expects, and `overlay` draws on it what networks found.
+"""The blocks of pictures: `prepare` turns a picture into a network's input, and `overlay` draws outputs on a picture.
 
-`prepare`: a picture in a network's size, layout and numbers.
+The block `prepare` writes a picture in a network's size, layout and numbers. The number for a byte b of channel c is
+((b / 255 - mean[c]) / sd[c]) / step + zero_point; for an integer type it is rounded and clipped. Without keys, mean is
+0, sd is 1, and step is 1 for floats. For bytes, step is 1/255, so that bytes do not change; the zero point is 0, or
+-128 for signed bytes.
 
-A network's number for a byte b of channel c is ((b / 255 - mean[c]) / sd[c]) / step + zero_point, rounded and clipped
-to the type where that is a whole number. Without keys, mean is 0, sd is 1, and step is 1 for floats. For bytes, step is
-1/255, so that bytes stay as they are; the zero point is 0, or -128 for signed bytes.
+The block `overlay` draws these outputs on a picture:
 
-The block `overlay`: draws on a picture what networks found in it.
+- `mask`: classes or scores. If it has three axes, the smaller of the first and the last has the channels. The largest
+  of several channels is the class, and channel 0 is the background. A single float channel is a mask where it is above
+  0.5; a single integer channel contains classes.
+- `depth`: one channel, drawn from its least number (blue) to its largest (red).
+- `boxes`: rows of x0, y0, x1, y1 and maybe a score, in pixels of the picture, or from 0 to 1. A box with score 0 is not
+  drawn.
 
-- `mask`: classes or scores; of three axes the smallest outer one is that of the channels. Of several channels the
-  largest counts, and channel 0 is the background. One channel of floats counts above 0.5; one of whole numbers holds
-  classes.
-- `depth`: one channel, from its least (blue) to its largest number (red).
-- `boxes`: rows of x0, y0, x1, y1 and maybe a score, in pixels of the picture, or from 0 to 1; a score of 0 draws
-  nothing.
-
-A mask is stretched over the picture.
+Mask and depth are stretched over the picture.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from trilane.pipeline.file_keys import TYPES, PortType
 from trilane.pipeline.stage import Arrays, PortedStage, UnitContext
 
 STEPS: Final = 255
-PAD: Final = 114  # the grey around a letterboxed picture, as detectors are trained with
+PAD: Final = 114  # grey around a letterboxed picture, with which detectors are trained
 CHANNELS: Final = (1, 3)
 NCHW, NHWC = "nchw", "nhwc"
 OWN_CODE: Final = "a stage with python can prepare it"
@@ -42,8 +41,12 @@ OWN_CODE: Final = "a stage with python can prepare it"
 class Preparation:
     """Turns pictures of one type into inputs of a network.
 
+    `picture`: type of the pictures, (h,w,c).
+    `wanted`: type of the network's input.
     `keys`: fit, layout, mean, sd, step and zero_point of the block, as far as they are given.
-    `where`: place of the stage in its file. Raises BadInputError for what does not fit.
+    `where`: place of the stage in its file, for errors.
+
+    Raises BadInputError if the keys or the types do not fit each other.
     """
 
     def __init__(self, picture: PortType, wanted: PortType, keys: Mapping[str, Any], where: str) -> None:
@@ -60,13 +63,13 @@ class Preparation:
         if self._dtype.kind in "iu":
             limits = np.iinfo(self._dtype)
             numbers = np.clip(np.rint(numbers), limits.min, limits.max)
-        #: The number for each byte and channel, so that a frame needs one look-up for each of its bytes.
+        #: The network's number for each byte and channel (256, channels), so that each byte needs one look-up.
         self._table = numbers.astype(self._dtype)
         self._is_same = self._dtype == np.uint8 and (self._table == np.arange(STEPS + 1)[:, None]).all()
         self._height_in, self._width_in, self._channels_in = picture.shape
 
     def _quantised(self, keys: Mapping[str, Any], where: str) -> tuple[float, float]:
-        """Return step and zero point of the network's numbers."""
+        """Return (step, zero point) of the network's numbers."""
         if self._dtype.kind == "f":
             return keys.get("step") or 1.0, float(keys.get("zero_point") or 0)
         if self._dtype.itemsize > 1 and keys.get("step") is None:
@@ -125,7 +128,7 @@ _DEFAULTS: Final = {"mean": 0.0, "sd": 1.0}
 
 
 def _each(values: Sequence[float] | None, channels: int, other: float, where: str) -> NDArray[np.float64]:
-    """Return a value for each channel."""
+    """Return a value for each channel (channels,). `other`: value for all channels if `values` is None."""
     given = [other] if values is None else list(values)
     if len(given) not in (1, channels):
         expected = f"1 or {channels}, one for each channel"
@@ -134,7 +137,7 @@ def _each(values: Sequence[float] | None, channels: int, other: float, where: st
 
 
 def _layout(wanted: PortType, asked: str | None, where: str) -> tuple[str, tuple[int, int, int]]:
-    """Return the layout of a network's input, and height, width and channels in it."""
+    """Return (layout of a network's input, (height, width, channels) in it). `asked`: layout that the file states."""
     shape = wanted.shape[-3:]
     if len(wanted.shape) not in (3, 4):
         expected = "one that reads pictures, 1xCxHxW or 1xHxWxC"
@@ -155,7 +158,7 @@ def _resized(picture: U8, width: int, height: int) -> U8:
 
 
 class Prepare(PortedStage):
-    """Writes what a network expects of a picture."""
+    """Writes the input of a network for each picture."""
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         super().__init__(settings)
@@ -181,7 +184,7 @@ CLASSES: Final = 256
 
 
 def class_colours() -> U8:
-    """Return a colour for each class, (CLASSES, 3), distinct for neighbours; that of class 0 is never drawn."""
+    """Return a colour for each class (CLASSES, 3), distinct for neighbouring classes; class 0 is never drawn."""
     hues = np.arange(CLASSES) * 0.618034 % 1  # the golden ratio spreads them
     waves = [np.clip(np.abs((hues * 6 + shift) % 6 - 3) - 1, 0, 1) for shift in (0, 4, 2)]
     return np.asarray(np.stack(waves, axis=1) * STEPS, np.uint8)
@@ -191,7 +194,7 @@ DRAW_YOURSELF: Final = "a stage with python before it can bring them into this f
 
 
 class Overlay(PortedStage):
-    """Writes a picture with what was found in it. Raises BadInputError for a port of another form."""
+    """Writes a picture with the outputs of networks on it. Raises BadInputError for an input of another form."""
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         super().__init__(settings)
@@ -233,7 +236,7 @@ class Overlay(PortedStage):
         picture[..., :3] = chosen if where is None else np.where(where[..., None], chosen, picture[..., :3])
 
     def _draw(self, picture: U8, boxes: NDArray[np.float64]) -> None:
-        """Draw the frame of each box."""
+        """Draw the outline of each box. `boxes`: (boxes, 4 or more): x0, y0, x1, y1, maybe score."""
         boxes = boxes[np.isfinite(boxes[:, :4]).all(axis=1)]
         if boxes.shape[1] > 4:
             boxes = boxes[boxes[:, 4] > 0]
@@ -252,7 +255,7 @@ class Overlay(PortedStage):
 
 
 def _channels(array: NDArray[Any]) -> NDArray[Any]:
-    """Return `array` as (channels, height, width): of three axes the smallest outer one is that of the channels."""
+    """Return `array` as (channels, height, width); the smaller of the first and the last of three axes has channels."""
     planes = array.reshape([size for size in array.shape if size > 1])
     if planes.ndim == 2:
         return planes[None]
@@ -260,7 +263,7 @@ def _channels(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _classes(mask: NDArray[Any]) -> U8:
-    """Return the class of each pixel, (h,w)."""
+    """Return the class of each pixel (h,w)."""
     planes = _channels(mask)
     if len(planes) > 1:
         return np.asarray(planes.argmax(axis=0) % CLASSES, np.uint8)

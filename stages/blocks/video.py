@@ -1,15 +1,13 @@
-"""The blocks of video files: `video` reads one, and `encode` writes one.
+"""The blocks of video files: `video` reads a video, and `encode` writes one.
 
-`video`: pictures of a video file, or of a folder of pictures, scaled and cropped to one size.
+The block `video` writes the pictures of a video file, or of a folder of pictures, scaled and cropped to one size. Frame
+n of a video is the picture that is shown n / rate after the video's begin; the rate is the run's, or else the file's.
+Frame n of a folder is picture n. After its end a video or folder begins again. A frame is found by its number, so a
+unit that was started again goes on at the right frame.
 
-Frame n is the picture that is shown n / rate after the beginning. The rate is that of the run, else the file's own; of
-a folder, frame n is picture n. After its end a video or folder begins again. A frame is found by its number, so a unit
-that was started again goes on where it was.
-
-The block `encode`: writes pictures to a video.
-
-The pictures go into a segment below the run's folder, which a killed unit leaves whole up to its last frames. After the
-run the segments are joined to the video. Where somebody watches the run, the newest picture goes to the window too.
+The block `encode` writes pictures to a video. They go to a segment below the run's folder. If the unit is killed, its
+segment is complete except for the last frames. After the run the segments are joined to the video. If somebody watches
+the run, the newest picture goes to the window too.
 """
 
 from __future__ import annotations
@@ -38,14 +36,18 @@ EXPECTED = "a video or a folder of pictures"
 
 
 class Footage(NamedTuple):
-    """What a path holds. `pictures`: number of pictures; 0 where it is not known. `fps`: its own rate, or None."""
+    """The facts of a video or a folder of pictures.
+
+    `pictures`: number of pictures; 0 if it is not known.
+    `fps`: the file's own rate in frames a second; None if it has none.
+    """
 
     pictures: int
     fps: float | None
 
 
 def footage(path: Path) -> Footage:
-    """Return what a video file or a folder of pictures holds. Raises BadInputError."""
+    """Return the facts of a video file or a folder of pictures. Raises BadInputError."""
     if not path.exists():
         raise BadInputError(path, "no such file", EXPECTED, "put it there, or change `path`")
     if path.is_dir():
@@ -61,7 +63,7 @@ def footage(path: Path) -> Footage:
 
 
 def picture_files(folder: Path) -> list[Path]:
-    """Return the pictures of a folder, by name. Raises BadInputError where there is none."""
+    """Return the pictures of a folder, sorted by name. Raises BadInputError if there is none."""
     files = sorted(file for file in folder.iterdir() if file.suffix.lower() in PICTURES)
     if not files:
         expected = f"files that end in {', '.join(PICTURES)}"
@@ -70,7 +72,7 @@ def picture_files(folder: Path) -> list[Path]:
 
 
 class Video(PortedStage):
-    """Writes one picture a frame. Raises BadInputError for a file that cannot be read."""
+    """Writes one picture for each frame. Raises BadInputError for a file that cannot be read."""
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         super().__init__(settings)
@@ -110,10 +112,10 @@ def build_video(settings: Mapping[str, Any], unit: UnitContext) -> Video:  # noq
 
 
 class Encode(PortedStage):
-    """Encodes one picture a frame.
+    """Encodes one picture for each frame.
 
-    Keys: `fps`, `segments`: name of the folder of segments below the run's folder, `window`: path of the window for the
-    newest picture; empty for none. Sides are cut to even numbers, as the video's colours need it.
+    Its keys are `fps`, `segments`, the name of the folder of segments below the run's folder, and `window`, the path of
+    the window for the newest picture, or empty. Sides are cut to even numbers, because the video's colours need it.
     """
 
     def __init__(self, settings: Mapping[str, Any]) -> None:

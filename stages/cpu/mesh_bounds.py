@@ -1,28 +1,27 @@
-"""The screen rectangle of a skinned mesh, exact, at a fraction of the cost of skinning it.
+"""Computes the exact screen rectangle of a skinned mesh, at a fraction of the cost of skinning it.
 
-No part of the mesh that is on the screen lies outside the rectangle; parts behind the near plane or beside the screen
-do not widen it. Each patch of the mesh lies in a sphere, in any pose. The spheres tell which patches are off the
-screen, which the near plane cuts, and which can reach the rectangle's sides. Only the last two kinds are examined in
-finer patches, and only their vertices are skinned.
+The rectangle contains all parts of the mesh that are on the screen; parts behind the near plane or outside the screen
+do not widen it. In any pose, each patch of the mesh lies in a sphere. The spheres show which patches are off the
+screen, which ones the near plane cuts, and which ones can reach the rectangle's sides. Only the last two kinds are
+divided into finer patches, and only their vertices are skinned.
 
-**Patches** are neighbouring triangles with similar skin weights. A patch's radius is proved, not sampled. Let c be the
-rest position of the patch's centre, a vertex with weights u, and p another of its vertices with weights w; G_j is the
-rigid motion of joint j. Then
+**Patches** are neighbouring triangles with similar skinning weights. A patch's radius is a proven bound. Let c be the
+rest position of the patch's centre, a vertex with weights u, and p another vertex of the patch with weights w. G_j is
+the rigid motion of joint j. The distance vector in a pose is
 
     x_p - x_c = sum_j w_j (G_j p - G_j c) + sum_j (w_j - u_j) G_j c.
 
-The first sum is at most |p - c|. The second is a change of weights at c as in `skinning.weight_error_bound`. So it is
-at most sum_b |E_b| |G_b c - G_parent c|, where E_b is the sum of w_j - u_j over b and the joints below it. As b turns
-about its centre c_b by its own angle t_b, |G_b c - G_parent c| <= 2 sin(t_b / 2) |c - c_b|.
+The first sum is at most |p - c|. The second sum is a change of weights at c as in `skinning.weight_error_bound`.
+Therefore it is at most sum_b |E_b| |G_b c - G_parent c|, where E_b is the sum of w_j - u_j over b and the joints below
+it. Joint b turns about its centre c_b by its own angle t_b, so |G_b c - G_parent c| <= 2 sin(t_b / 2) |c - c_b|.
 
-**Skinned bodies** are projected in float32, in memory that is allocated once. Vertices whose place on the screen is
-within twice the rounding error of the furthest one are handed on, and float64 decides between them. Therefore the
-furthest of them in float64 is the furthest of all vertices.
+**Skinned bodies** are projected in float32, in memory that is allocated once. All vertices within twice the rounding
+error of the outermost one are projected again in float64, which finds the truly outermost vertex.
 
-The rounding error follows with u = 2**-24. A clip coordinate c = r . v + d is a sum of three products of rounded
-factors and d, so it is off by at most 6 u (sum |r_k| |v_k| + |d|). The bound e_c is 8 u of that, with the sphere's
-reach added, which covers what the reach and its rounding add. A quotient q = c / w, with w >= w_least, is off by at
-most (e_c + |q| e_w) / w_least + 4 u |q|, where |q| is at most 1 for anything on the screen.
+The rounding error follows from u = 2**-24. A clip coordinate c = r . v + d is a sum of three products of rounded
+factors and d, so its error is at most 6 u (sum |r_k| |v_k| + |d|). The bound e_c is 8 u times this sum plus the
+sphere's reach; the larger factor covers the rounding of the reach. A quotient q = c / w, with w >= w_least, has an
+error of at most (e_c + |q| e_w) / w_least + 4 u |q|, where |q| is at most 1 on the screen.
 """
 
 from __future__ import annotations
@@ -55,10 +54,13 @@ class Outermost:
         self._is_far = np.empty(count, np.bool_)
 
     def of(self, vertices: F32, camera: F64, radius: float) -> I64 | None:
-        """Return numbers (N,) of the `vertices` (V,3) that may be outermost, each with a sphere of `radius` metres.
+        """Return the indices (N,) of the vertices that may be outermost on the screen.
 
-        `camera`: matrix (4,4) to clip space. The result is None when a sphere may reach over the screen's edge or a
-        clip plane.
+        The result is None if a vertex's sphere may reach over the screen's edge or a clip plane.
+
+        `vertices`: (V,3), metres, world space.
+        `camera`: matrix (4,4) to clip space.
+        `radius`: radius of the sphere about each vertex, metres.
         """
         reach = radius * np.linalg.norm(camera[:, :3], axis=1)
         error = self._project(vertices, camera, reach)
@@ -80,16 +82,22 @@ class Outermost:
         return np.concatenate(found) if len(found) == len(sides) else None
 
     def _project(self, vertices: F32, camera: F64, reach: F64) -> F64:
-        """Write the clip coordinates, and return the error bound of each of the four."""
+        """Write the clip coordinates of `vertices`, and return the error bound of each coordinate (4,).
+
+        `reach`: reach of a vertex's sphere along each clip coordinate (4,).
+        """
         np.matmul(camera[:, :3].astype(np.float32), vertices.T, out=self._flat)
         self._flat += camera[:, 3:].astype(np.float32)
         furthest = max(float(vertices.max()), -float(vertices.min()))
         return np.asarray(8 * U * (np.abs(camera[:, :3]).sum(axis=1) * furthest + np.abs(camera[:, 3]) + reach))
 
     def _side(self, row: F32, reach: float, sign: int, slack: float) -> I64 | None:
-        """Return the vertices that may be lowest along `row` of clip coordinates (`sign` 1) or highest (-1).
+        """Return the indices of the vertices that may be outermost on one side; None if one may be off the screen.
 
-        None when one may be beyond the screen's edge.
+        `row`: clip coordinate x or y of each vertex (V,).
+        `reach`: reach of a vertex's sphere along this coordinate.
+        `sign`: 1 for the side with the lowest coordinates, -1 for the side with the highest.
+        `slack`: largest error of a quotient, twice.
         """
         scratch, least, most = self._scratch
         place = np.subtract(row, np.float32(reach), out=scratch) if sign > 0 else np.negative(row, out=scratch)
@@ -105,7 +113,7 @@ class Outermost:
 #: Largest distance between the middles of a patch's triangles, metres, for coarse and for fine patches.
 EXTENTS_M = (0.08, 0.02)
 LEAST_FACES = 4
-#: Joint angle, radians, for which patches are cut: triangles that move apart at this angle are in different patches.
+#: Joint angle, radians, for which patches are formed: triangles that move apart at this angle are in different patches.
 TYPICAL_TURN = 0.5
 VERSION = "patches 1"  # raise it when the same body gives other patches
 
@@ -114,10 +122,11 @@ VERSION = "patches 1"  # raise it when the same body gives other patches
 class Level:
     """P patches of one level of detail.
 
-    `centres`: vertex indices (P,).
-    `size`, `give`: (P,) and (P,54). The sphere about a patch's posed centre has the radius size + sum_b give_b 2
-    sin(t_b / 2), metres, where t_b is the angle of joint b = 1..54.
-    `blend`: (P,54) the furthest that the pose blend shapes of a joint move a vertex, metres per unit of |R - I|.
+    `centres`: index of each patch's centre, a vertex (P,).
+    `size`, `give`: (P,) and (P,54), metres. The sphere about a patch's posed centre has the radius size + sum_b give_b
+    2 sin(t_b / 2), where t_b is the angle of joint b = 1..54.
+    `blend`: largest distance by which the pose blend shapes of each joint move a vertex (P,54), metres per unit of
+    |R - I|.
     `parts`: for each patch, the indices of its patches in the next level; in the last level, of its vertices.
     `faces`: for each patch, the indices of its triangles.
     """
@@ -131,12 +140,15 @@ class Level:
 
 
 def join(groups: list[I64], chosen: I64) -> I64:
-    """Join the indices of the groups that `chosen` lists into one array."""
+    """Return the indices in the groups that `chosen` lists, as one array."""
     return np.concatenate([groups[patch] for patch in chosen]) if len(chosen) else np.zeros(0, np.int64)
 
 
 def build_levels(shaped: ShapedBody, weights: F64) -> list[Level]:
-    """Return coarse and fine patches of all triangles of the body, skinned with `weights` (V,55); cached."""
+    """Return the coarse and the fine patches of all triangles of the body. The result is cached.
+
+    `weights`: skinning weights (V,55).
+    """
     body = shaped.body
     sources: list[NDArray[Any]] = [shaped.vertices, shaped.joints, body.parents, body.faces, weights]
     sources += [body.posedirs] if body.posedirs is not None else []
@@ -200,7 +212,10 @@ def _level(
 
 
 def _blend_reach(posedirs: NDArray[np.float32] | None, count: int) -> F64:
-    """Return how far (V,54), metres, each joint's pose blend shapes can move each vertex at |R - I| = 1."""
+    """Return how far each joint's pose blend shapes can move each vertex at |R - I| = 1 (V,54), metres.
+
+    `count`: number of vertices V.
+    """
     if posedirs is None:
         return np.zeros((count, 54))
     blocks = posedirs.reshape(count, 3, 54, 9)
@@ -208,7 +223,7 @@ def _blend_reach(posedirs: NDArray[np.float32] | None, count: int) -> F64:
 
 
 def _bisect(features: F64, rows: I64, extent: float) -> list[I64]:
-    """Halve `rows` along the longest axis of their `features` until no axis of a group is longer than `extent`."""
+    """Return `rows` in groups: halved along the longest axis of `features` until no axis is longer than `extent`."""
     here = features[rows]
     low, high = here.min(axis=0), here.max(axis=0)
     axis = int((high - low).argmax())
@@ -230,7 +245,7 @@ ROUNDING_NDC = 1e-6
 
 @dataclass
 class _Extent:
-    """Least and greatest (x, y) of the points added so far, in normalised device coordinates."""
+    """The least and the largest (x, y) of the points added so far, in NDC."""
 
     low: F64 = field(default_factory=lambda: np.full(2, np.inf))
     high: F64 = field(default_factory=lambda: np.full(2, -np.inf))
@@ -242,13 +257,13 @@ class _Extent:
             np.maximum(self.high, high.max(axis=0), out=self.high)
 
     def widened_by(self, low: F64, high: F64) -> Mask:
-        """Return which (N,) of the bounds `low`, `high` (N,2) would move a side that is not at the screen's edge."""
+        """Return a mask (N,): which of the bounds `low`, `high` (N,2) would move a side inside the screen."""
         return np.asarray(
             (((low < self.low) & (self.low > -1.0)) | ((high > self.high) & (self.high < 1.0))).any(axis=1)
         )
 
     def rect(self) -> Rect | None:
-        """Return the rectangle, clipped to the screen; None when it is empty."""
+        """Return the rectangle, clipped to the screen; None if it is empty."""
         low, high = np.maximum(self.low - ROUNDING_NDC, -1.0), np.minimum(self.high + ROUNDING_NDC, 1.0)
         if not (low < high).all():
             return None
@@ -259,8 +274,11 @@ class _Extent:
 class _View:
     """The camera and the body's pose in one frame.
 
-    The camera is a matrix (4,4) to clip space, with the norms of its rows. `per_joint` (55,16): each joint's matrix
-    from rest to clip space. `turned` (54,): |R - I| of joints 1 to 54.
+    `camera`: matrix (4,4) to clip space.
+    `norms`: norm of the first three columns of each row of `camera` (4,).
+    `near_norm`, `far_norm`: norms for the distances from the near and from the far plane.
+    `per_joint`: matrix of each joint from rest to clip space (55,16).
+    `turned`: |R - I| of joints 1 to 54 (54,).
     """
 
     camera: F64
@@ -294,12 +312,12 @@ class MeshBounds:
     def __init__(
         self, shaped: ShapedBody, weight_count: int | None = None, standoff_m: float = 0.0, pose_blend: bool = True
     ) -> None:
-        """Cut the body into patches.
+        """Divide the body into patches.
 
         `shaped`: body.
-        `weight_count`: number of skin weights with which a vertex is drawn; None for all.
-        `standoff_m`: distance that clothes and hair reach from the mesh, metres.
-        `pose_blend`: whether its pose blend shapes, if any, are drawn.
+        `weight_count`: number of skinning weights with which a vertex is drawn; None for all.
+        `standoff_m`: how far clothes and hair reach from the mesh, metres.
+        `pose_blend`: whether the body's pose blend shapes, if any, are drawn.
         """
         body = shaped.body
         weights = body.weights if weight_count is None else largest_weights(body.weights, weight_count).dense()
@@ -313,10 +331,12 @@ class MeshBounds:
         self.reach_m = _reach(shaped, self._weights, self._levels) + standoff_m + ROUNDING_M
 
     def is_off_screen(self, root: F64, clip: ArrayLike) -> bool:
-        """Return whether the mesh is certainly off the screen in any pose.
+        """Return whether the mesh is certainly off the screen, whatever its pose.
 
-        `root`: place of its root joint, (3,), world metres. The body lies in a sphere about this joint, which is
-        compared with the six planes of the clip volume.
+        The body lies in a sphere about its root joint, which is compared with the six planes of the clip volume.
+
+        `root`: place of the root joint (3,), metres, world space.
+        `clip`: projection @ view (4,4).
         """
         camera = np.asarray(clip, np.float64)
         planes = np.concatenate([camera[3] + camera[:3], camera[3] - camera[:3]])
@@ -324,19 +344,19 @@ class MeshBounds:
         return bool((away < -self.reach_m * np.linalg.norm(planes[:, :3], axis=1)).any())
 
     def may_be_seen(self, posed: Posed, clip: ArrayLike) -> bool:
-        """Return whether the mesh may be on the screen, by its largest patches: false only when it certainly is not."""
+        """Return whether the mesh may be on the screen, by its coarse patches; False: it is certainly not."""
         view = _View.of(posed, clip)
         level = self._levels[0]
         touching, cut = self._sort_out(level, np.arange(len(level.centres)), view, _Extent())
         return bool(len(touching) or len(cut))
 
     def rect(self, posed: Posed, clip: ArrayLike, vertices: NDArray[np.float32] | None = None) -> Rect | None:
-        """Return the mesh's rectangle on the screen, clipped to it; None when nothing is visible.
+        """Return the mesh's rectangle, clipped to the screen; None if nothing is visible.
 
         `posed`: a frame of `Skeleton.pose`.
         `clip`: projection @ view (4,4), of any lens.
-        `vertices`: skinned vertices (V,3) of the frame, if the caller has them: a body wholly on the screen then needs
-        no patches.
+        `vertices`: skinned vertices (V,3) of the frame, if the caller has them. With them, a body that is wholly on the
+        screen needs no patches.
         """
         view = _View.of(posed, clip)
         if vertices is not None and (whole := self._rect_of_whole(vertices, view)) is not None:
@@ -351,7 +371,7 @@ class MeshBounds:
         return seen.rect()
 
     def _rect_of_whole(self, vertices: NDArray[np.float32], view: _View) -> Rect | None:
-        """Return the rectangle of a body that is wholly on the screen; None when a part of it may be off the screen."""
+        """Return the rectangle of a body that is wholly on the screen; None if a part of it may be off the screen."""
         radius = self._standoff + ROUNDING_M
         if self._outermost is None or self._outermost.count != len(vertices):
             self._outermost = Outermost(len(vertices))
@@ -364,7 +384,10 @@ class MeshBounds:
         return seen.rect() if (seen.low > -1.0).all() and (seen.high < 1.0).all() else None
 
     def _sort_out(self, level: Level, rows: I64, view: _View, seen: _Extent) -> tuple[I64, I64]:
-        """Return the patches of `rows` that may widen `seen`, and those that the near plane may cut, as indices."""
+        """Return the indices of (patches of `rows` that may widen `seen`, patches that the near plane may cut).
+
+        The patches that are certainly visible widen `seen` by a point each.
+        """
         radius = level.size[rows] + (self._standoff + ROUNDING_M)
         radius += np.einsum("pj,j->p", level.give[rows], view.turned / np.sqrt(2.0))
         if self._blend is not None:
@@ -373,14 +396,18 @@ class MeshBounds:
         front, cut = _against_near(centres, radius, view)
         low, high = _quotients(centres, radius, view)
         front &= ((high >= -1.0) & (low <= 1.0)).all(axis=1)
-        # A point of each patch that is certainly covered widens the rectangle now, so that fewer patches need refining.
-        # It is the centre, or where blend shapes may have moved the centre, the inner side of its sphere.
+        # A point that each patch certainly covers widens the rectangle now, so that fewer patches need refining. The
+        # point is the centre. If blend shapes may have moved the centre, it is the inner side of the sphere.
         point = _quotients(centres[front], np.full(int(front.sum()), self._standoff), view)
         seen.add(*(point if self._blend is None else (high[front], low[front])))
         return rows[front][seen.widened_by(low[front], high[front])], rows[cut]
 
     def _project(self, vertices: NDArray[np.integer[Any]], view: _View, blend: bool = True) -> F64:
-        """Return clip coordinates (N,4) of `vertices` (N,). `blend`: whether to apply the pose blend shapes."""
+        """Return the clip coordinates (N,4) of vertices.
+
+        `vertices`: indices (N,).
+        `blend`: whether to add the pose blend shapes.
+        """
         rest = self._rest[vertices]
         if blend and self._blend is not None:
             rest[:, :3] += np.einsum("naf,f->na", self._blend[vertices], view.posed.feature)
@@ -399,10 +426,10 @@ class MeshBounds:
 
 
 def _reach(shaped: ShapedBody, weights: F64, levels: list[Level]) -> float:
-    """Return the furthest, in metres, that any pose brings a vertex from the root joint.
+    """Return the largest distance in metres that a vertex can have from the root joint in any pose.
 
-    A joint is no further from the root than the sum of the bones between them. A point that it moves is no further from
-    it than at rest, and a skinned vertex is a mean of such points. |R - I| of a joint is at most 2 sqrt(2).
+    A joint is no further from the root than the sum of the bones between them. A point that a joint moves keeps its
+    distance from the joint, and a skinned vertex is a mean of such points. |R - I| of a joint is at most 2 sqrt(2).
     """
     parents, joints = shaped.body.parents, shaped.joints
     bones = np.linalg.norm(joints - np.where(parents[:, None] < 0, joints, joints[parents]), axis=1)
@@ -414,9 +441,9 @@ def _reach(shaped: ShapedBody, weights: F64, levels: list[Level]) -> float:
 
 
 def _against_near(centres: F64, radius: F64, view: _View) -> tuple[Mask, Mask]:
-    """Return which spheres (N,) lie wholly in front of the near plane (and W = 0), and which (N,) cross it.
+    """Return two masks (N,): spheres wholly in front of the near plane (and of W = 0), and spheres that cross it.
 
-    A sphere that is neither is not visible.
+    A sphere in neither mask is not visible.
     """
     near, far = centres[:, 3] + centres[:, 2], centres[:, 3] - centres[:, 2]
     within = far + radius * view.far_norm >= 0.0
@@ -425,10 +452,13 @@ def _against_near(centres: F64, radius: F64, view: _View) -> tuple[Mask, Mask]:
 
 
 def _quotients(points: F64, radius: F64, view: _View) -> tuple[F64, F64]:
-    """Return the least and greatest (X/W, Y/W), (N,2) each, over spheres about clip coordinates `points` (N,4).
+    """Return the least and the largest (X/W, Y/W), (N,2) each, over spheres about points in clip coordinates.
 
-    `radius`: (N,). X, Y and W are linear in the point, so over a sphere each varies by the radius times the norm of its
-    matrix row.
+    X, Y and W are linear in the point. Therefore each varies over a sphere by the radius times the norm of its matrix
+    row.
+
+    `points`: clip coordinates of the centres (N,4).
+    `radius`: radius of each sphere (N,), metres.
     """
     reach = radius[:, None] * view.norms[:2]
     least = np.maximum(points[:, 3] - radius * view.norms[3], W_LEAST)[:, None]
@@ -438,9 +468,10 @@ def _quotients(points: F64, radius: F64, view: _View) -> tuple[F64, F64]:
 
 
 def _clip_near(triangles: F64, slack: float) -> F64:
-    """Return clip coordinates (N,4) of the corners in front of the near plane, and of the points where edges cross it.
+    """Return the clip coordinates (N,4) of corners in front of the near plane, and of points where edges cross it.
 
-    `triangles` (F,3,4). `slack`: distance that the plane is moved back, in clip coordinates.
+    `triangles`: clip coordinates of the corners (F,3,4).
+    `slack`: distance by which the plane is moved back, in clip coordinates.
     """
     near = triangles[:, :, 2] + triangles[:, :, 3] + slack
     points = [triangles[near > 0.0]]

@@ -1,8 +1,9 @@
-"""The pose stage: from a frame's number to everything that the other stages have to know about the frame.
+"""The pose stage: it computes from a frame's number all data that the other stages need about the frame.
 
-Motion and camera are sampled at the frame's media time, frame / fps; no number that is not finite leaves this stage. A
-frame that shows what an earlier one showed, or nobody, skins nothing and skips the stages that would draw it. Each body
-gets a level of its mesh, then the cheapest level of detail with which both errors are within the budget of pixels.
+Motion and camera are sampled at the frame's media time, frame / fps; all numbers that leave this stage are finite. If a
+frame shows the same as an earlier frame, or nobody, nothing is skinned, and the frame skips the stages that would draw
+it. Each body gets a level of its mesh, then the cheapest level of detail for which the sum of both errors is within the
+budget of pixels.
 """
 
 from __future__ import annotations
@@ -43,9 +44,12 @@ FINEST = len(DETAILS) - 1
 class SeenAvatar:
     """An avatar on the screen.
 
-    `level`: an index into `DETAILS`. `error_px`: bound of the error of both levels on the picture, pixels. `mesh`:
-    level of the mesh, 0 for the whole mesh. `triangles`: number of triangles of that level. `share`: its vertices, as a
-    share of the whole mesh's.
+    `rect`: rectangle of the mesh on the screen, NDC.
+    `level`: level of detail, an index into `DETAILS`.
+    `error_px`: bound on the error of both levels on the picture, pixels.
+    `mesh`: level of the mesh, 0 for the whole mesh.
+    `triangles`: number of triangles of this level of the mesh.
+    `share`: number of vertices of this level over that of the whole mesh.
     """
 
     rect: Rect
@@ -60,7 +64,9 @@ class SeenAvatar:
 class DetailChoice:
     """The choice for an avatar in a frame.
 
-    `mesh`: level of the mesh. `level`: an index into `DETAILS`. `error_px`: bound of the error of both, pixels.
+    `mesh`: level of the mesh.
+    `level`: level of detail, an index into `DETAILS`.
+    `error_px`: bound on the error of both on the picture, pixels.
     """
 
     mesh: HeldMesh
@@ -71,8 +77,11 @@ class DetailChoice:
 class DrawnMesh:
     """One level of a body's mesh, with the data for posing it.
 
-    `shaped`: the body with the vertices of the level. `skins`: whether the CPU unit skins it. `details`: whether levels
-    of detail may leave something out.
+    `shaped`: body with the vertices of this level.
+    `skins`: whether the CPU unit skins it.
+    `details`: whether levels of detail are used.
+    `skinners`: skinner for each level of detail; empty if the GPU unit skins.
+    `moved_to_skin`: bytes that each skinner reads from memory for a frame.
     """
 
     def __init__(self, shaped: ShapedBody, skins: bool, details: bool) -> None:
@@ -81,13 +90,17 @@ class DrawnMesh:
         self.moved_to_skin = [moved_of_kept(skinner.constant_bytes) for skinner in self.skinners]
 
     def _skinners(self, details: bool) -> list[FrameSkinner]:
-        """Return a skinner for each level of detail; the finest for all when nothing may be left out."""
+        """Return a skinner for each level of detail; without `details`, the finest skinner for all levels."""
         if not details:
             return [FrameSkinner(self.shaped)] * len(DETAILS)
         return [FrameSkinner(self.shaped, detail) for detail in DETAILS]
 
     def pose(self, posed: Posed, level: int, vertices: F32, moved: ByteCounter) -> F32:
-        """Skin the body with detail `level` into the beginning of `vertices`, and return that part of it."""
+        """Skin the body into the beginning of `vertices`, and return this part of the array.
+
+        `level`: level of detail, an index into `DETAILS`.
+        `moved`: counter of the moved bytes.
+        """
         own = vertices[: len(self.shaped.vertices)]
         self.skinners[level].skin_into(posed, own)
         moved.copied(own.nbytes)
@@ -99,8 +112,10 @@ class DrawnMesh:
 class ModelledBody:
     """A body that several avatars of a scene may share, with the data of each of its levels.
 
-    `bodies`: the whole body, then those of its mesh `levels`. `skins`: whether the CPU unit skins it. `budget_px`:
-    largest error on the picture, pixels; with 0 everything is modelled.
+    `bodies`: the whole body, then the body of each level of its mesh.
+    `levels`: levels of its mesh, the finest first.
+    `skins`: whether the CPU unit skins it.
+    `budget_px`: largest error on the picture in pixels; 0: everything is modelled.
     """
 
     def __init__(
@@ -111,7 +126,7 @@ class ModelledBody:
         self.details = skins and budget_px > 0.0
         self.levels = levels if budget_px > 0.0 else ()
         self.meshes = [DrawnMesh(body, skins, self.details) for body in bodies]
-        # A level lies within its error of the whole mesh, and rectangles are widened by it.
+        # The bounds of the whole mesh serve for all levels, because rectangles are widened by a level's error.
         self.bounds = MeshBounds(self.shaped, standoff_m=CLOTHES_STANDOFF_M)
 
     @cached_property
@@ -122,9 +137,11 @@ class ModelledBody:
         return Skeleton(self.shaped.joints, self.shaped.body.parents)
 
     def choose(self, posed: Posed, clip: F64, output: Shape, before: HeldMesh | None = None) -> DetailChoice:
-        """Return the levels of a frame, and the bound on their error in pixels of a picture of `output`.
+        """Return the levels of mesh and detail for a frame, with the bound on their error.
 
-        `before`: level of the mesh in the frame before.
+        `clip`: projection @ view (4,4).
+        `output`: (height, width) of the picture.
+        `before`: level of the mesh in the frame before; None without one.
         """
         if not self.details and not self.levels:
             return DetailChoice(HeldMesh(0), FINEST, 0.0)
@@ -138,7 +155,10 @@ class ModelledBody:
         return DetailChoice(mesh, level if self.details else FINEST, errors[level])
 
     def _moved_m(self, level: MeshLevel, posed: Posed, stretch: Stretch, w: float) -> float:
-        """Return the bound of `level` in metres, or its least in any pose where that is beyond the budget already."""
+        """Return a bound on the error of `level`, metres, in the pose `posed`.
+
+        If the level's least error in any pose is already above the budget, that least error is returned.
+        """
         if error_px(level.least_m, stretch, w) > self.budget_px:
             return level.least_m
         return level.metres(posed)
@@ -146,11 +166,14 @@ class ModelledBody:
     def see(
         self, posed: Posed, clip: F64, output: Shape, vertices: F32 | None, moved: ByteCounter, choice: DetailChoice
     ) -> SeenAvatar | None:
-        """Skin the body into `vertices`, if given, and find its rectangle; None when nothing of it is visible.
+        """Skin the body, and return its place on the screen; None if nothing of it is visible.
 
-        `posed`: pose of the frame. `clip`: projection @ view, (4,4). `output`: (height, width) of the picture. `moved`:
-        counter of moved bytes: vertices that are written, then read to find the rectangle, and what skinning reads.
-        `choice`: what `choose` returned for the frame.
+        `posed`: pose of the frame.
+        `clip`: projection @ view (4,4).
+        `output`: (height, width) of the picture.
+        `vertices`: array for the skinned vertices (V,3); None: the body is not skinned here.
+        `moved`: counter of the bytes that skinning reads and writes, and that the search for the rectangle reads.
+        `choice`: result of `choose` for the frame.
         """
         mesh = self.meshes[choice.mesh.level]
         own = None if vertices is None else mesh.pose(posed, choice.level, vertices, moved)
@@ -179,11 +202,14 @@ class _Actor:
     body: ModelledBody
 
     def is_off_screen(self, translation: F64, clip: F64) -> bool:
-        """Return whether no pose at `translation` (3,), before the mover's `world`, brings the body onto the screen."""
+        """Return whether the body is off the screen in every pose.
+
+        `translation`: place of the body (3,), before `mover.world` is applied.
+        """
         return self.body.bounds.is_off_screen(self.pivot(translation), clip)
 
     def pivot(self, translation: F64) -> F64:
-        """Return the place of the body's root (3,) in the scene when it is at `translation` (3,)."""
+        """Return the place of the body's root joint in the scene (3,). `translation`: as in `is_off_screen`."""
         return np.asarray(
             self.mover.world[:3, :3] @ (self.body.shaped.joints[0] + translation) + self.mover.world[:3, 3]
         )
@@ -193,7 +219,10 @@ class _Actor:
 class FramePlan:
     """The decisions for a frame.
 
-    They are the frame's work, the tensor's shape (None with nobody in view), and each visible avatar by its number.
+    `work`: the frame's work.
+    `shape`: shape of the tensor; None with nobody in view.
+    `density`: density of a planned tensor, else None.
+    `seen`: visible avatars by their numbers.
     """
 
     work: FrameWork
@@ -209,14 +238,19 @@ class FramePlan:
 
 @dataclass(frozen=True)
 class _Made:
-    """A frame's content, its header, and the decisions for it."""
+    """A frame that was computed.
+
+    `shown`: bytes that are equal for frames that show the same.
+    `header`: copy of its header.
+    `plan`: decisions for the frame.
+    """
 
     shown: bytes
     header: NDArray[np.void]
     plan: FramePlan
 
 
-#: Fields of the header that differ even between frames that show the same.
+#: Fields of the header that may differ between frames that show the same.
 OF_THE_FRAME = {*(name for name, _ in FRAME_FIELDS), "media_time_s", "work"}
 
 
@@ -227,7 +261,7 @@ class PoseStage:
     """
 
     def __init__(self, config: RunConfig, assets: Assets) -> None:
-        """Prepare the scene of `config`, whose avatars, motions and camera lie in `assets`."""
+        """Prepare the scene of `config`. `assets`: its avatars, motions and camera."""
         scene = config.scene
         self._fps = scene.fps
         self._output = (scene.output.height, scene.output.width)
@@ -264,23 +298,22 @@ class PoseStage:
         self._vertices: list[list[NDArray[np.float32]]] = []
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
-        """Take the output slots. Raises ValueError when the stage has inputs."""
+        """Take the output slots. Raises ValueError if there are inputs."""
         if inputs:
             raise ValueError("the pose stage has no input edge")
         self._slots = [packet.header for packet in outputs]
         self._vertices = [posed_vertices(packet.payload, self._counts) for packet in outputs]
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
-        """Fill `outputs[slot_out]` for `frame`; the result is a `Skip` except for full work.
+        """Fill `outputs[slot_out]` for `frame`, and return metrics: a `Skip` if the frame needs less than full work.
 
-        All frames of a fixed plan are full work.
+        With a fixed plan, all frames need full work.
 
-        Metrics: `visible`, number of visible avatars; for a full frame `level` of `body.skinning.DETAILS` and
-        `error_px`, the bound on the error on the picture, both of the worst avatar; `triangles` of all avatars;
-        `density` of a planned tensor; the bytes moved.
-        The least bytes count the samples of motions and camera, the header, and the vertices of skinned avatars.
+        The metrics are `visible`, the number of visible avatars, and the bytes moved. A full frame also has the largest
+        `level` and `error_px` of all avatars, the sum of their `triangles`, and the `density` of a planned tensor. The
+        least bytes are the samples of motions and camera, the header, and the vertices of skinned avatars.
 
-        Raises ValueError without `slot_out`, TrilaneError when a number of the frame is not finite.
+        Raises ValueError without `slot_out`, TrilaneError if a number of the frame is not finite.
         """
         if slot_out is None:
             raise ValueError("the pose stage needs an output slot")
@@ -309,14 +342,14 @@ class PoseStage:
         return _metrics(self.plan, self._moved)
 
     def _count(self, packet: NDArray[np.void], view: F64, moved: Sequence[tuple[F64, F64]]) -> None:
-        """Count the bytes of every frame: what was sampled, and the header."""
+        """Count the bytes of every frame: the samples and the header."""
         sampled = view.nbytes + sum(array.nbytes for pair in moved for array in pair)
         self._moved.read += sampled
         self._moved.written += packet.nbytes
         self._moved.least += sampled + packet.nbytes
 
     def _view(self, t_s: float, moved: Sequence[tuple[F64, F64]]) -> F64:
-        """Return the matrix (4, 4) from world to camera: the scene's camera, steered about the first avatar."""
+        """Return the matrix (4,4) from world to camera: the scene's camera, steered about the first avatar."""
         view = self._camera.sample(t_s)
         if self._window is None:
             return view
@@ -329,7 +362,7 @@ class PoseStage:
         return FrameWork.FULL
 
     def forget(self) -> None:
-        """Make the next frame in which anybody is seen a full one."""
+        """Let the next frame with a visible avatar be a full frame."""
         self._made.pop(FrameWork.FULL, None)
 
     def step_to(self, rung: int) -> None:
@@ -342,7 +375,8 @@ class PoseStage:
     def _make(self, slot_out: int, frame: int, view: F64, projection: F64, moved: Sequence[tuple[F64, F64]]) -> bool:
         """Fill the header of slot `slot_out` with camera and avatars, and return whether an avatar is visible.
 
-        `view`, `projection` (4,4), and `moved`, each avatar's pose and place, are those of `frame`.
+        `view`, `projection`: matrices (4,4) of `frame`.
+        `moved`: (pose, place) of each avatar in `frame`.
         """
         packet = self._slots[slot_out]
         packet["avatar_count"] = len(self._actors)
@@ -359,7 +393,10 @@ class PoseStage:
         return bool(seen)
 
     def _lay_out(self, packet: NDArray[np.void], seen: list[tuple[NDArray[np.void], SeenAvatar]]) -> FramePlan:
-        """Set crop rectangles, cells and the tensor's shape; the smallest shape when nothing is to be drawn."""
+        """Set crop rectangles, `tensor_rect`s and the tensor's shape; with nobody in view, the smallest shape.
+
+        `seen`: pairs of an avatar's part of the header and its place on the screen.
+        """
         if not seen:
             packet["tensor_shape"] = min(self._buckets, key=lambda shape: shape[0] * shape[1])
             return FramePlan(FrameWork.NONE, None, None, {})
@@ -378,7 +415,7 @@ class PoseStage:
         return FramePlan(FrameWork.FULL, layout.shape, density, {int(avatar["avatar"]): one for avatar, one in seen})
 
     def _foreseen(self, t_s: float) -> Shape | None:
-        """Return the tensor's shape at `t_s`; None where it was not foreseen."""
+        """Return the foreseen shape of the tensor at `t_s`; None if it was not foreseen."""
         if not self._changes:
             return None
         changes = self._changes[self._rung]
@@ -394,10 +431,13 @@ class PoseStage:
         frame: int,
         clip: NDArray[np.float64],
     ) -> SeenAvatar | None:
-        """Fill one avatar's joints, and `vertices` if given, and find it on the screen; None when it is not visible.
+        """Fill one avatar's part of the header, and return its place on the screen; None if it is not visible.
 
-        An avatar that is far off the screen is not posed. One that the last made frame did not show is looked for by
-        its patches before it is skinned.
+        An avatar that is far off the screen is not posed. An avatar that the last computed frame did not show is first
+        searched by its patches, before it is skinned.
+
+        `avatar`: the avatar's part of the header.
+        `vertices`: array for its skinned vertices; None if the GPU unit skins.
         """
         pose, translation = moved[actor.index]
         avatar["avatar"], avatar["visible"] = actor.index, False
@@ -417,7 +457,7 @@ class PoseStage:
         return seen
 
     def close(self) -> None:
-        """Let go of the slots."""
+        """Drop the views of the slots."""
         self._slots, self._vertices = [], []
 
 
@@ -438,7 +478,7 @@ def _metrics(plan: FramePlan, moved: ByteCounter) -> Mapping[str, float]:
 
 
 def _copy_same(source: NDArray[np.void], target: NDArray[np.void]) -> None:
-    """Copy a header without the fields that belong to its frame alone."""
+    """Copy a header without the fields OF_THE_FRAME."""
     for name in source.dtype.names or ():
         if name not in OF_THE_FRAME:
             target[name] = source[name]

@@ -1,9 +1,9 @@
-"""The present stage: turns frames into a segment of video, and writes a line with a digest of every frame beside it.
+"""The present stage: it encodes frames as a segment of video, and writes a digest of every frame to a text file.
 
-The stage presents the bytes of the slot and digests them before anything else is done to them. Each process writes one
-segment, named so that none replaces another; the parent joins them (`apps/run/run_files.py`). A segment is fragmented
-MP4: when its writer is killed it is readable, short of the last frame at most. Frames that are to be compared after the
-run are kept as arrays beside it.
+The stage computes the digest of the bytes in the slot before it uses them otherwise. Each process writes one segment
+with a name of its own; the parent joins the segments (`apps/run/run_files.py`). A segment is fragmented MP4: if its
+writer is killed, it is readable, and lacks at most the last frame. Frames that are compared after the run are kept as
+arrays in a folder beside it.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SEGMENTS = "segments"
 KEYFRAME_EVERY = 30
 #: One thread, no look-ahead and no reordering: every frame leaves the encoder before the next one comes.
 ENCODER_OPTIONS = {"preset": "ultrafast", "crf": "20", "tune": "zerolatency"}
-#: Every frame is a fragment of its own and goes to the file at once, so a killed writer loses the last one at most.
+#: Every frame is a fragment of its own and is written at once, so that a killed writer loses at most the last frame.
 FRAGMENTS = {"movflags": "empty_moov+default_base_moof+frag_every_frame", "flush_packets": "1"}
 MS = 1e-6  # milliseconds in a nanosecond
 NOTHING = ByteCounter().figures()
@@ -43,7 +43,7 @@ NOTHING = ByteCounter().figures()
 
 @contextmanager
 def full_disk_told(path: Path) -> Iterator[None]:
-    """Raise UnwrittenError about `path` where the disk takes no more; other errors pass."""
+    """Turn the errors of a full disk inside the `with` block into an UnwrittenError about `path`."""
     try:
         yield
     except (OSError, av.error.FFmpegError) as error:
@@ -55,8 +55,9 @@ def full_disk_told(path: Path) -> Iterator[None]:
 class Segment:
     """One file of H.264 video, written frame by frame, and a text file of digests beside it.
 
-    A digest line is the frame's number and the SHA-256 of its bytes (row 0 first, RGB). `moved`: bytes that the latest
-    frame moved. The least bytes are a new frame's and the encoder's output.
+    A digest line has the frame's number and the SHA-256 of its bytes (row 0 first, RGB).
+
+    `moved`: counter of the latest frame's bytes. The least bytes are the bytes of a new frame and the encoder's output.
     """
 
     def __init__(self, path: Path, fps: float, height: int, width: int) -> None:
@@ -79,8 +80,9 @@ class Segment:
     def digest(self, frame: int, pixels: NDArray[np.uint8], repeats: bool = False) -> None:
         """Write the digest of `pixels`, (height, width, 3) and C-contiguous.
 
-        `repeats`: whether the pixels equal those of the last call. Raises UnwrittenError, also when the file was
-        removed.
+        `repeats`: whether the pixels equal those of the last call.
+
+        Raises UnwrittenError, also if the file was removed.
         """
         if not repeats:
             self._digest = hashlib.sha256(pixels.data).hexdigest()
@@ -90,10 +92,10 @@ class Segment:
         require_name(self._path, self._digests.fileno())
 
     def add(self, frame: int, pixels: NDArray[np.uint8], repeats: bool = False) -> None:
-        """Show `pixels`, (height, width, 3) RGB, from the instant of frame number `frame` on.
+        """Add frame number `frame` to the video. Raises UnwrittenError.
 
-        `repeats`: whether the pixels equal those of the last call, which are already converted for the encoder. Raises
-        UnwrittenError.
+        `pixels`: (height, width, 3) RGB.
+        `repeats`: whether the pixels equal those of the last call, which are already converted for the encoder.
         """
         if not repeats:
             rgb = av.VideoFrame.from_numpy_buffer(pixels, format="rgb24")
@@ -121,9 +123,9 @@ class Segment:
 
 
 class PresentStage:
-    """Stage `present` of the CPU unit: one input edge of frames, no output.
+    """Stage `present` of the CPU unit, with an input edge of frames and no output.
 
-    A recorded job reports `digest_ms`, `encode_ms` and the bytes moved. Any other job reports no bytes moved.
+    If the run is recorded, a job reports `digest_ms`, `encode_ms` and the bytes moved; otherwise it reports zero bytes.
     """
 
     def __init__(self, config: RunConfig) -> None:
@@ -138,7 +140,7 @@ class PresentStage:
         self._kept = KeptFrames(config.out_dir, config.kept)
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
-        """Make views of the slots as frames, and the encoder. Raises ValueError for outputs, or UnwrittenError."""
+        """Make the views of the slots, and the encoder. Raises ValueError for outputs, or UnwrittenError."""
         if outputs:
             raise ValueError("the present stage has no output edge")
         size = self._height * self._width * 3
@@ -149,11 +151,11 @@ class PresentStage:
             path = self._folder / f"{time.monotonic_ns():020d}-{os.getpid()}.mp4"
             try:
                 self._segment = Segment(path, self._fps, self._height, self._width)
-            except FileNotFoundError as error:  # between the folder and the second file
+            except FileNotFoundError as error:  # somebody removed the folder just now
                 raise UnwrittenError(path, FileNotFoundError(errno.ENOENT, REMOVED)) from error
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
-        """Present `inputs[slot_in]` as frame `frame`. Raises ValueError when `slot_in` is None."""
+        """Present `inputs[slot_in]` as frame `frame`. Raises ValueError if `slot_in` is None."""
         if slot_in is None:
             raise ValueError("the present stage needs an input slot")
         if self._window is not None and self._window.is_looked_at:
@@ -190,14 +192,14 @@ KEPT_FOLDER = "kept"
 
 
 class KeptFrames:
-    """Keeps frames `numbers`, which ascend, in `folder`/`KEPT_FOLDER`."""
+    """Keeps the frames `numbers`, ascending, as arrays in `folder`/`KEPT_FOLDER`."""
 
     def __init__(self, folder: Path, numbers: Sequence[int]) -> None:
         self._folder, self._numbers = folder / KEPT_FOLDER, list(numbers)
         self._next = self._numbers.pop(0) if self._numbers else None
 
     def see(self, frame: int, pixels: U8) -> None:
-        """Keep frame `frame`, (h,w,3), if it is among the numbers."""
+        """Keep `pixels` (h,w,3) of frame `frame` if it is the next of the numbers."""
         if self._next is None or frame < self._next:
             return
         self._folder.mkdir(exist_ok=True)
@@ -207,7 +209,7 @@ class KeptFrames:
 
 
 def kept_frames(folder: Path) -> dict[int, Path]:
-    """Return the files of the frames that were kept in `folder`, by number."""
+    """Return the file of each frame that was kept in `folder`, by the frame's number."""
     return {
         int(file.stem): file for file in sorted((folder / KEPT_FOLDER).glob("*.npy"), key=lambda file: int(file.stem))
     }

@@ -1,8 +1,8 @@
-"""Measures the calls of a network alone on this machine, on distinct inputs, in a process like a unit of a run.
+"""Measures isolated calls of a network on this machine, on distinct inputs, in a process like a unit of a run.
 
-Rule: a measurement is kept with everything that it depends on, so a machine, package or network that changed is
-measured again. A network of integers runs as an avatar's does. Any other one runs with its own number types: in ONNX
-Runtime, or in the runtime of the stage that it is in a pipeline file.
+Rule: a measurement is cached under everything that it depends on, so that a changed machine, package or network is
+measured again. An integer network runs like an avatar's network. Any other network runs with its own number types: in
+ONNX Runtime, or for a stage of a pipeline file in the runtime of the stage.
 """
 
 from __future__ import annotations
@@ -49,7 +49,9 @@ Shapes = Mapping[str, Sequence[int]]
 class Calls(NamedTuple):
     """The measured calls of a network.
 
-    `took_ns`: nanoseconds of each call, by number of threads. `runtime`: name of the runtime. `at`: date and time, UTC.
+    `took_ns`: time of each call in ns, by number of threads.
+    `runtime`: name of the runtime.
+    `at`: date and time of the measurement, UTC.
     """
 
     took_ns: Mapping[int, Sequence[int]]
@@ -66,12 +68,16 @@ def calls_of(
     say: Callable[[], None],
     as_stage: bool = False,
 ) -> Calls:
-    """Measure how long calls of the network in `path` take, without the time in which they had no core.
+    """Return measured times of calls of the network in `path`, without the time in which they had no core.
 
-    `shapes`: shapes of inputs by name, in place of the file's. `runtime`: runtime of a network of integers; other ones
-    run in ONNX Runtime. `counts`: numbers of threads. `cores`: cores to run on, the last ones first. `say`: is called
-    before this takes seconds. `as_stage`: whether any network runs in `runtime`, as a stage of a pipeline file does.
-    Raises BadInputError for a file that cannot be read, TrilaneError when the network cannot be run.
+    `shapes`: shapes of inputs by name, in place of the file's shapes.
+    `runtime`: runtime of an integer network; other networks run in ONNX Runtime.
+    `counts`: numbers of threads to measure.
+    `cores`: numbers of cores; a call with n threads runs on the last n.
+    `say`: function that is called before a measurement, which takes seconds.
+    `as_stage`: whether any network runs in `runtime`, like a stage of a pipeline file.
+
+    Raises BadInputError for a file that cannot be read, TrilaneError if the network cannot run.
     """
     is_avatar = not as_stage and not shapes and _integers(path) is not None
     runs = runtime if as_stage or is_avatar else ORT
@@ -106,7 +112,7 @@ def _measured(
 
 
 def _integers(path: Path) -> NetworkFile | None:
-    """Return the network in `path` if it is an integer network that an avatar may have; else None."""
+    """Return the network in `path` if it is an integer network that an avatar may have; otherwise None."""
     try:
         return read_network(path)
     except BadInputError:
@@ -114,7 +120,7 @@ def _integers(path: Path) -> NetworkFile | None:
 
 
 def _digest(path: Path) -> str:
-    """Return a digest of the file and its size; weights beside it do not change how long a call takes."""
+    """Return a digest of the file; weights in other files are left out, because they do not change times."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
@@ -125,14 +131,14 @@ class CallStage:
         self._calls = calls
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
-        """Do nothing: there are no slots, and the inputs are made with the calls."""
+        """Do nothing, because there are no slots, and the calls have their own inputs."""
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
         self._calls[frame % len(self._calls)]()
         return {}
 
     def close(self) -> None:
-        """Do nothing: nothing is left."""
+        """Do nothing, because the calls need no closing."""
 
 
 def build(settings: Mapping[str, Any], unit: UnitContext) -> CallStage:
@@ -148,9 +154,9 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> CallStage:
 
 
 def _calls(path: Path, shapes: Shapes, runtime: str, options: RuntimeOptions) -> list[Callable[[], object]]:
-    """Return calls of any network, whose outputs nobody gets.
+    """Return functions that call any network on random inputs and throw its outputs away.
 
-    Raises BadInputError for a graph that the runtime cannot load or whose inputs are no numbers.
+    Raises BadInputError for a graph that the runtime cannot load, or whose inputs are no numbers.
     """
     from trilane.stages.blocks.network import engine_of
 
@@ -169,7 +175,7 @@ def _calls(path: Path, shapes: Shapes, runtime: str, options: RuntimeOptions) ->
 
 
 def _random(seed: int, shape: Sequence[int], numbers: type[np.generic]) -> NDArray[Any]:
-    """Return random numbers, the same for a seed: bytes of all values, normally distributed floats, else 0 and 1."""
+    """Return random numbers from `seed`: uniform bytes, normally distributed floats, or 0 and 1 for other types."""
     rng = np.random.default_rng(seed)
     if numbers is np.uint8:
         return rng.integers(0, 256, shape, dtype=np.uint8)

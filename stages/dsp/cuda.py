@@ -1,8 +1,9 @@
 """The runtime `cuda`: ONNX Runtime on an NVIDIA GPU.
 
-Rule: every node of the graph runs on the GPU; when one cannot, loading fails, and none falls back to the CPU.
+Rule: every node of the graph runs on the GPU. If one cannot, loading fails; no node falls back to the CPU.
 
-ONNX Runtime has no integer layers for CUDA: it computes a layer's sum in float, from the same bytes to the same bytes.
+ONNX Runtime has no integer layers for CUDA: it computes a layer's sums in float, and the bytes before and after stay
+the same.
 Slots are copied to the GPU and back in every run, because the GPU cannot read their memory directly.
 """
 
@@ -25,10 +26,11 @@ SILENT = 4
 
 
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
-    """Compile `network` for the GPU.
+    """Return `network` compiled for the GPU.
 
-    `options.device`: settings of the CUDA provider. Raises BadInputError when a node of the network does not run there,
-    MissingPartError when no GPU works.
+    `options`: its `device` has settings of the CUDA provider.
+
+    Raises BadInputError if a node of the network does not run on the GPU, MissingPartError if no GPU works.
     """
     _check_gpu()
     check_integer_layers(network)
@@ -38,8 +40,11 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
 def gpu_session(where: str, model: str | bytes, device: Mapping[str, str]) -> onnxruntime.InferenceSession:
     """Return a session on the GPU.
 
-    `where`: names the network in errors. `model`: its file or its bytes. `device`: settings of the CUDA provider.
-    Raises as `load`.
+    `where`: name of the network in errors.
+    `model`: path of its file, or its bytes.
+    `device`: settings of the CUDA provider.
+
+    Raises as `load` does.
     """
     _check_gpu()
     settings = onnxruntime.SessionOptions()
@@ -53,7 +58,7 @@ def gpu_session(where: str, model: str | bytes, device: Mapping[str, str]) -> on
 
 @cache
 def _check_gpu() -> None:
-    """Raise MissingPartError when the CUDA provider cannot be loaded; ONNX Runtime itself reports no error then."""
+    """Raise MissingPartError if the CUDA provider cannot be loaded, because ONNX Runtime reports no error then."""
     values = [helper.make_tensor_value_info(name, TensorProto.UINT8, [1]) for name in ("x", "y")]
     graph = helper.make_graph([helper.make_node("Identity", ["x"], ["y"])], "probe", values[:1], values[1:])
     probe = helper.make_model(graph, opset_imports=[helper.make_opsetid("", PROBE_OPSET)], ir_version=PROBE_IR)

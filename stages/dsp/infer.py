@@ -1,8 +1,8 @@
-"""The infer stage: bytes of a slot in, bytes of a slot out, by the avatar's integer network or a part of it.
+"""The infer stage: it runs the avatar's integer network, or a part of it, from the input slot to the output slot.
 
-`bind` makes all sessions and bindings, a frame allocates nothing, and nothing runs with nobody in view. The tensors
-that cross a cut of the network lie in a slot in the order of the cut, each on its own cache lines. Every process that
-reads the same configuration finds the same places.
+`bind` makes all sessions and bindings. A frame allocates nothing, and nothing runs with nobody in view. The tensors
+that cross a cut of the network are in the slot in the order of the cut, each on its own cache lines. All processes with
+the same configuration use the same offsets.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ from trilane.stages.config import MAX_CHANNELS, PAINTED_CHANNELS, RunConfig, net
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, Session, copies_slots, has_device, load_runtime, resolve
 from trilane.transport.packets import Packet
 
-VERSION = "network parts 1"  # raise it when the same network and cuts give other parts
+VERSION = "network parts 1"  # raise the number when the same network and cuts give other parts
 SHAPES = ("inputs", "outputs", "crossing_in", "crossing_out")
 LINE = 64  # bytes of a cache line, and of the widest vector register
 
 
 def parts_for(config: RunConfig, network: NetworkFile, shape: Shape) -> list[NetworkPart]:
-    """Return the parts of `network` for tensors of `shape`, cut as `config` says; one part when it is not cut.
+    """Return the parts of `network` for tensors of `shape`, by the cuts of `config`; one part without cuts.
 
-    They are cached: inferring every shape of the graph again takes longer than reading them.
+    The result is cached, because reading it is faster than inferring every shape of the graph again.
     """
     cuts = [cut.at for cut in config.cuts]
     sources = (VERSION, onnx.__version__, network.digest, *map(str, shape), *cuts)
@@ -70,7 +70,7 @@ def _from_arrays(arrays: Arrays, where: str) -> list[NetworkPart]:
 
 
 def crossing_bytes(config: RunConfig, network: NetworkFile) -> list[int]:
-    """Return the bytes that cross each cut of `network`, for the scene's largest need. Raises BadInputError."""
+    """Return the bytes that cross each cut of `network`, for the tensor shape with the most. Raises BadInputError."""
     if not config.cuts:
         return []
     shapes = [[part.crossing_out for part in parts_for(config, network, shape)[:-1]] for shape in config.buckets]
@@ -78,7 +78,7 @@ def crossing_bytes(config: RunConfig, network: NetworkFile) -> list[int]:
 
 
 def constant_bytes(model: onnx.ModelProto) -> int:
-    """Return the number of bytes in the constants of `model`: weights, biases, scales."""
+    """Return the size in bytes of the constants of `model`: weights, biases, scales."""
     return sum(
         math.prod(tensor.dims) * onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type).itemsize
         for tensor in constants_of(model).values()
@@ -86,12 +86,12 @@ def constant_bytes(model: onnx.ModelProto) -> int:
 
 
 def extent(shapes: Shapes) -> int:
-    """Return the number of bytes that tensors of `shapes` take up in a slot."""
+    """Return the size in bytes of a slot for tensors of `shapes`."""
     return sum(-(-math.prod(shape) // LINE) * LINE for shape in shapes.values())
 
 
 def views(payload: U8, shapes: Shapes) -> dict[str, U8]:
-    """Return the tensors of `shapes` in a slot, in their order. Raises ValueError when the slot is too small."""
+    """Return views of the tensors of `shapes` in a slot, in their order. Raises ValueError if the slot is too small."""
     found, start = {}, 0
     for name, shape in shapes.items():
         size = math.prod(shape)
@@ -110,10 +110,11 @@ LOAD_AT_ONCE = ("openvino", "ort")
 
 @dataclass(frozen=True)
 class BoundPart:
-    """A part on a pair of slots.
+    """A part of the network, bound to an input slot and an output slot.
 
-    `passed`: pairs (from, to) of tensors that a later part reads unchanged. `in_bytes`: bytes that the network reads,
-    with its weights where they come from memory. `out_bytes`: bytes that it writes.
+    `passed`: pairs (source, target) of tensors that are copied unchanged for a later part.
+    `in_bytes`: bytes that the part reads, with its weights if they come from memory.
+    `out_bytes`: bytes that the part writes.
     """
 
     binding: Binding
@@ -132,13 +133,15 @@ class BoundPart:
 
 
 class InferStage:
-    """A `trilane.pipeline.stage.Stage`; a whole network turns H·W·C bytes into H·W·4.
+    """A `trilane.pipeline.stage.Stage` that runs networks, or a part of one. A network turns H·W·C bytes into H·W·4.
 
-    A frame has one inference for each network that paints somebody in view.
+    A frame has one inference for each network that paints somebody in view. Avatars with the same network share its
+    tensor, each in its `tensor_rect`.
 
-    `networks`: networks of the avatars. Those of one network share its tensor, each in its `tensor_rect`.
-    `part`: number of the part that the configuration's cuts make of the only network.
-    Raises BadInputError, MissingPartError when made or bound.
+    `networks`: networks of the avatars, by number.
+    `part`: index of the part to run, if the configuration cuts the only network.
+
+    Its constructor and `bind` raise BadInputError and MissingPartError.
     """
 
     def __init__(self, config: RunConfig, networks: Sequence[NetworkFile], part: int = 0) -> None:
@@ -158,9 +161,9 @@ class InferStage:
         self._outputs: Sequence[Packet] = ()
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
-        """Compile every shape, bind every pair of slots, run each shape once.
+        """Compile each network for every shape, bind it to every pair of slots, and run each shape once.
 
-        As many shapes are prepared at a time as there are cores, for runtimes that allow it.
+        Runtimes in LOAD_AT_ONCE prepare as many shapes at a time as there are cores.
         """
         self._inputs, self._outputs = inputs, outputs
         at_once = len(machine.here.cores()) if self.runtime in LOAD_AT_ONCE else 1
@@ -180,21 +183,21 @@ class InferStage:
             (number, shape, i, o): _bound(session, part, source, target, weights)
             for (i, source), (o, target) in product(enumerate(sources), enumerate(targets))
         }
-        # A session allocates memory in its first run; later runs, those of frames, do not.
+        # A session allocates memory in its first run, so that the runs of frames do not.
         bindings[number, shape, 0, 0].run(ByteCounter())
         return bindings
 
     def _own(self, packet: Packet, number: int, channels: int) -> U8:
-        """Return the part of a slot of network `number`; all of it for the only network, which may be cut."""
+        """Return the part of a slot that belongs to network `number`; the whole slot for an only network."""
         if len(self._networks) == 1:
             return packet.payload
         return network_parts(packet.payload, len(self._networks), self._shapes, channels)[number]
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
-        """Infer the tensor of each network that paints somebody in view; with nobody in view, pictures are transparent.
+        """Run each network that paints somebody in view; with nobody in view, write transparent pictures.
 
-        Figures: `inferred`, the number of inferences, and the bytes moved. The least bytes are the networks' inputs and
-        outputs, and their weights where they do not fit into the last-level cache.
+        The metrics are `inferred`, the number of inferences, and the bytes moved. The least bytes are the networks'
+        inputs and outputs, and their weights if these do not fit into the last-level cache.
         """
         assert slot_in is not None and slot_out is not None
         pose, picture, moved = self._inputs[slot_in].header, self._outputs[slot_out].payload, self._moved
@@ -216,11 +219,11 @@ class InferStage:
 
     @property
     def sessions(self) -> int:
-        """Number of compiled networks that are ready: one for each network and shape."""
+        """The number of sessions: one for each network and shape."""
         return len({(number, shape) for number, shape, _, _ in self._bindings})
 
     def close(self) -> None:
-        """Drop sessions and bindings, which hold views of the slots."""
+        """Drop all sessions and bindings, because they have views of the slots."""
         self._bindings.clear()
         self._inputs = self._outputs = ()
 
@@ -241,9 +244,9 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> InferStage:
 
 
 def _bound(session: Session, part: NetworkPart, source: U8, target: U8, weights: int) -> BoundPart:
-    """Bind `part` to the slots `source` and `target`.
+    """Return `part`, bound to the slots `source` and `target`.
 
-    `weights`: bytes of the network's own that each run reads from memory.
+    `weights`: bytes of the part's weights that each run reads from memory.
     """
     given, handed_on = views(source, part.crossing_in), views(target, part.crossing_out)
     inputs, outputs = [given[name] for name in part.inputs], [handed_on[name] for name in part.outputs]

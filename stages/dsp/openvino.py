@@ -28,7 +28,7 @@ REMEDY = ("integer layers", "quantise them")
 
 
 class OpenvinoBinding:
-    """One infer request whose tensors are the bound buffers."""
+    """An infer request whose tensors are the bound arrays."""
 
     def __init__(self, compiled: Any, inputs: Sequence[U8], outputs: Sequence[U8]) -> None:
         self._tensors = [openvino.Tensor(array, shared_memory=True) for array in (*inputs, *outputs)]
@@ -42,7 +42,7 @@ class OpenvinoBinding:
 
 
 class OpenvinoSession:
-    """One compiled model."""
+    """A compiled model of OpenVINO."""
 
     def __init__(self, compiled: Any) -> None:
         self._compiled = compiled
@@ -52,9 +52,9 @@ class OpenvinoSession:
 
 
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OpenvinoSession:
-    """Compile `network`, or read what was compiled before from the cache.
+    """Return `network` compiled, from the cache if it was compiled before.
 
-    Raises BadInputError when OpenVINO cannot load it or would run a layer in float.
+    Raises BadInputError if OpenVINO cannot load it or would run a layer in float.
     """
     settings = {
         "PERFORMANCE_HINT": "LATENCY",
@@ -79,7 +79,7 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OpenvinoSession:
 
 
 def _key(network: IntegerNetwork, settings: Mapping[str, Any]) -> str:
-    """Return a file name from everything that a compiled network depends on, including its processor."""
+    """Return a file name that depends on everything that a compiled network depends on, including the processor."""
     core = _core()
     machine = [str(core.get_property(DEVICE, name)) for name in ("FULL_DEVICE_NAME", "OPTIMIZATION_CAPABILITIES")]
     parts = (network.digest, version(), *machine, *(f"{name}={value}" for name, value in settings.items()))
@@ -91,9 +91,9 @@ def _with_digest(blob: bytes) -> bytes:
 
 
 def _without_digest(content: bytes) -> bytes:
-    """Return the blob in a file that `_with_digest` made.
+    """Return the blob in `content`, a result of `_with_digest`.
 
-    Raises ValueError when it is damaged: OpenVINO itself would not notice.
+    Raises ValueError if it is damaged, because OpenVINO would not notice.
     """
     size = hashlib.sha256().digest_size
     if hashlib.sha256(content[size:]).digest() != content[:size]:
@@ -103,7 +103,7 @@ def _without_digest(content: bytes) -> bytes:
 
 @cache
 def _core() -> Any:
-    """Return OpenVINO's core, one for all shapes."""
+    """Return OpenVINO's core, which all sessions share."""
     return openvino.Core()
 
 

@@ -36,7 +36,7 @@ Named = Mapping[str, NDArray[Any]]
 
 
 class OrtBinding:
-    """An ONNX Runtime IOBinding to the addresses of the buffers, by name; an output without a buffer is computed."""
+    """An ONNX Runtime IOBinding to arrays by name; an output without an array goes to memory of the runtime."""
 
     def __init__(self, session: onnxruntime.InferenceSession, inputs: Named, outputs: Named) -> None:
         self._buffers = (*inputs.values(), *outputs.values())
@@ -55,7 +55,7 @@ class OrtBinding:
 
 
 class OrtSession:
-    """One session, which has its own threads. `outputs`: names of its outputs, in its order."""
+    """One session, which has its own threads. `outputs`: names of the network's outputs, in order."""
 
     def __init__(self, session: onnxruntime.InferenceSession) -> None:
         self._session = session
@@ -72,7 +72,7 @@ class OrtSession:
 
 
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
-    """Compile `network`. Raises BadInputError when ONNX Runtime cannot load it or would run a layer in float."""
+    """Return `network` compiled. Raises BadInputError if ONNX Runtime cannot load it or would run a layer in float."""
     with tempfile.TemporaryDirectory(prefix="trilane-ort-") as folder:
         optimised = Path(folder) / "optimised.onnx"
         settings = settings_of(options)

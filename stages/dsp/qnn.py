@@ -1,6 +1,6 @@
 """The runtime `qnn`: Qualcomm's HTP through ONNX Runtime, on the Hexagon of a Snapdragon or its emulator on x86 Linux.
 
-Rule: every node of the graph runs on the HTP; when one cannot, loading fails, and none falls back to the CPU.
+Rule: every node of the graph runs on the HTP. If one cannot, loading fails; no node falls back to the CPU.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ DEFAULTS = {**SOCS["sm8350"], "htp_performance_mode": "burst"}
 
 
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
-    """Compile `network` for the HTP, or load the compiled network from the cache.
+    """Return `network` compiled for the HTP, from the cache if it was compiled before.
 
-    Raises BadInputError when a node of it does not run there in integers.
+    Raises BadInputError if a node of it does not run on the HTP in integers.
     """
     check_integer_layers(network)
     device = {**DEFAULTS, **options.device}
@@ -63,7 +63,7 @@ def version() -> str:
 
 
 def _key(network: IntegerNetwork, device: Mapping[str, str]) -> str:
-    """Return a file name from everything that a compiled network depends on."""
+    """Return a file name that depends on everything that a compiled network depends on."""
     parts = (
         network.digest,
         version(),
@@ -81,8 +81,12 @@ def _context(path: Path) -> dict[str, str]:
 def htp_session(where: str, model: str | bytes, device: Mapping[str, str], entries: Mapping[str, str]) -> Any:
     """Return a session on the HTP.
 
-    `where`: names the network in errors. `model`: its file or its bytes. `device`: settings of the provider. `entries`:
-    further entries of the session. Raises BadInputError when a node does not run there.
+    `where`: name of the network in errors.
+    `model`: path of its file, or its bytes.
+    `device`: settings of the provider.
+    `entries`: further entries of the session's configuration.
+
+    Raises BadInputError if a node does not run on the HTP.
     """
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = ERRORS_ONLY

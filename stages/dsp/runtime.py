@@ -1,6 +1,6 @@
-"""Runtimes, which run an integer network: the protocol that each of them offers, and the table of all of them.
+"""Runtimes, which run an integer network: the protocol of a runtime, and the table of all runtimes.
 
-Rule: a runtime is chosen by name; it runs the network or the run stops with an error. None falls back to another.
+Rule: a runtime is chosen by name. It runs the network, or the run stops with an error; none falls back to another.
 """
 
 from __future__ import annotations
@@ -24,8 +24,9 @@ X86 = ("x86_64", "AMD64")
 class RuntimeOptions:
     """Options of a runtime.
 
-    `threads`: number of computing threads, the calling one included. `spin`: whether they may spin between jobs.
-    `device`: settings that only one runtime has, by its own names, such as `htp_arch` of `qnn`.
+    `threads`: number of computing threads, including the calling thread.
+    `spin`: whether the threads may spin between jobs.
+    `device`: settings of one runtime, by its own names, such as `htp_arch` of `qnn`.
     """
 
     threads: int = 1
@@ -44,9 +45,10 @@ class Session(Protocol):
     """A loaded network of one shape."""
 
     def bind(self, inputs: Sequence[U8], outputs: Sequence[U8]) -> Binding:
-        """Bind C-contiguous buffers, in the order of the network's inputs and outputs; they must outlive the binding.
+        """Return a binding to arrays in the order of the network's inputs and outputs.
 
-        A whole network has one input (N, H, W, C) and one output (N, H, W, 4); a part has the tensors of its cuts.
+        The arrays must be C-contiguous, and outlive the binding. A whole network has one input (N,H,W,C) and one output
+        (N,H,W,4); a part has the tensors of its cuts.
         """
 
 
@@ -54,7 +56,7 @@ class Runtime(Protocol):
     """The interface that each runtime's module in this folder offers."""
 
     def load(self, network: IntegerNetwork, options: RuntimeOptions) -> Session:
-        """Compile `network` for its shape. Raises BadInputError naming a node that it cannot run in integers."""
+        """Return `network` compiled for its shape. Raises BadInputError naming a node that cannot run in integers."""
 
     def version(self) -> str:
         """Return the name and version of the installed library."""
@@ -62,9 +64,12 @@ class Runtime(Protocol):
 
 @dataclass(frozen=True)
 class RuntimeEntry:
-    """A runtime: its module, the package it needs, the command that installs it, and a file the package must contain.
+    """A row of the table of runtimes.
 
-    `file`: path relative to the package's folder; empty when the package alone suffices.
+    `module`: module that implements `Runtime`.
+    `package`: package that it needs.
+    `install`: function that returns the command that installs the package.
+    `file`: file that the package must contain, relative to its folder; empty for none.
     `copies`: whether each run copies the slots to a device's memory, and back.
     """
 
@@ -76,13 +81,13 @@ class RuntimeEntry:
 
     @property
     def is_installed(self) -> bool:
-        """Return whether the package, and its `file`, are there."""
+        """Whether the package is installed and has its `file`."""
         begins = machine.here.package_file(self.package)
         return begins is not None and (not self.file or (begins.parent / self.file).is_file())
 
 
 def cuda_line() -> str:
-    """Return the command for the runtime `cuda`: the build for GPUs replaces the other, whose modules it contains."""
+    """Return the command that installs the runtime `cuda`; its package replaces the CPU's, which has the same files."""
     here = pip()
     return f"{here} uninstall -y onnxruntime && {here} install onnxruntime-gpu  # on a machine with an NVIDIA GPU"
 
@@ -107,7 +112,7 @@ def installed() -> Sequence[str]:
 
 
 def resolve(name: str) -> str:
-    """Return `name` itself. Raises BadInputError when it is no runtime, MissingPartError when it is not installed."""
+    """Return `name` itself. Raises BadInputError if it is no runtime, MissingPartError if it is not installed."""
     if name not in RUNTIMES:
         raise BadInputError("runtime", f"{name!r}", f"one of {', '.join(RUNTIMES)}", did_you_mean(name, RUNTIMES))
     entry = RUNTIMES[name]
@@ -118,26 +123,26 @@ def resolve(name: str) -> str:
 
 
 def has_device(name: str) -> bool:
-    """Return whether runtime `name` computes on hardware of its own; on x86, `qnn` emulates it on the cores."""
+    """Return whether runtime `name` computes on a device; on x86, `qnn` only emulates its device on the cores."""
     return name == "cuda" or (name == "qnn" and machine.here.architecture() not in X86)
 
 
 def copies_slots(name: str) -> bool:
-    """Return whether runtime `name` copies slots to its device and back in every run; the others work in the slots."""
+    """Return whether runtime `name` copies the slots to its device and back in every run, and does not use them."""
     return RUNTIMES[name].copies
 
 
 def load_runtime(name: str) -> Runtime:
-    """Return the module of runtime `name`. Raises as `resolve`."""
+    """Return the module of runtime `name`. Raises as `resolve` does."""
     module: Runtime = import_module(RUNTIMES[resolve(name)].module)
     return module
 
 
 def quiet_openvino() -> Any:
-    """Import OpenVINO without its telemetry; all code imports it by this function.
+    """Return the module `openvino`, imported without its telemetry; all code imports OpenVINO by this function.
 
-    Imported directly, it reports to its maker's server that it was imported, and keeps a number for that in the home
-    folder. Without the package `openvino_telemetry` it uses a stand-in of its own, which does neither.
+    A direct import reports to its maker's server, and stores an id in the home folder. Without the package
+    `openvino_telemetry`, OpenVINO uses its own stand-in, which does neither.
     """
     cast(dict[str, Any], sys.modules).setdefault("openvino_telemetry", None)
     import openvino
@@ -146,5 +151,5 @@ def quiet_openvino() -> Any:
 
 
 def said_by_openvino(error: RuntimeError) -> str:
-    """Return the text of an error of OpenVINO as part of a sentence: on one line, without the stop at its end."""
+    """Return the text of an error of OpenVINO as part of a sentence: on one line, without the full stop."""
     return " ".join(str(error).split()).rstrip(".")

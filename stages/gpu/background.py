@@ -1,12 +1,13 @@
 """Backgrounds from the user's files: a picture, a folder of pictures, or a video, each examined before a run.
 
-Every frame covers the output: `cover` scales the picture until no border is left, and crops the overhang equally on
-both sides; the picture's lens is changed alike. Videos and folders start again when they end; photos that belong to the
-camera's views are shown with these views. A picture is turned as its EXIF tag says, unless its reader is told
-otherwise. What Pillow would show wrongly is converted to eight bits, or refused.
+Every frame covers the output: `cover` scales the picture until no border is left, and crops both sides equally. Videos
+and folders start again when they end; photos that belong to the camera's views are shown with these views. The EXIF tag
+of a picture says how it is turned, but a caller may choose another turn. A picture that Pillow would show wrongly is
+converted to eight bits, or refused.
 
-`survey` says size, rate and range of a background. Rule: everything that the run will show is opened before it: each
-picture is decoded, and a video's frames are counted. A broken file is then named before a process is started.
+`survey` returns size, rate and range of a background. Rule: all pictures that the run will show are opened before the
+run: each picture is decoded, and a video's frames are counted. Therefore a broken file is named before a process is
+started.
 """
 
 from __future__ import annotations
@@ -43,14 +44,13 @@ from trilane.stages.gpu.video_reader import (
 )
 
 PICTURES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff"})
-#: Photos that phones write and Pillow does not read; FFmpeg would show a single tile of them.
+#: Suffixes of phone photos that Pillow does not read; FFmpeg would show only one tile of them.
 PHONE_PHOTOS = frozenset({".heic", ".heif", ".hif"})
 MAX_PIXELS = 64_000_000
 DEEP_STEP = 257  # factor from eight bits to sixteen
 DEEP_MODES = frozenset({"I;16", "I;16L", "I;16B", "I;16N"})
 REFUSED_MODES = {"F": "numbers with fractions, as high-range pictures have", "I": "whole numbers of 32 bits"}
-#: For each EXIF tag, how a picture is brought upright, and by how many quarters that turns it clockwise, mirrored or
-#: not.
+#: The operation that brings a picture upright, and its clockwise quarter turns without mirroring, by the EXIF tag.
 BY_TAG = {
     2: Image.Transpose.FLIP_LEFT_RIGHT,
     3: Image.Transpose.ROTATE_180,
@@ -67,21 +67,22 @@ A_VIDEO = "a video, a picture, or a folder of pictures"
 
 
 def look_at_picture(path: Path) -> Stored:
-    """Return the size of the picture in `path`, by its head alone. Raises BadInputError."""
+    """Return size and turn of the picture in `path`, without decoding it. Raises BadInputError if that fails."""
     with _opened(path) as image:
         return Stored((image.height, image.width), QUARTERS.get(_orientation(image), 0))
 
 
 def check_picture(path: Path) -> None:
-    """Decode all of the picture in `path`, a JPEG at an eighth of its size. Raises BadInputError."""
+    """Decode the whole picture in `path`, a JPEG at an eighth of its size. Raises BadInputError if that fails."""
     with _opened(path) as image:
         image.draft("RGB", (1, 1))
         image.load()
 
 
 def read_picture(path: Path, shape: Shape, turned: int | None = None) -> U8:
-    """Return the picture in `path` covering `shape` (h,w): (h,w,3) uint8. Raises BadInputError.
+    """Return the picture in `path`, scaled and cropped to `shape`, as (h,w,3) uint8. Raises BadInputError.
 
+    `shape`: (height, width).
     `turned`: number of clockwise quarter turns; None for the turn of the EXIF tag.
     """
     with _opened(path) as image:
@@ -94,7 +95,7 @@ def read_picture(path: Path, shape: Shape, turned: int | None = None) -> U8:
 
 
 def _orientation(image: Image.Image) -> int:
-    """Return the EXIF tag; for a PNG only if it stands before the pixels, which are not decoded for it."""
+    """Return the EXIF orientation tag; in a PNG, a tag after the pixels is ignored, so that no pixels are decoded."""
     return int(Image.Image.getexif(image).get(ExifTags.Base.Orientation, 1))
 
 
@@ -123,16 +124,17 @@ class Background(Protocol):
     """A background of a fixed shape (height, width)."""
 
     def at(self, time_s: float) -> U8 | None:
-        """Return the picture (h,w,3) uint8 sRGB at `time_s`, or None when the last call returned the same one."""
+        """Return the picture (h,w,3) uint8 sRGB at `time_s`; None if it is the same as at the last call."""
 
     def close(self) -> None:
         """Release files and threads."""
 
 
 def open_background(path: Path, shape: Shape, fps: float, camera: CameraPath | None = None) -> Background:
-    """Open the background in `path`; a folder's pictures follow each other at `fps`. Raises BadInputError.
+    """Return the opened background in `path`; a folder's pictures follow each other at `fps`. Raises BadInputError.
 
-    `camera`: camera that may have filmed it.
+    `shape`: (height, width) of its pictures.
+    `camera`: camera of the scene. The pictures may belong to its views; None: they belong to no views.
     """
     turned = () if camera is None else camera.optics.turned
     if camera is not None and camera.is_held:
@@ -147,12 +149,12 @@ def open_background(path: Path, shape: Shape, fps: float, camera: CameraPath | N
 
 
 def is_picture(path: Path) -> bool:
-    """Return whether the name of `path` says that it is a picture."""
+    """Return whether `path` has the suffix of a picture."""
     return path.suffix.lower() in PICTURES | PHONE_PHOTOS
 
 
 def pictures_in(folder: Path) -> list[Path]:
-    """Return the pictures in `folder`, in order. Raises BadInputError without any."""
+    """Return the pictures in `folder`, in order. Raises BadInputError if there are none."""
     names = _names_in(folder)
     if not names:
         near = next((sub for sub in sorted(folder.iterdir()) if sub.is_dir() and _names_in(sub)), None)
@@ -160,12 +162,12 @@ def pictures_in(folder: Path) -> list[Path]:
         raise BadInputError(folder, "no pictures", f"files that end in {', '.join(sorted(PICTURES))}", remedy)
     pictures = [folder / name for name in in_order(names)]
     for path in pictures:
-        require_file(path, "a picture")  # refuses a pipe of such a name, which would be waited for
+        require_file(path, "a picture")  # refuses a pipe with such a name, which could block for ever
     return pictures
 
 
 def _names_in(folder: Path) -> list[str]:
-    """Return the names of pictures in `folder`. Raises BadInputError when it cannot be read."""
+    """Return the names of the pictures in `folder`. Raises BadInputError if it cannot be read."""
     try:
         return [path.name for path in folder.iterdir() if path.suffix.lower() in PICTURES]
     except OSError as error:
@@ -173,24 +175,24 @@ def _names_in(folder: Path) -> list[str]:
 
 
 class PictureSequence:
-    """Pictures in files, one after the other.
-
-    `number_at`: function that gives the number of the picture shown at a time.
-    """
+    """A `Background` of pictures in files, one after the other."""
 
     def __init__(
         self, paths: Sequence[Path], number_at: Callable[[float], int], shape: Shape, turned: Sequence[int] = ()
     ) -> None:
-        """Keep the files.
+        """Keep the paths, and read the first picture.
 
-        `turned`: number of quarters that each is turned, or a single one for all; empty for what the files say.
+        `number_at`: function that returns the index of the picture at a time in seconds.
+        `shape`: (height, width) of the pictures that are returned.
+        `turned`: number of clockwise quarter turns of each picture, or a single number for all; empty for the turns of
+        the EXIF tags.
         """
         self._paths, self._number_at, self._shape, self._turned = paths, number_at, shape, turned
         self._shown = -1
         self._first: U8 | None = self._read(0)
 
     def at(self, time_s: float) -> U8 | None:
-        """Return the picture whose turn it is."""
+        """Return the picture at `time_s`, as `Background.at`."""
         number = self._number_at(time_s)
         if number == self._shown:
             return None
@@ -199,26 +201,29 @@ class PictureSequence:
         return first if first is not None and number == 0 else self._read(number)
 
     def close(self) -> None:
-        """Do nothing: no file is held."""
+        """Do nothing, because no file is open."""
 
     def _read(self, number: int) -> U8:
         turned = self._turned[number % len(self._turned)] if self._turned else None
         return read_picture(self._paths[number], self._shape, turned)
 
 
-#: A video has a variable rate when a step between its frames differs from the usual one by more than this share.
+#: A video has a variable rate if the steps between its frames differ by more than this share of the usual step.
 STEADY = 0.25
 MOST_PACKETS = 500_000
 #: Least share of its stated frames that a whole file contains.
 LEAST_WHOLE = 0.99
-#: Control characters, except those that lay out a text.
+#: Control characters that no text contains.
 NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
 QUARTER_WORDS = {1: ", turned by 90 degrees", 2: ", turned by 180 degrees", 3: ", turned by 270 degrees"}
 EIGHT_BITS = 8
 
 
 def survey(path: Path, fps: float) -> Footage:
-    """Return size, rate and range of `path`; a folder's pictures follow each other at `fps`. Raises BadInputError."""
+    """Return the facts of the background in `path`: size, rate and range. Raises BadInputError.
+
+    `fps`: rate at which a folder's pictures follow each other.
+    """
     if path.is_dir():
         return _folder(path, fps)
     require_file(path, A_VIDEO)
@@ -229,9 +234,11 @@ def survey(path: Path, fps: float) -> Footage:
 
 
 def check_pictures(path: Path, fps: float, frames: int, camera: CameraPath) -> None:
-    """Decode each picture of `path` that a run of `frames` frames shows. Raises BadInputError naming a bad one.
+    """Decode each picture of `path` that a run shows. Raises BadInputError naming a picture that cannot be decoded.
 
-    `camera`: camera of the scene, whose views the pictures may belong to.
+    `fps`: rate at which a folder's pictures follow each other, and the frames of the run.
+    `frames`: number of frames of the run.
+    `camera`: camera of the scene. The pictures may belong to its views.
     """
     if path.is_dir():
         for _ in _checked(_shown(path, fps, frames, camera)):
@@ -272,8 +279,9 @@ def _size(stored: Stored) -> str:
 
 
 class _Head(NamedTuple):
-    """A video's first frame, and the facts of its stream.
+    """Facts of a video from its first frame and its stream.
 
+    `codec`: name of the codec.
     `bits`: bits per colour.
     """
 
@@ -284,9 +292,9 @@ class _Head(NamedTuple):
 
 
 def require_video(path: Path) -> None:
-    """Raise BadInputError for a file that is no video, even where FFmpeg may show it or files that it names.
+    """Raise BadInputError for a text or another file that is no video, even if FFmpeg would open it.
 
-    Texts and archives are such files.
+    FFmpeg opens texts that name other files, such as playlists.
     """
     try:
         with path.open("rb") as file:
@@ -301,7 +309,7 @@ def require_video(path: Path) -> None:
 
 
 def is_text(head: bytes) -> bool:
-    """Return whether a file that begins with `head` may be text: every video has bytes that no text has."""
+    """Return whether a file that begins with `head` may be text; the head of a video has bytes that no text has."""
     return not NO_TEXT.search(head)
 
 
@@ -340,7 +348,7 @@ def _head(container: Any, path: Path) -> _Head:
 
 
 def _times(container: Any, path: Path) -> list[float]:
-    """Return increasing times of the frames, seconds, without decoding. Raises BadInputError for a truncated file."""
+    """Return the times of the frames in seconds, ascending. Nothing is decoded. Raises BadInputError for a cut file."""
     stream = video_stream(container, path)
     times, count = set(), 0
     for packet in container.demux(stream):
@@ -355,7 +363,7 @@ def _times(container: Any, path: Path) -> list[float]:
 
 
 def _rate(steps: Sequence[float], period_s: float) -> str:
-    """Say the rate in words, by the sorted `steps` between frames."""
+    """Return the rate in words. `steps`: times between frames in seconds, sorted. `period_s`: length of the video."""
     if not steps:
         return "one frame"
     usual = median(steps)

@@ -1,16 +1,17 @@
-"""The composite stage: draws background, planes, contact shadow, avatars and display, in that order.
+"""The composite stage: it draws background, planes, contact shadows, avatars and the text display, in that order.
 
-Avatars are drawn far to near; one that is not visible leaves no trace. If an output slot still holds an equal frame,
-the new frame is copied instead of drawn. Only the composite writes to its output slots, so their bytes stay until it
-writes there again.
+Avatars are drawn from far to near; an avatar that is not visible leaves no trace. If an output slot still has an equal
+frame, the new frame is copied instead of drawn. Only this stage writes to its output slots, so their bytes stay until
+it writes there again.
 
-While the camera stands still, everything under the avatars is drawn twice and copied from then on. The first frame of a
-view is only drawn, because most views of a moving camera never come again. The second one is kept in host memory: a
-software driver copies it from there in a tenth of a millisecond, and takes twenty times as long to copy between
-framebuffers.
+While the camera stands still, everything under the avatars is drawn for two frames, and copied for all further ones.
+The first frame of a view is only drawn, because most views of a moving camera never come again. The second one is also
+kept in host memory. From there a software driver copies it in a tenth of a millisecond; a copy between framebuffers
+takes twenty times as long.
 
-The display shows frame number and time of the picture. This stage measures rate and age. Both are updated four times a
-second, so that a person can read them. They start again when frame numbers do.
+The text display shows frame number and time of the picture, and the rate and the age of frames, which this stage
+measures. Rate and age are updated four times a second, so that a person can read them. Their measurement starts again
+when the frame numbers start again.
 """
 
 from __future__ import annotations
@@ -56,27 +57,27 @@ from trilane.stages.gpu.opengl import (
 )
 from trilane.transport.packets import Packet
 
-#: Number of the avatars' picture, number of the background's picture, view and projection.
+#: Inputs of a frame's picture: number of the avatars' picture, number of the background's picture, view, projection.
 Drawing = tuple[int, int, bytes, bytes]
 
 
 class DrawnFrames:
-    """Remembers the drawing in each slot."""
+    """Remembers which drawing each output slot has."""
 
     def __init__(self) -> None:
         self._slots: dict[int, tuple[Drawing | None, int]] = {}
 
     def slot_of(self, drawing: Drawing | None, preferred: int) -> int | None:
-        """Return a slot that holds `drawing`, preferably `preferred`; None without such a slot or drawing."""
+        """Return a slot that has `drawing`, preferably the slot `preferred`; None without such a slot or drawing."""
         if drawing is None:
             return None
         held = [slot for slot, (there, _) in self._slots.items() if there == drawing]
         return preferred if preferred in held else held[0] if held else None
 
     def note(self, slot: int, drawing: Drawing | None, frame: int, copied_from: int | None) -> int:
-        """Note that `slot` holds `drawing` of `frame` from now on; return `repeats` of the frame's header.
+        """Note that `slot` has the drawing of `frame` from now on; return the field `repeats` of the frame's header.
 
-        `copied_from`: slot that held the drawing already; None when it was drawn now.
+        `copied_from`: slot that already had the drawing; None if it was drawn now.
         """
         drawn = frame if copied_from is None else self._slots[copied_from][1]
         self._slots[slot] = (drawing, drawn)
@@ -84,7 +85,10 @@ class DrawnFrames:
 
 
 class StillBackground:
-    """Keeps the background of `target`, a framebuffer with one colour of four bytes."""
+    """Keeps the pixels of a background, so that one that does not change is drawn only once.
+
+    `target`: framebuffer with one RGBA colour attachment of 8 bits.
+    """
 
     def __init__(self, target: Any) -> None:
         self._target = target
@@ -93,7 +97,10 @@ class StillBackground:
         self._is_kept = False
 
     def draw(self, shown: Hashable, draw: Callable[[], None]) -> None:
-        """Fill the target with the background that `shown` identifies: by `draw`, or a copy. `shown` is not None."""
+        """Fill the target with a background: call `draw`, or copy the kept background.
+
+        `shown`: value that identifies the background; not None.
+        """
         if shown == self._shown and self._is_kept:
             upload(self._target.ctx, self._target.color_attachments[0], self._bytes)
             return
@@ -113,7 +120,7 @@ SHEET, INK = (0, 0, 0, 150), (255, 255, 255, 255)
 
 
 class Hud:
-    """Draws the display into the lower left corner of a target; a smaller target shows a part of it."""
+    """Draws the text display into the lower left corner of a target; a smaller target shows only a part of it."""
 
     def __init__(self, ctx: Any) -> None:
         self._ctx = ctx
@@ -126,7 +133,7 @@ class Hud:
         self._measured = ""
 
     def draw(self, target: Any, pose: NDArray[np.void]) -> None:
-        """Blend the display for the frame of pose packet `pose` over `target`."""
+        """Blend the text display over `target`. `pose`: header of the frame."""
         lines = self._lines(pose, time.monotonic_ns())
         upload(self._ctx, self._texture, hud_picture(lines, self._font).tobytes())
         corner = MARGIN_PX, target.height - MARGIN_PX - SIZE[1]
@@ -151,9 +158,10 @@ class Hud:
 
 
 def measured_line(pose: NDArray[np.void], presented_ns: list[int]) -> str:
-    """Return the line of rate and age.
+    """Return the line of the text display with rate and age.
 
-    `presented_ns`: times at which the last frames were composed, this frame's last.
+    `pose`: header of the frame.
+    `presented_ns`: times at which the last frames were composed, ascending, up to this frame.
     """
     span = presented_ns[-1] - presented_ns[0]
     rate = f"{(len(presented_ns) - 1) * 1e9 / span:.1f} fps" if span > 0 else "- fps"
@@ -162,7 +170,7 @@ def measured_line(pose: NDArray[np.void], presented_ns: list[int]) -> str:
 
 
 def hud_lines(pose: NDArray[np.void], measured: str) -> list[str]:
-    """Return the three lines of the display; `measured` is the middle one."""
+    """Return the three lines of the text display. `measured`: the middle line, from `measured_line`."""
     height, width = pose["tensor_shape"].tolist()
     visible = int(sum(avatar["visible"] for avatar in pose["avatars"][: int(pose["avatar_count"])]))
     return [
@@ -173,7 +181,7 @@ def hud_lines(pose: NDArray[np.void], measured: str) -> list[str]:
 
 
 def hud_picture(lines: list[str], font: Any) -> NDArray[np.uint8]:
-    """Return `lines` on a dark background, (62,232,4) uint8, straight alpha."""
+    """Return a picture of `lines` on a dark background, (62,232,4) uint8, straight alpha."""
     image = Image.new("RGBA", SIZE, SHEET)
     ImageDraw.Draw(image).multiline_text((8, 3), "\n".join(lines), INK, font, spacing=3)
     return np.asarray(image)
@@ -185,13 +193,13 @@ ROOM = "room"
 class CompositeStage:
     """Draws frames of `shape` (height, width).
 
-    `shapes`: tensor shapes that may come.
+    `shapes`: tensor shapes (height, width) that may come.
     `rest`: rest joints (55,3) of each avatar of the scene, metres.
     `background`: background from files; None for the built-in room.
-    `eyes`: places (3,) that the room holds from the first frame on, so that it never grows, not even after a restart.
-    `planes`: detected planes to show.
-    `painters`: network of each avatar; empty where one network paints all.
-    `hud`: whether to show frame, rate and age.
+    `eyes`: camera positions (3,) that the room contains from the first frame on, so that it never grows during a run.
+    `planes`: planes of the scene to draw.
+    `hud`: whether to draw the text display.
+    `painters`: number of the network that paints each avatar; empty if one network paints all.
     """
 
     def __init__(
@@ -228,12 +236,16 @@ class CompositeStage:
         self._inputs, self._outputs = inputs, outputs
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
-        """Write the frame, (h,w,3) uint8 sRGB, row 0 on top.
+        """Write the frame to the output slot, (h,w,3) uint8 sRGB, row 0 on top.
 
-        Figures: 1 or 0 for `nobody` (nobody is on the screen), `reused` (the picture of an earlier frame is the right
-        one), `stale` (the right one never came, so an earlier one is shown), and `copied` (the frame was copied from an
-        earlier one, not drawn); and the bytes moved. The least bytes count the new parts of the background and of the
-        network's picture, in the cells of visible avatars. They also count the frame, unless a slot holds it already.
+        The metrics are the bytes moved, and four numbers that are 1 or 0:
+        - `nobody`: nobody is on the screen;
+        - `reused`: the picture of an earlier frame is shown, and is the right one;
+        - `stale`: the right picture never came, so an older one is shown;
+        - `copied`: the frame was copied from an earlier frame, not drawn.
+
+        The least bytes are the new parts of the background, of the network's picture in the `tensor_rect`s of visible
+        avatars, and the frame if no slot had it.
         """
         if slot_in is None or slot_out is None:
             raise ValueError("composite needs an input and an output slot")
@@ -265,12 +277,12 @@ class CompositeStage:
         return {**{name: float(value) for name, value in said.items()}, **moved.figures()}
 
     def draw(self, pose: NDArray[np.void], image: NDArray[np.uint8]) -> None:
-        """Draw the frame that `pose` and the networks' `image` (h * w * 4 bytes or more) describe."""
+        """Draw a frame into the target. `pose`: its header. `image`: payload with the networks' pictures."""
         self._take(pose, image)
         self._draw(pose)
 
     def _take(self, pose: NDArray[np.void], image: NDArray[np.uint8]) -> None:
-        """Upload the new parts of this frame: the background's picture, and for a full frame the avatars' picture."""
+        """Upload a new picture of the background, if any, and for a full frame the avatars' picture."""
         if self._background is not None and self._picture is not None:
             picture = self._background.at(float(pose["media_time_s"]))
             if picture is not None:
@@ -287,11 +299,11 @@ class CompositeStage:
             counter_of(self._ctx).least += _cells_bytes(pose)
 
     def _holds(self, picture: int) -> bool:
-        """Return whether the uploaded picture of the avatars is that of frame `picture`."""
+        """Return whether the uploaded picture of the avatars belongs to the frame number `picture`."""
         return self._held is not None and int(self._held["picture"]) == picture
 
     def _drawing(self, pose: NDArray[np.void]) -> Drawing | None:
-        """Return the inputs of the frame's bytes; None for a frame like no other."""
+        """Return the inputs on which the frame's bytes depend; None if the text display makes each frame different."""
         if self._hud is not None:
             return None
         nobody = self._held is None or int(pose["work"]) == FrameWork.NONE
@@ -299,7 +311,7 @@ class CompositeStage:
         return picture, self._shows_background, pose["view"].tobytes(), pose["projection"].tobytes()
 
     def _draw(self, pose: NDArray[np.void]) -> None:
-        """Draw the frame of `pose` with the picture of the avatars that was uploaded last."""
+        """Draw the frame of `pose`, with the picture of the avatars that was uploaded last."""
         self._target.use()
         shown = self._shows_background, pose["view"].tobytes(), pose["projection"].tobytes()
         self._still.draw(shown, lambda: self._draw_background(pose))
@@ -333,7 +345,7 @@ class CompositeStage:
             self._planes.draw(pose["view"], pose["projection"])
 
     def _depth(self, pose: NDArray[np.void], avatar: Any) -> float:
-        """Return camera z of the pelvis: the most negative is the farthest."""
+        """Return the z of the avatar's pelvis in camera space, metres; the most negative is the farthest."""
         pelvis = avatar["joints"][0] @ np.append(self._rest[int(avatar["avatar"])][0], 1.0)
         return float(pose["view"][2, :3] @ pelvis + pose["view"][2, 3])
 
@@ -343,7 +355,7 @@ def _visible(pose: NDArray[np.void]) -> list[Any]:
 
 
 def _cells_bytes(pose: NDArray[np.void]) -> int:
-    """Return the bytes of the network's picture in the rectangles of the avatars in view."""
+    """Return the bytes of the network's picture in the `tensor_rect`s of the visible avatars."""
     return sum(4 * int(avatar["tensor_rect"][2]) * int(avatar["tensor_rect"][3]) for avatar in _visible(pose))
 
 

@@ -1,16 +1,16 @@
 """The painters of the composite, one class per layer of the frame: room, picture, planes, contact shadows, avatars.
 
-The room is the built-in background: a wooden floor at y = 0 and walls, as a mesh and two textures. Rule: mesh and
-textures are computed from constants and a fixed seed, and the room always holds the camera.
+The room is the built-in background: a wooden floor at y = 0 and walls, as a mesh and three textures. Rule: mesh and
+textures are computed from constants and a fixed seed, and the room always contains the camera.
 
-Background bytes are copied unchanged, as sRGB; everything blended over them is blended in linear light. A shadow only
+Background bytes are copied unchanged, as sRGB; all other layers are blended over them in linear light. A shadow only
 multiplies light, which a sum on sRGB numbers does too, so its bytes are not converted. The planes come from the scene
-file; nothing is detected here. A contact shadow is a disc under a joint, which grows and fades with the height of its
-joint above the floor.
+file; nothing is detected here. A contact shadow is a disc under a joint, which grows and fades with the joint's height
+above the floor.
 
-A body fills about half of its rectangle, and a software driver takes as long for an unchanged pixel as for any other.
-Therefore the network's picture is cut into bands of rows. Each band is cut to the columns between its first and last
-texel that is not transparent, widened by what a screen pixel may read beside its middle.
+A body fills about half of its rectangle, and a software driver takes as long for a transparent pixel as for any other.
+Therefore the network's picture is drawn in bands of rows. Each band has only the columns between its first and its last
+texel that is not transparent, and a margin of the texels that a screen pixel also reads.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ FLOOR_SIDE = 1024
 PLANKS = 16  # number across one period
 PLANK_ROWS = 2  # number of plank lengths in one period
 WALL_PERIOD_M = 2.0
-WALL_TEXTURE_M = 4.0  # height that the wall texture spans; the paint goes on above it
+WALL_TEXTURE_M = 4.0  # height of the wall that the texture covers; above it the paint repeats
 WALL_SHAPE = (1024, 256)
 SKIRTING_M = 0.11
-SHADE_M = 0.1  # height above the skirting board in which its shade fades
+SHADE_M = 0.1  # height above the skirting board within which its shade fades
 MARGIN_M = 0.6
 GRID = np.array([0, 0.04, 0.12, 0.5, 0.88, 0.96, 1])
 SEED = 7
@@ -49,18 +49,20 @@ VERSION = "room textures 2"  # raise it when the textures change
 
 @dataclass(frozen=True)
 class Extent:
-    """Inside of the room in metres.
+    """The inside of the room.
 
-    `low`, `high`: corners (x, y, z). The floor is y = 0.
+    `low`, `high`: opposite corners (x, y, z), metres; the floor is y = 0.
     """
 
     low: tuple[float, float, float] = (-4.0, 0.0, -4.0)
     high: tuple[float, float, float] = (4.0, 3.0, 4.0)
 
     def holding(self, eye: F64) -> Extent:
-        """Return this room, or a larger one that holds the camera position `eye` (3,).
+        """Return this room if it contains a camera; otherwise a larger room that does.
 
-        Walls and ceiling are then at least MARGIN_M beyond it.
+        Walls and ceiling have at least a distance of MARGIN_M from the camera.
+
+        `eye`: position of the camera (3,), metres.
         """
         low = (min(self.low[0], eye[0] - MARGIN_M), self.low[1], min(self.low[2], eye[2] - MARGIN_M))
         high = tuple(max(side, float(at) + MARGIN_M) for side, at in zip(self.high, eye, strict=True))
@@ -72,8 +74,12 @@ class Extent:
 class RoomMesh:
     """The mesh of the room.
 
-    `vertices` (N,8) float32: position, uv, light. `floor`, `boards` and `paint` (M,3) uint32: triangles facing inwards.
-    `boards` are the parts of the walls with the skirting board and its shade; `paint` is all that is only painted.
+    All triangles face inwards; they are indices of vertices (M,3) uint32.
+
+    `vertices`: position (3), uv (2), light (3) of each vertex (N,8) float32.
+    `floor`: triangles of the floor.
+    `boards`: triangles of the walls with the skirting board and its shade.
+    `paint`: triangles of the walls and the ceiling that are only painted.
     """
 
     vertices: F32
@@ -83,7 +89,7 @@ class RoomMesh:
 
 
 def room_mesh(extent: Extent) -> RoomMesh:
-    """Return the six sides of `extent`, light baked per vertex: dim corners, brighter towards the windows (-x, +z)."""
+    """Return the mesh of a room. Its baked light is dim in corners and brighter towards the windows (-x, +z)."""
     low, high = np.array(extent.low), np.array(extent.high)
     sides = [_side(low, high, axis, end) for axis in (1, 0, 2) for end in (0, 1)]
     count = GRID.size**2
@@ -94,9 +100,9 @@ def room_mesh(extent: Extent) -> RoomMesh:
 
 
 def room_textures() -> tuple[U8, U8, U8]:
-    """Return the textures of floor, boards and paint.
+    """Return the textures of (floor, boards, paint).
 
-    They are cached, because their noise takes a good part of a second.
+    They are cached, because computing their noise takes a good part of a second.
     """
     made = {"floor": floor_texture, "boards": wall_texture, "paint": paint_texture}
     stored = cached_arrays(VERSION, (), lambda: {name: make() for name, make in made.items()})
@@ -104,7 +110,7 @@ def room_textures() -> tuple[U8, U8, U8]:
 
 
 def floor_texture() -> U8:
-    """Return planks of oak, (1024, 1024, 4) uint8 sRGB, repeating in both directions."""
+    """Return a texture of oak planks (1024,1024,4), uint8 sRGB, which repeats in both directions."""
     rng = np.random.default_rng(SEED)
     row, column = np.indices((FLOOR_SIDE, FLOOR_SIDE)) / FLOOR_SIDE
     plank = np.floor(column * PLANKS).astype(int)
@@ -123,7 +129,7 @@ def floor_texture() -> U8:
 
 
 def wall_texture() -> U8:
-    """Return a painted wall with a skirting board, (1024, 256, 4) uint8 sRGB; row 0 is the floor, u repeats."""
+    """Return a texture of a painted wall with a skirting board (1024,256,4), uint8 sRGB; row 0 is at the floor."""
     height = (np.arange(WALL_SHAPE[0]) + 0.5) / WALL_SHAPE[0] * WALL_TEXTURE_M
     board = np.array([243, 241, 236]) * (1 - 0.25 * np.clip((height - SKIRTING_M + 0.012) / 0.012, 0, 1))[:, None]
     board[height < 0.012] *= 0.6
@@ -133,9 +139,9 @@ def wall_texture() -> U8:
 
 
 def paint_texture() -> U8:
-    """Return the wall's paint alone, (512, 128, 4) uint8 sRGB, repeating in both directions.
+    """Return a texture of the wall's paint (512,128,4), uint8 sRGB, which repeats in both directions.
 
-    Half of the wall's resolution is enough for paint that is read texel by texel.
+    Half of the wall's resolution is enough for paint, which is read without interpolation.
     """
     rows, columns = WALL_SHAPE
     return _bytes(_paint().reshape(rows // 2, 2, columns // 2, 2, 3).mean(axis=(1, 3)))
@@ -187,9 +193,9 @@ def _triangles(turned: bool) -> NDArray[np.int64]:
 
 
 def _noise(rng: np.random.Generator, shape: tuple[int, int], length: tuple[float, float]) -> F64:
-    """Return periodic noise of mean 0 and deviation 1.
+    """Return periodic noise of `shape` with mean 0 and standard deviation 1.
 
-    `length`: Gaussian correlation lengths, across columns and rows.
+    `length`: Gaussian correlation lengths in texels, along columns and along rows.
     """
     frequency = [np.fft.fftfreq(n)[:, None] if k == 0 else np.fft.fftfreq(n)[None] for k, n in enumerate(shape)]
     spread = (frequency[0] * length[1]) ** 2 + (frequency[1] * length[0]) ** 2
@@ -208,10 +214,10 @@ WHOLE: F32 = np.array([[0, 0, 1, 1]], np.float32)
 
 
 def spans(shown: Mask, margin: int) -> F32:
-    """Return the parts (N,4) float32 to draw: left, top, right, bottom of each, as shares of the picture's sides.
+    """Return the parts of a picture to draw: left, top, right, bottom of each, as shares of its sides (N,4) float32.
 
-    `shown`: pixels (h,w) of the picture that are not transparent. `margin`: number of texels that are read beside a
-    pixel's middle.
+    `shown`: mask of the pixels that are not transparent (h,w).
+    `margin`: number of texels that a screen pixel reads on each side of its middle.
     """
     height, width = shown.shape
     has_any = shown.any(axis=1)
@@ -227,8 +233,8 @@ def spans(shown: Mask, margin: int) -> F32:
     return np.asarray(edges / (width, height, width, height), np.float32)
 
 
-# joint, radius on the floor in metres, strength there (at most 0.72, see `shadow.frag`), height in metres over which it
-# fades to 1/e
+# (joint, radius in metres at height 0, strength at height 0, at most 0.72 (`shadow.frag`), height in metres at which the
+# strength has fallen to 1/e)
 DISCS = (
     ("left_ankle", 0.15, 0.65, 0.18),
     ("right_ankle", 0.15, 0.65, 0.18),
@@ -250,7 +256,11 @@ _RADIUS, _STRENGTH, _FADE = np.array([numbers for _, *numbers in DISCS]).T
 
 
 def floor_discs(joints: NDArray[np.floating[Any]], rest: F64) -> NDArray[np.float32]:
-    """Return discs (N,4) float32: x, z, radius, strength, for skinning matrices (55,3,4) and rest joints (55,3)."""
+    """Return the contact shadows of a body: x, z, radius in metres, and strength 0 to 1 of each disc (N,4) float32.
+
+    `joints`: skinning matrices (55,3,4), metres, world space.
+    `rest`: rest joints (55,3), metres.
+    """
     matrices = np.asarray(joints, np.float64)[_JOINT]
     place = np.einsum("nij,nj->ni", matrices[..., :3], rest[_JOINT]) + matrices[..., 3]
     height = np.maximum(place[:, 1], 0.0)
@@ -260,26 +270,26 @@ def floor_discs(joints: NDArray[np.floating[Any]], rest: F64) -> NDArray[np.floa
 
 
 MAX_TAPS = 8
-#: Least number of screen pixels at which drawing less saves more time than finding what is transparent takes.
+#: Least number of screen pixels of an avatar for which finding transparent texels takes less time than it saves.
 WORTH_CUTTING_PX = 60_000
 HALF_TEXEL_INWARD = np.array([0.5, 0.5, -0.5, -0.5])
 UNDER_THE_FLOOR = (70, 66, 60)
 
 
 class RoomPainter:
-    """Draws the built-in room, which is made larger when a camera leaves it."""
+    """Draws the built-in room. If a camera leaves the room, the room is made larger."""
 
     def __init__(self, ctx: Any, eyes: Sequence[Floats] = ()) -> None:
         """Make the room.
 
-        `eyes`: places (3,) of cameras that the room holds from the beginning.
+        `eyes`: camera positions (3,), metres, that the room contains from the beginning.
         """
         self._ctx = ctx
         self._program = build_program(ctx, "room.vert", "room.frag")
         floor, boards, paint = room_textures()
         self._textures = [
             _detail(ctx, floor, moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR),
-            # The boards are too smooth to show where levels change, and paint is too smooth to show texels.
+            # The boards are so smooth that no change of levels shows, and the paint so smooth that no texel shows.
             _detail(ctx, boards, moderngl.LINEAR_MIPMAP_NEAREST, moderngl.LINEAR),
             _detail(ctx, paint, moderngl.NEAREST, moderngl.NEAREST),
         ]
@@ -288,7 +298,10 @@ class RoomPainter:
         self._build()
 
     def draw(self, target: Any, view: Floats, projection: Floats) -> None:
-        """Fill `target` with the room as seen by `view` and `projection`; from below, the floor is not drawn."""
+        """Fill `target` with the room; a camera below the floor does not see the floor.
+
+        `view`, `projection`: OpenGL matrices (4,4).
+        """
         grown = self._extent.holding(eye_of(view))
         if grown is not self._extent:
             self._extent = grown
@@ -313,7 +326,7 @@ class RoomPainter:
 
 
 class PicturePainter:
-    """Draws a background picture of the output's size, (h,w,3) uint8."""
+    """Draws a background picture. `shape`: (height, width) of the picture and of the target."""
 
     def __init__(self, ctx: Any, shape: tuple[int, int]) -> None:
         self._ctx = ctx
@@ -322,18 +335,18 @@ class PicturePainter:
         self._texture = ctx.texture(shape[::-1], 3, alignment=1)
 
     def upload(self, picture: U8) -> None:
-        """Write `picture` (h,w,3) to the GPU; `draw` shows it from now on."""
+        """Write `picture` (h,w,3) uint8 to the GPU; `draw` draws it from now on."""
         upload(self._ctx, self._texture, picture, alignment=1)
 
     def draw(self) -> None:
-        """Copy the picture to the target in use."""
+        """Copy the picture to the current target."""
         self._ctx.enable_only(moderngl.NOTHING)
         self._texture.use(0)
         self._screen.render(vertices=3)
 
 
 class ShadowPainter:
-    """Draws contact shadows: up to `blobs` soft discs on the floor."""
+    """Draws contact shadows, soft discs on the floor. `blobs`: largest number of discs."""
 
     def __init__(self, ctx: Any, blobs: int) -> None:
         self._ctx, self._count = ctx, blobs
@@ -341,9 +354,10 @@ class ShadowPainter:
         self._discs = ctx.vertex_array(self._program, [])
 
     def draw(self, view: Floats, projection: Floats, blobs: F32) -> None:
-        """Darken the target in use.
+        """Darken the current target with discs.
 
-        `blobs` (N,4) float32: x, z, radius in metres, strength 0 to 0.72.
+        `view`, `projection`: OpenGL matrices (4,4).
+        `blobs`: x, z, radius in metres, and strength 0 to 0.72 of each disc (N,4) float32.
         """
         if not len(blobs) or eye_of(view)[1] <= 0:
             return
@@ -359,7 +373,10 @@ class ShadowPainter:
 
 
 class AvatarPainter:
-    """Draws the network's picture: uploaded once a frame, then drawn avatar by avatar at their crop rectangles."""
+    """Draws the network's picture, which is uploaded once a frame, avatar by avatar into their crop rectangles.
+
+    `shapes`: shapes (height, width) of the pictures that may come.
+    """
 
     def __init__(self, ctx: Any, shapes: list[tuple[int, int]]) -> None:
         self._ctx = ctx
@@ -372,7 +389,11 @@ class AvatarPainter:
         self._pictures = {shape: self._picture(shape) for shape in shapes}
 
     def upload(self, shape: tuple[int, int], image: U8) -> None:
-        """Write `image` (h * w * 4,) uint8, sRGB with straight alpha, to the GPU as the picture of `shape`."""
+        """Write a picture to the GPU.
+
+        `shape`: (height, width) of the picture.
+        `image`: its bytes (h * w * 4,) uint8, sRGB with straight alpha.
+        """
         self._shown = image.reshape(*shape, 4)[:, :, 3] > 0
         straight, target, _ = self._pictures[shape]
         upload(self._ctx, straight, image)
@@ -388,9 +409,9 @@ class AvatarPainter:
         """Blend one avatar's part of the picture over `target`.
 
         `target`: framebuffer.
-        `shape`: (height, width) of the picture that was uploaded.
-        `rect`: rectangle of the avatar on the screen, x0, y0, x1, y1 in normalised device coordinates.
-        `tensor_rect`: its part of the picture: top, left, height, width.
+        `shape`: (height, width) of the uploaded picture.
+        `rect`: crop rectangle of the avatar, x0, y0, x1, y1 in NDC.
+        `tensor_rect`: the avatar's part of the picture: top, left, height, width in pixels.
         """
         top, left, height, width = tensor_rect
         rows, columns = (rect[3] - rect[1]) / 2 * target.height, (rect[2] - rect[0]) / 2 * target.width
@@ -423,9 +444,10 @@ class AvatarPainter:
 
 
 def taps_of(cell: tuple[int, int], pixels: tuple[float, float]) -> int:
-    """Return the number of reads along a side whose mean is a screen pixel, when `cell` of a picture fills `pixels`.
+    """Return the number of texels along a side that are averaged for a screen pixel.
 
-    Both are (height, width).
+    `cell`: (height, width) of the part of the picture that is drawn.
+    `pixels`: (height, width) on the screen.
     """
     return int(np.clip(np.ceil(_density(cell, pixels) - 0.25), 1, MAX_TAPS))
 
@@ -441,11 +463,11 @@ def _detail(ctx: Any, image: U8, minify: int, magnify: int) -> Any:
     return texture
 
 
-UPRIGHT = 0.9  # a plane whose unit normal has |y| above this is aligned with the world's x, any other with its y
+UPRIGHT = 0.9  # a plane whose unit normal has a larger |y| is aligned with the world's x axis, others with its y axis
 
 
 class PlanePainter:
-    """Draws `planes` (at least one) into the target in use."""
+    """Draws planes into the current target. `planes`: at least one."""
 
     def __init__(self, ctx: Any, planes: Sequence[PlaneSpec]) -> None:
         self._ctx, self._count = ctx, len(planes)
@@ -457,7 +479,7 @@ class PlanePainter:
         self._program["along"].write(np.array([along for _, along in sides], np.float32))
 
     def draw(self, view: Floats, projection: Floats) -> None:
-        """Blend the planes over the target, as seen by `view` and `projection`."""
+        """Blend the planes over the current target. `view`, `projection`: OpenGL matrices (4,4)."""
         self._ctx.enable_only(moderngl.BLEND)
         self._ctx.blend_func = moderngl.SRC_ALPHA, moderngl.ONE_MINUS_SRC_ALPHA
         upload(self._ctx, self._program["clip_from_world"], target_clip(view, projection))
@@ -466,7 +488,7 @@ class PlanePainter:
 
 
 def half_sides(plane: PlaneSpec) -> tuple[F32, F32]:
-    """Return half of each side of `plane` as a vector (3,), metres.
+    """Return the two half sides of `plane` as vectors (3,), metres: half its width, and half its depth.
 
     The vectors are at right angles to each other and to the normal.
     """

@@ -1,15 +1,15 @@
-"""OpenGL as the GPU unit uses it: the context, calls that moderngl lacks, programs, copies and camera matrices.
+"""OpenGL for the GPU unit: the context, calls that moderngl lacks, programs, copies and camera matrices.
 
-There is one off-screen EGL context per process, hardware or software. No other file creates one, and the calling thread
-must have it current. Each shader is a file of `trilane.shaders`; Python only adds `#define NAME VALUE` lines after its
-`#version`.
+There is one off-screen EGL context per process, on hardware or in software. Only this file creates a context, and it
+must be current on the calling thread. Each shader is a file of `trilane.shaders`; Python only adds `#define NAME VALUE`
+lines after its `#version`.
 
-Every copy of a frame between the CPU's memory and the GPU's is made by a function here, and counted as it is made. A
-context has one counter, because the stages that draw with it do one job at a time. Software drivers copy within the
-same memory, and these copies count too.
+Functions of this file make all copies of a frame's data between the CPU's memory and the GPU's, and count their bytes.
+A context has one counter, because the stages that draw with it do one job at a time. A software driver copies within
+the same memory, and such copies count too.
 
-A target's first row in memory is the top row of the image, so y is flipped in the projection by `target_clip`, and
-nowhere else.
+A target's first row in memory is the top row of the image. Therefore `target_clip` flips y in the projection; no other
+code flips it.
 """
 
 from __future__ import annotations
@@ -35,17 +35,14 @@ from trilane.errors import EGL_LINE, MissingPartError, TrilaneError, UnitLostErr
 from trilane.pipeline.memory import ByteCounter
 
 REQUIRED_VERSION = 330
-CONTEXT = "OpenGL context"  # key of the context among what the stages of the unit share
+CONTEXT = "OpenGL context"  # key of the context in `UnitContext.shared`
 LIBRARY = "libEGL.so.1"  # eglGetProcAddress gives every OpenGL function, so libGL is not needed
 SOFTWARE_RENDERERS = ("llvmpipe", "softpipe", "swr", "swiftshader", "swrast")
 
 
 @dataclass(frozen=True)
 class Driver:
-    """The OpenGL driver.
-
-    `hardware`: False for a renderer that runs on the CPU.
-    """
+    """The OpenGL driver. `hardware`: False for a renderer that runs on the CPU."""
 
     vendor: str
     renderer: str
@@ -54,15 +51,17 @@ class Driver:
 
 
 def open_context(threads: int | None = None) -> Any:
-    """Open an off-screen `moderngl.Context` of OpenGL 3.3 or later, current on the calling thread.
+    """Return a new off-screen `moderngl.Context` of OpenGL 3.3 or later, current on the calling thread.
 
-    `threads`: number of CPU threads that a software driver may use, the calling thread included; Mesa reads it once,
-    when the process makes its first context. Raises MissingPartError when no context can be made.
+    `threads`: number of CPU threads that a software driver may use, including the calling thread. Mesa reads it only
+    when the process makes its first context.
+
+    Raises MissingPartError if no context can be made.
     """
     if threads is not None:
         os.environ["LP_NUM_THREADS"] = str(threads if threads > 1 else 0)
     if "torch" in sys.modules:
-        # PyTorch's compiler and Mesa each bring LLVM. If Mesa's comes first, the compiler ends the process (SIGSEGV).
+        # PyTorch's compiler and Mesa each load an LLVM. If Mesa's is first, the compiler ends the process (SIGSEGV).
         with suppress(ModuleNotFoundError):
             import_module("triton")
     try:
@@ -73,9 +72,9 @@ def open_context(threads: int | None = None) -> Any:
 
 
 def check(ctx: Any) -> None:
-    """Raise UnitLostError when the context was lost, TrilaneError when a call since the last check failed.
+    """Raise UnitLostError if the context was lost, TrilaneError if a call since the last check failed.
 
-    Without a current context OpenGL calls do nothing and report no error, so an old tensor would look like a new one.
+    Without a current context, OpenGL calls do nothing and report no error, so an old tensor would pass for a new one.
     """
     error = ctx.error if current() else "GL_CONTEXT_LOST"
     if error == "GL_CONTEXT_LOST":
@@ -86,7 +85,7 @@ def check(ctx: Any) -> None:
 
 @contextmanager
 def checked(ctx: Any) -> Iterator[None]:
-    """Run the block, then `check`. An exception raised while there is no current context becomes UnitLostError."""
+    """Call `check` after the `with` block. An exception in it without a current context becomes UnitLostError."""
     try:
         yield
     except Exception as error:
@@ -109,7 +108,7 @@ def _current_context() -> Any:
 
 
 def describe(ctx: Any) -> Driver:
-    """Return the driver of `ctx`, by the names it gives itself."""
+    """Return the driver of `ctx`, from its own strings."""
     info = ctx.info
     renderer = str(info["GL_RENDERER"])
     software = any(name in renderer.lower() for name in SOFTWARE_RENDERERS)
@@ -140,7 +139,7 @@ _SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
 
 @cache
 def function(name: str) -> Callable[..., Any]:
-    """Return OpenGL function `name` of `_SIGNATURES`. Raises MissingPartError when the driver lacks it."""
+    """Return the OpenGL function `name`, a key of `_SIGNATURES`. Raises MissingPartError if the driver lacks it."""
     library = ctypes.CDLL(LIBRARY)
     library.eglGetProcAddress.restype = ctypes.c_void_p
     address = library.eglGetProcAddress(name.encode())
@@ -152,19 +151,22 @@ def function(name: str) -> Callable[..., Any]:
 
 
 def clear_unsigned(value: tuple[int, int, int, int]) -> None:
-    """Fill colour attachment 0 of the bound framebuffer, which has an unsigned integer format, with `value`."""
+    """Fill colour attachment 0 of the bound framebuffer with `value`; it must have an unsigned integer format."""
     function("glClearBufferuiv")(COLOR, 0, (ctypes.c_uint * 4)(*value))
 
 
 def clear_depth() -> None:
-    """Fill the bound framebuffer's depth with 1, the greatest depth."""
+    """Fill the bound framebuffer's depth with 1, the largest depth."""
     function("glClearBufferfv")(DEPTH, 0, (ctypes.c_float * 1)(1.0))
 
 
 def write_level(texture: int, level: int, size: tuple[int, int, int], pixels: bytes) -> None:
-    """Write half-float RGBA `pixels` to a `level` of array texture `texture`.
+    """Write one level of an array texture.
 
-    `size`: width, height and layers of the level.
+    `texture`: OpenGL name of the texture.
+    `level`: number of the level.
+    `size`: (width, height, layers) of the level.
+    `pixels`: FP16 RGBA numbers, layer by layer.
     """
     function("glBindTexture")(TEXTURE_2D_ARRAY, texture)
     function("glPixelStorei")(UNPACK_ALIGNMENT, 1)
@@ -173,12 +175,12 @@ def write_level(texture: int, level: int, size: tuple[int, int, int], pixels: by
 
 
 def fence() -> int:
-    """Return a fence after every command issued so far. It must be passed to `wait_fence` exactly once."""
+    """Return a fence after all commands so far. Pass it to `wait_fence` exactly once."""
     return int(function("glFenceSync")(SYNC_GPU_COMMANDS_COMPLETE, 0))
 
 
 def wait_fence(sync: int, timeout_ns: int = 1_000_000_000) -> None:
-    """Wait for fence `sync` and delete it. Raises TrilaneError when the GPU does not reach it within `timeout_ns`."""
+    """Wait for the fence `sync` and delete it. Raises TrilaneError if the GPU does not reach it within `timeout_ns`."""
     result = function("glClientWaitSync")(sync, SYNC_FLUSH_COMMANDS, timeout_ns)
     function("glDeleteSync")(sync)
     if result in (TIMEOUT_EXPIRED, WAIT_FAILED):
@@ -187,7 +189,7 @@ def wait_fence(sync: int, timeout_ns: int = 1_000_000_000) -> None:
 
 @contextmanager
 def srgb_target() -> Iterator[None]:
-    """Draw inside the block with blending in linear light when the target is sRGB; outside, bytes are not converted."""
+    """Blend in linear light inside the `with` block, if the target is sRGB; outside, bytes are not converted."""
     function("glEnable")(FRAMEBUFFER_SRGB)
     try:
         yield
@@ -196,7 +198,7 @@ def srgb_target() -> Iterator[None]:
 
 
 def shader_source(name: str | Path, **defines: int | str) -> str:
-    """Return the text of shader `name`, a file of `trilane.shaders` or a path, with the definitions inserted."""
+    """Return the text of a shader with definitions. `name`: file of `trilane.shaders`, or a path."""
     file = name if isinstance(name, Path) else files("trilane.shaders") / name
     text = file.read_text(encoding="utf-8")
     version, _, body = text.partition("\n")
@@ -205,11 +207,12 @@ def shader_source(name: str | Path, **defines: int | str) -> str:
 
 
 def build_program(ctx: Any, vertex: str | Path, fragment: str | Path, **defines: int | str) -> Any:
-    """Build and link a program of two shaders.
+    """Return a linked program of two shaders.
 
     `ctx`: OpenGL context.
     `vertex`, `fragment`: files of `trilane.shaders`, or paths.
-    `defines`: preprocessor definitions of both.
+    `defines`: preprocessor definitions of both shaders.
+
     Raises TrilaneError with the compiler's log.
     """
     try:
@@ -219,14 +222,14 @@ def build_program(ctx: Any, vertex: str | Path, fragment: str | Path, **defines:
 
 
 def set_uniforms(program: Any, values: dict[str, Any]) -> None:
-    """Set the uniforms of `values`; those that the shader's compiler removed are skipped."""
+    """Set uniforms by name; a uniform that the shader's compiler removed is ignored."""
     for name, value in values.items():
         if name in program:
             program[name].value = value
 
 
 def counter_of(ctx: Any) -> ByteCounter:
-    """Return the counter of context `ctx`, made on first use."""
+    """Return the byte counter of the context `ctx`, which is made on first use."""
     if ctx.extra is None:
         ctx.extra = ByteCounter()
     counter: ByteCounter = ctx.extra
@@ -234,8 +237,10 @@ def counter_of(ctx: Any) -> ByteCounter:
 
 
 def upload(ctx: Any, target: Any, data: Any, **how: Any) -> None:
-    """Write `data`, bytes or a contiguous array, to `target`: a buffer, a texture, or a uniform that is an array.
+    """Write data to the GPU, and count its bytes.
 
+    `target`: buffer, texture, or uniform that is an array.
+    `data`: bytes or a contiguous array.
     `how`: further arguments of `target.write`.
     """
     target.write(data, **how)
@@ -243,13 +248,13 @@ def upload(ctx: Any, target: Any, data: Any, **how: Any) -> None:
 
 
 def uploaded_buffer(ctx: Any, data: bytes) -> Any:
-    """Return a new buffer that holds `data`."""
+    """Return a new buffer with the content `data`, and count its bytes."""
     counter_of(ctx).uploaded += len(data)
     return ctx.buffer(data)
 
 
 def read_into(ctx: Any, framebuffer: Any, pixels: U8, *box: Any, **how: Any) -> None:
-    """Copy `framebuffer` into `pixels`, which it fills.
+    """Copy `framebuffer` into the whole array `pixels`, and count its bytes.
 
     `box`, `how`: further arguments of `Framebuffer.read_into`.
     """
@@ -261,15 +266,17 @@ FLIP_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 
 
 def target_clip(view: Floats, projection: Floats) -> bytes:
-    """Return the matrix `clip_from_world` of a target whose first row is the top one.
+    """Return the matrix `clip_from_world` of a target whose first row is the top row, as bytes of a GLSL `mat4`.
 
-    It is column-major float32 bytes of a `mat4`. `view`, `projection`: OpenGL matrices (4,4).
+    The bytes are column-major float32.
+
+    `view`, `projection`: OpenGL matrices (4,4).
     """
     clip = FLIP_Y @ np.asarray(projection, np.float64) @ np.asarray(view, np.float64)
     return clip.T.astype(np.float32).tobytes()
 
 
 def eye_of(view: Floats) -> NDArray[np.float64]:
-    """Return the position (3,) of the camera in the world, metres; `view` (4,4) is a rotation and a translation."""
+    """Return the position (3,) of the camera, metres, world space. `view`: matrix (4,4), rotation and translation."""
     rotation = np.asarray(view, np.float64)[:3, :3]
     return -rotation.T @ np.asarray(view, np.float64)[:3, 3]

@@ -1,10 +1,11 @@
-"""The raster stage, from a pose packet to the network's input tensor, and the packed pass that draws it.
+"""The raster stage, which draws the network's input tensor from a pose packet, and the packed pass that it uses.
 
-Rule of the stage: the tensor is written straight into the output slot; a frame with nothing to show costs one fill.
+Rule of the stage: the tensor is written directly to the output slot; a frame with nobody in view costs one fill.
 
-The packed pass draws a posed mesh with its neural texture as the tensor, in bytes. They leave the GPU in tensor order
-(NHWC, row 0 on top) and already have the network's scale and zero point. The neural texture is an array texture of four
-channels a layer. Its texels are FP16; what FP16 cannot hold is refused before anything is uploaded.
+The packed pass draws a posed mesh with its neural texture as bytes of the tensor. The bytes leave the GPU in tensor
+order (NHWC, row 0 on top), with the network's scale and zero point already applied. The neural texture is an array
+texture with four channels in each layer. Its texels are FP16; a texture with a number beyond FP16 is refused before
+anything is uploaded.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from trilane.stages.gpu.opengl import (
 from trilane.stages.gpu.skinned_mesh import BodyPose, Mesh, MeshDraw, PosedMesh, SkinnedMesh, avatar_mesh
 from trilane.transport.packets import Packet
 
-#: How the neural texture is read: the filter when it is shrunk, and the greatest anisotropy, which a driver may limit.
+#: (minifying filter, largest anisotropy) of the neural texture, by the scene's word; a driver may limit the anisotropy.
 FILTERS = {
     "linear": (moderngl.LINEAR, 1.0),
     "mipmap": (moderngl.LINEAR_MIPMAP_LINEAR, 1.0),
@@ -50,14 +51,15 @@ FILTERS = {
 }
 FP16_MAX = float(np.finfo(np.float16).max)
 HALF_EXPONENTS = 16  # FP16 numbers are below 2**16
-HALF_BIAS, FLOAT_BIAS = 15, 127  # what is added to the exponent of a number
+HALF_BIAS, FLOAT_BIAS = 15, 127  # biases of the exponents of FP16 and FP32
 
 
 def texture_array(ctx: Any, texture: Floats, filtering: str = "linear", levels: Sequence[Floats] = ()) -> Any:
     """Return an FP16 array texture of C/4 RGBA layers from `texture` (H,W,C), clamped at its edge.
 
-    `filtering`: one of FILTERS. `levels`: smaller levels that were learnt. They replace the driver's means, and no
-    smaller level is read. Therefore `linear` becomes `mipmap`.
+    `filtering`: one of FILTERS.
+    `levels`: smaller levels that were learnt, each (H,W,C). They replace the levels that the driver computes, and no
+    smaller level is read. With them, `linear` becomes `mipmap`.
     """
     height, width, channels = texture.shape
     array = ctx.texture_array((width, height, channels // 4), 4, _pixels(texture), dtype="f2")
@@ -74,10 +76,10 @@ def texture_array(ctx: Any, texture: Floats, filtering: str = "linear", levels: 
 
 
 def texture_words(ctx: Any, texture: Floats) -> tuple[Any, float]:
-    """Return a texture of words with the FP16 numbers of `texture` (H,W,C), as `packed_tensor.frag` reads it deferred.
+    """Return (texture of 32-bit words with the FP16 numbers of `texture` (H,W,C), uniform `unit`) for a deferred pass.
 
-    Also return its uniform `unit`. The numbers are first multiplied by a power of two, as large as FP16 allows, so that
-    small numbers are not subnormal. The shader turns the bits of such a number into a float, and multiplies by `unit`.
+    The numbers are first multiplied by the largest power of two that FP16 allows, so that small numbers are not
+    subnormal. `packed_tensor.frag` turns the bits of such a number into a float, and multiplies it by `unit`.
     """
     height, width, channels = texture.shape
     halves = texture.astype(np.float16)
@@ -93,7 +95,10 @@ def texture_words(ctx: Any, texture: Floats) -> tuple[Any, float]:
 
 
 def filter_of(asked: str, learnt: bool) -> str:
-    """Return the filter of a texture when the scene names the filter `asked`; `learnt` levels are always read."""
+    """Return the filter of a texture. `asked`: filter of the scene. `learnt`: whether it has learnt smaller levels.
+
+    Learnt levels are always read, so `linear` becomes `mipmap` with them.
+    """
     return "mipmap" if learnt and asked == "linear" else asked
 
 
@@ -114,8 +119,8 @@ def check_texture(texture: Floats, channels: int) -> None:
 
 CHANNELS = (4, 8, 12, 16)
 WORD_TYPES = {1: "uint", 2: "uvec2", 3: "uvec4", 4: "uvec4"}
-#: Number of 32-bit words in a target's pixel, by the tensor's. OpenGL does not promise drawable targets of three words,
-#: so those have four, and the fourth is not read back.
+#: Number of 32-bit words in a target's pixel, by the number of words in a tensor's pixel. OpenGL does not guarantee
+#: targets of three words, so such a target has four words, and the fourth is not read back.
 TARGET_WORDS = {1: 1, 2: 2, 3: 4, 4: 4}
 
 
@@ -123,8 +128,10 @@ TARGET_WORDS = {1: 1, 2: 2, 3: 4, 4: 4}
 class Placement:
     """One avatar in a tensor.
 
-    `rect`: top, left, height, width in tensor pixels. `clip_projection` (4,4): projection of its crop. `joints`,
-    `feature`, `vertices`: its pose, as in `BodyPose`. `mesh`: number of the mesh that is drawn.
+    `joints`, `feature`, `vertices`: pose, as in `BodyPose`.
+    `clip_projection`: projection of the avatar's crop rectangle (4,4).
+    `rect`: (top, left, height, width) in tensor pixels.
+    `mesh`: number of the mesh that is drawn.
     """
 
     joints: F32
@@ -136,7 +143,7 @@ class Placement:
 
     @property
     def pose(self) -> BodyPose:
-        """The pose, as the mesh takes it."""
+        """The pose in the form that a mesh takes."""
         return BodyPose(self.joints, self.feature, self.vertices)
 
 
@@ -144,8 +151,10 @@ class Placement:
 class Target:
     """A target of the pass.
 
-    `words`: framebuffer of the tensor. `uv_image`, `uv`: image of u and v in a deferred pass, and its framebuffer; they
-    share one depth. `blank`: bytes of an empty tensor, which software drivers copy faster than they clear a target.
+    `words`: framebuffer of the tensor.
+    `uv_image`: texture of u and v in a deferred pass.
+    `uv`: framebuffer of `uv_image`, with the same depth buffer as `words`.
+    `blank`: bytes of an empty tensor, which software drivers copy faster than they clear a target.
     """
 
     words: Any
@@ -163,12 +172,13 @@ class PackedPass:
         """Check the settings; targets are made on first use.
 
         `ctx`: OpenGL context.
-        `channels`: channels of the tensors and textures, one of `CHANNELS`.
+        `channels`: number of channels of tensors and textures, one of `CHANNELS`.
         `quantisation`: scale and zero point of the bytes.
-        `deferred`: whether to draw u and v of every pixel first, then read the texture once for each visible pixel. The
-        bytes are the same. It is faster on software drivers, which shade whole blocks of pixels for each small
+        `deferred`: whether to draw u and v of every pixel first, and then read the texture once for each visible pixel.
+        The bytes are the same. This is faster on software drivers, which shade whole blocks of pixels for each small
         triangle.
-        `filtering`: a name of `FILTERS`. A deferred pass has no derivatives of u and v, so it takes only `linear`.
+        `filtering`: one of FILTERS. A deferred pass has no derivatives of u and v, so it takes only `linear`.
+
         Raises BadInputError.
         """
         if filtering not in FILTERS:
@@ -188,7 +198,7 @@ class PackedPass:
 
     @property
     def uniforms(self) -> dict[str, float]:
-        """Uniforms of `packed_tensor.frag`."""
+        """The uniforms of `packed_tensor.frag`."""
         encoding = self.quantisation
         return {"neural": 0, "uv_image": 1, "scale": encoding.scale, "zero_point": float(encoding.zero_point)}
 
@@ -199,7 +209,7 @@ class PackedPass:
         return self._targets[shape]
 
     def begin(self, shape: Shape) -> Target:
-        """Fill the target of `shape` with the zero point and the greatest depth, and return it."""
+        """Fill the target of `shape` (height, width) with the zero point and the largest depth, and return it."""
         target = self.target(shape)
         target.words.use()
         target.words.viewport = (0, 0, shape[1], shape[0])
@@ -212,7 +222,7 @@ class PackedPass:
         return target
 
     def read_into(self, shape: Shape, tensor: U8) -> None:
-        """Copy the target of `shape` to `tensor`, (h * w * channels,) uint8."""
+        """Copy the target of `shape` (height, width) to `tensor` (h * w * channels,) uint8."""
         box = (0, 0, shape[1], shape[0])
         words = self.target(shape).words
         read_into(self.ctx, words, tensor, box, components=self.layers, dtype="u4", alignment=1)
@@ -233,7 +243,7 @@ class PackedPass:
 
 
 class PackedAvatar:
-    """One avatar's meshes and texture, which a `PackedPass` draws."""
+    """The meshes and the texture of one avatar, which a `PackedPass` draws."""
 
     def __init__(
         self,
@@ -243,11 +253,14 @@ class PackedAvatar:
         levels: Floats | None = None,
         coarser: Sequence[Mesh] = (),
     ) -> None:
-        """Upload `texture` (H,W,C) and its smaller `levels`, which a deferred pass cannot read.
+        """Upload meshes and texture.
 
-        `mesh`, `coarser`: the whole mesh, number 0, and its levels.
+        `mesh`: whole mesh, number 0.
+        `texture`: neural texture (H,W,C).
+        `levels`: packed smaller levels of the texture, which a deferred pass cannot read; None without any.
+        `coarser`: levels of the mesh, numbers 1, 2, ...
 
-        Raises BadInputError when FP16 cannot hold a texture, or C is not the pass's number of channels.
+        Raises BadInputError if a texture has a number beyond FP16, or C is not the pass's number of channels.
         """
         check_texture(texture, packed.channels)
         smaller = split_levels(levels, texture.shape[1])
@@ -271,11 +284,11 @@ class PackedAvatar:
                 draw.set(packed.uniforms)
 
     def draw(self, target: Target, view: Floats, placement: Placement) -> None:
-        """Draw into `target`, which `PackedPass.begin` has cleared.
+        """Draw the avatar into a target.
 
-        `target`: target of the pass.
-        `view`: matrix (4,4) of the camera.
-        `placement`: pose, crop and rectangle of the avatar.
+        `target`: target that `PackedPass.begin` has cleared.
+        `view`: matrix (4,4) from world to camera.
+        `placement`: pose and place of the avatar in the tensor.
         """
         top, left, height, width = placement.rect
         box = (left, top, width, height)
@@ -302,9 +315,11 @@ class PackedAvatar:
 class RasterStage:
     """The raster stage.
 
-    `passes`: draws the tensors of each network. `avatars[i]`: draws the scene's avatar i. `shapes`: tensor shapes
-    (height, width) that may come. `posed_vertices`: number of skinned vertices of each avatar in the input slot; empty
-    when the GPU skins. `painters`: network of each avatar; empty where one network paints all.
+    `passes`: pass that draws the tensors of each network, by the network's number.
+    `avatars`: meshes and texture of each avatar of the scene, by the avatar's number.
+    `shapes`: tensor shapes (height, width) that may come.
+    `posed_vertices`: number of skinned vertices of each avatar in the input slot; empty if the GPU unit skins.
+    `painters`: number of the network that paints each avatar; empty if one network paints all.
     """
 
     def __init__(
@@ -329,12 +344,12 @@ class RasterStage:
             packed.target(shape)
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
-        """Write the tensor of frame `frame`, (h,w,C) uint8, of each network that paints somebody in view.
+        """Write the tensor (h,w,C) uint8 of each network: drawn if it paints somebody in view, otherwise empty.
 
-        Figures: the bytes moved. The least bytes: for each avatar in view the pose that its mesh takes, and the
-        tensors.
+        The metrics are the bytes moved. The least bytes are the pose of the drawn mesh of each visible avatar, and the
+        drawn tensors.
 
-        Raises TrilaneError when a joint is not a finite number, UnitLostError with the context.
+        Raises TrilaneError if a joint is not a finite number, UnitLostError if the context was lost.
         """
         if slot_in is None or slot_out is None:
             raise ValueError("raster needs an input and an output slot")
@@ -364,7 +379,7 @@ class RasterStage:
         return moved.figures()
 
     def close(self) -> None:
-        """Let go of the slots; the context goes with the process."""
+        """Drop the views of the slots; the context ends with the process."""
         self._vertices = []
 
 
@@ -389,7 +404,7 @@ def _refuse_nan(frame: int, avatars: Sequence[Any]) -> None:
 def build(settings: Mapping[str, Any], unit: UnitContext) -> RasterStage:
     """Build the raster stage of the configuration in `settings`. Raises BadInputError, MissingPartError.
 
-    The driver's kind only decides how the packed pass is drawn.
+    The kind of the driver, hardware or software, decides only whether the pass is deferred.
     """
     config = RunConfig.model_validate(settings["config"])
     ctx = unit.shared(CONTEXT, lambda: open_context(unit.settings.threads))
@@ -415,9 +430,10 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> RasterStage:
 
 
 def _meshes(ctx: Any, bodies: Sequence[ShapedBody], config: RunConfig) -> list[Mesh]:
-    """Return the meshes of a whole body and of its levels. A level of a mesh that encloses a volume does so too.
+    """Return the meshes of a whole body and of its levels.
 
-    Where a level folds over itself, the triangles that face away lie behind others, so it is drawn without them.
+    If the whole mesh encloses a volume, each level counts as closed. A level may fold over itself, but its triangles
+    that face away are behind others, so it is drawn without them.
     """
     whole, *coarser = (avatar_mesh(body) for body in bodies)
     arrays = [whole, *(replace(level, closed=whole.closed) for level in coarser)]

@@ -1,10 +1,12 @@
 """A body's mesh on the GPU: its arrays, its vertex and index buffers, the pose of a frame, and how it is drawn.
 
-There is one vertex per distinct (position, UV) corner, and triangles are ordered so that neighbours are drawn together.
-A mesh implements `Mesh`: the vertex shader skins the vertices of a `SkinnedMesh`, the CPU unit those of a `PosedMesh`.
+There is one vertex for each distinct pair of a position and a UV. Triangles are ordered so that neighbours are drawn
+together. There are two kinds of `Mesh`: the vertex shader skins the vertices of a `SkinnedMesh`; the CPU unit has
+already skinned the vertices of a `PosedMesh`.
 
-A triangle whose corners have at most four weights is skinned with four, and so on. Positions are the same to the last
-bit, because a weight of 0 adds nothing. The number of weights that a body needs is computed once and then cached.
+A triangle whose corners have at most four weights is skinned with four, one with at most eight with eight, any other
+with twelve. This changes no bit of a position, because a weight of 0 adds nothing. The arrays of a body's mesh are
+computed once and then cached.
 """
 
 from __future__ import annotations
@@ -31,12 +33,16 @@ MAX_OPEN = 0.005
 
 @dataclass(frozen=True)
 class MeshArrays:
-    """Per-vertex arrays after the split at UV seams.
+    """The vertices of a mesh after its split at UV seams, and its triangles.
 
-    `position` (N,3): metres, rest pose. `uv` (N,2). `joint` (N,K) uint8 and `weight` (N,K): largest first, rows sum to
-    1. `triangles` (F,3) uint32. `source` (N,) int64: the body's vertex that each row is a copy of. `surface`: arrays
-    `normal` (N,3) and `colour` (N,4) of shaded meshes, else empty. `closed`: whether the triangles enclose a volume, so
-    that those facing away from the camera are never seen from outside.
+    `position`: positions in the rest pose, (N,3), metres.
+    `uv`: texture coordinates, (N,2).
+    `joint`: joint indices, (N,K).
+    `weight`: their skin weights, (N,K), the largest first; a row sums to 1.
+    `triangles`: indices of vertices, (F,3).
+    `source`: for each vertex, the body's vertex that it is a copy of, (N,).
+    `surface`: arrays `normal` (N,3) and `colour` (N,4) of a mesh that is shaded, else empty.
+    `closed`: whether the triangles enclose a volume. Triangles that face away from the camera are then never seen.
     """
 
     position: F32
@@ -65,14 +71,15 @@ def mesh_arrays(
 ) -> MeshArrays:
     """Split vertices at UV seams and order them for the vertex cache. Vertices that no face uses are left out.
 
-    `vertices`: (V,3) metres.
+    `vertices`: positions, (V,3), metres.
     `faces`: indices of `vertices`, (F,3).
     `uv`: texture coordinates, (T,2).
-    `uv_faces`: indices of `uv`, (F,3), per corner.
-    `joint`: joint indices (V,K), K of 4, 8 or 12.
-    `weight`: their skin weights (V,K).
-    `normal`, `colour`: unit normals (V,3) and colours (V,4) of a mesh that is shaded.
-    Raises BadInputError when shapes, indices or values cannot be drawn.
+    `uv_faces`: indices of `uv`, (F,3), for the corners of `faces`.
+    `joint`: joint indices, (V,K); K is 4, 8 or 12.
+    `weight`: their skin weights, (V,K).
+    `normal`: unit normals, (V,3); None for a mesh that is not shaded.
+    `colour`: colours, (V,4); None for a mesh that is not shaded.
+    Raises BadInputError if shapes, indices or values cannot be drawn.
     """
     _check(vertices, faces, uv, uv_faces, joint, weight)
     triangle_order = patch_order(np.asarray(vertices, np.float64)[faces].mean(axis=1))
@@ -97,7 +104,7 @@ def _surface(normal: Floats | None, colour: Floats | None, source: NDArray[np.in
 
 
 def is_closed(vertices: Floats, faces: Ints) -> bool:
-    """Return whether the faces (F,3) wind outward around a volume, with at most a share `MAX_OPEN` of open edges.
+    """Return whether the faces (F,3) enclose a volume and wind outward; a share `MAX_OPEN` of edges may be open.
 
     Bodies have small openings that no camera sees, such as the backs of the eyes.
     """
@@ -110,9 +117,10 @@ def is_closed(vertices: Floats, faces: Ints) -> bool:
 
 
 def split_corners(faces: Ints, uv_faces: Ints) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.uint32]]:
-    """Number the distinct (vertex, uv) corners of `faces` (F,3) and `uv_faces` (F,3) by first use.
+    """Return (vertex index of each corner, UV index of each corner, triangles of corner numbers): (N,), (N,), (F,3).
 
-    Returns the vertex index (N,) and the uv index (N,) of each corner, and the triangles (F,3) of corner numbers.
+    A corner is a distinct pair of a vertex in `faces` (F,3) and a UV in `uv_faces` (F,3). Corners are numbered in the
+    order of their first use.
     """
     corner = faces.astype(np.int64).ravel() << 32 | uv_faces.astype(np.int64).ravel()
     distinct, first, inverse = np.unique(corner, return_index=True, return_inverse=True)
@@ -124,10 +132,14 @@ def split_corners(faces: Ints, uv_faces: Ints) -> tuple[NDArray[np.int64], NDArr
 
 
 def patch_order(centres: NDArray[np.float64], patch: int = PATCH_TRIANGLES) -> NDArray[np.int64]:
-    """Return an order of triangles (F,) in compact patches.
+    """Return an order of the triangles, (F,), in which compact patches follow each other.
 
-    Groups are halved along their longest side down to `patch` triangles; `centres` (F,3). Software drivers shade
-    vertices again for each batch of about a thousand indices, and compact patches have few vertices in common.
+    The triangles are halved along their longest side, again and again, until a patch has at most `patch` of them.
+    Software drivers shade a vertex again for each batch of about a thousand indices that uses it, and compact patches
+    have few vertices in common.
+
+    `centres`: centres of the triangles, (F,3).
+    `patch`: most triangles of a patch.
     """
     pending, done = [np.arange(len(centres))], []
     while pending:
@@ -144,7 +156,7 @@ def patch_order(centres: NDArray[np.float64], patch: int = PATCH_TRIANGLES) -> N
 
 
 def weight_batches(arrays: MeshArrays) -> dict[int, NDArray[np.uint32]]:
-    """Return triangles (F_k,3) by the number of skin weights, 4, 8 or 12, that suffices for all three corners."""
+    """Return the triangles (F_k,3) by the number of skin weights, 4, 8 or 12, that their corners need."""
     used = np.count_nonzero(arrays.weight, axis=1)
     needed = np.maximum(-(-used // 4) * 4, 4)[arrays.triangles].max(axis=1)
     return {k: arrays.triangles[needed == k] for k in WEIGHT_COUNTS if (needed == k).any()}
@@ -177,7 +189,7 @@ VERSION = "avatar mesh 1"  # raise it when the same body gives other arrays
 
 
 def avatar_mesh(shaped: ShapedBody) -> MeshArrays:
-    """Return vertices, triangles and weights of `shaped`, in the order in which they are drawn."""
+    """Return the mesh of `shaped`, computed or from the cache."""
     body = shaped.body
     sources = (shaped.vertices, body.faces, body.uv, body.uv_faces, body.weights)
     arrays: dict[str, Any] = dict(cached_arrays(VERSION, sources, lambda: _arrays(shaped)))
@@ -193,7 +205,7 @@ def _arrays(shaped: ShapedBody) -> Arrays:
 
 
 def enough_weights(body: Body) -> int:
-    """Return the smallest K of 4, 8, 12 whose K largest weights hold all but LARGEST_LOSS of every vertex; else 12."""
+    """Return the smallest of 4, 8 and 12 weights that loses at most LARGEST_LOSS of each vertex; 12 if none does."""
     left = -np.sort(-body.weights, axis=1)
     lost = {k: float(left[:, k:].sum(axis=1).max(initial=0.0)) for k in WEIGHT_COUNTS}
     return next((k for k in WEIGHT_COUNTS if lost[k] <= LARGEST_LOSS), WEIGHT_COUNTS[-1])
@@ -205,10 +217,11 @@ GROUPS = "abc"
 
 @dataclass(frozen=True)
 class BodyPose:
-    """One body in one frame.
+    """The pose of one body in one frame.
 
-    `joints` (55,3,4): skinning matrices. `feature` (486,): factors of the pose blend shapes. `vertices` (V,3): the
-    body's vertices in the world, metres, when the CPU unit has skinned them.
+    `joints`: skinning matrices, (55,3,4).
+    `feature`: factors of the pose blend shapes, (486,); None for a body without them.
+    `vertices`: the body's vertices, (V,3), metres, world space; None unless the CPU unit has skinned them.
     """
 
     joints: F32
@@ -219,8 +232,10 @@ class BodyPose:
 class Mesh(Protocol):
     """A mesh that `MeshDraw` draws: buffers, a vertex shader, and the pose of a frame.
 
-    `batches`: pairs of a number of skin weights and the index buffer of the triangles drawn with that many.
-    `pose_bytes`: bytes of a frame's pose, each number of it once.
+    `arrays`: vertices and triangles.
+    `vertex_shader`: file of `trilane.shaders`.
+    `batches`: pairs of a number of skin weights and the index buffer of the triangles that are drawn with it.
+    `pose_bytes`: size of a frame's pose. A number that is uploaded several times counts once.
     """
 
     arrays: MeshArrays
@@ -230,23 +245,23 @@ class Mesh(Protocol):
 
     @property
     def defines(self) -> dict[str, int | str]:
-        """Preprocessor definitions of the vertex shader, without K."""
+        """Preprocessor definitions of the vertex shader, except K."""
 
     def prepare(self, ctx: Any) -> None:
-        """Enable the depth test, and for a closed mesh leave out the triangles that face away."""
+        """Enable the depth test. For a closed mesh, also leave out the triangles that face away."""
 
     def vertex_array(self, program: Any, indices: Any) -> Any:
-        """Return a vertex array of this mesh for `program`, drawn in the order of index buffer `indices`."""
+        """Return a vertex array with which `program` draws the triangles of index buffer `indices`."""
 
     def upload_pose(self, pose: BodyPose) -> None:
-        """Write a frame's pose to the GPU. Raises ValueError when it lacks an array that the mesh needs."""
+        """Write a frame's pose to the GPU. Raises ValueError if it lacks an array that the mesh needs."""
 
     def bind_pose(self, program: Any) -> None:
         """Make `program` read the uploaded pose."""
 
 
 class PosedMesh:
-    """A mesh whose vertices the CPU unit skins frame by frame."""
+    """A mesh whose vertices the CPU unit skins for each frame."""
 
     vertex_shader = "posed_vertices.vert"
 
@@ -260,11 +275,11 @@ class PosedMesh:
         self.batches = [(WEIGHT_COUNTS[0], ctx.buffer(_index_bytes(arrays, arrays.triangles)))]
 
     def prepare(self, ctx: Any) -> None:
-        """Enable the depth test, and for a closed mesh leave out the triangles that face away."""
+        """Enable the depth test. For a closed mesh, also leave out the triangles that face away."""
         _prepare(ctx, self.arrays.closed)
 
     def vertex_array(self, program: Any, indices: Any) -> Any:
-        """Return a vertex array of this mesh for `program`."""
+        """Return a vertex array with which `program` draws the triangles of index buffer `indices`."""
         content = [(self._positions, "3f", "position"), (self._uv, "2f", "uv")]
         return _vertex_array(self._ctx, program, content, indices, self.arrays)
 
@@ -284,7 +299,7 @@ class PosedMesh:
 class SkinnedMesh:
     """A mesh whose vertices the vertex shader skins.
 
-    `posedirs` (V,3,486): pose blend shapes of the body's vertices.
+    `posedirs`: texture with the pose blend shapes of the body's vertices; None for a body without them.
     """
 
     vertex_shader = "skin.vert"
@@ -303,7 +318,7 @@ class SkinnedMesh:
 
     @property
     def defines(self) -> dict[str, int | str]:
-        """Preprocessor definitions of the vertex shader for this mesh, without K."""
+        """Preprocessor definitions of the vertex shader, except K."""
         values: dict[str, int | str] = {"JOINTS": JOINTS}
         if self.posedirs is not None:
             values |= {"POSE_FEATURES": POSE_FEATURES, "ROW": POSEDIRS_ROW}
@@ -341,7 +356,7 @@ class SkinnedMesh:
 
 
 def _index_size(arrays: MeshArrays) -> int:
-    """Return the bytes of an index: two where they suffice, because software drivers read them faster."""
+    """Return the number of bytes of an index: two if that is enough, because software drivers read these faster."""
     return 2 if len(arrays.position) <= 1 << 16 else 4
 
 
@@ -362,7 +377,7 @@ def _prepare(ctx: Any, closed: bool) -> None:
 
 
 def _layout(arrays: MeshArrays, with_source: bool) -> tuple[list[str], list[str], list[NDArray[Any]]]:
-    """Return names, moderngl formats and columns of the interleaved vertex buffer."""
+    """Return (names, formats, columns) of the interleaved vertex buffer; the formats are moderngl's."""
     columns: dict[str, tuple[str, NDArray[Any]]] = {"position": ("3f", arrays.position), "uv": ("2f", arrays.uv)}
     columns |= {name: (f"{values.shape[1]}f", values) for name, values in arrays.surface.items()}
     for group in range(arrays.weights_per_vertex // 4):
@@ -385,7 +400,7 @@ def _posedirs_texture(ctx: Any, posedirs: NDArray[np.floating[Any]]) -> Any:
 
 
 class MeshDraw:
-    """A mesh, drawn with one fragment shader."""
+    """A mesh that is drawn with one fragment shader."""
 
     def __init__(self, ctx: Any, mesh: Mesh, fragment: str | Path, **defines: int | str) -> None:
         """Build a program for each number of skin weights.
@@ -394,7 +409,7 @@ class MeshDraw:
         `mesh`: mesh to draw.
         `fragment`: file of `trilane.shaders`, or a path.
         `defines`: preprocessor definitions of both shaders.
-        Raises TrilaneError when a shader does not compile.
+        Raises TrilaneError if a shader does not compile.
         """
         self._mesh, self._ctx = mesh, ctx
         self._parts = []
@@ -403,12 +418,12 @@ class MeshDraw:
             self._parts.append((program, mesh.vertex_array(program, indices)))
 
     def set(self, values: dict[str, Any]) -> None:
-        """Set the uniforms of `values`; those that the shader's compiler removed are skipped."""
+        """Set the uniforms named in `values`, except any that the shader's compiler removed."""
         for program, _ in self._parts:
             set_uniforms(program, values)
 
     def draw(self, pose: BodyPose, view: Floats, projection: Floats) -> None:
-        """Draw into the target in use, with the depth test and culling that are enabled."""
+        """Draw the mesh in `pose` into the current target, with the depth test and culling that are enabled."""
         clip = target_clip(view, projection)
         self._mesh.upload_pose(pose)
         for program, vertices in self._parts:

@@ -1,12 +1,17 @@
-"""A video as a background: decoded ahead on a thread, in step with media time, and converted to sRGB.
+"""A video as a background: a thread decodes its frames in advance and converts them to sRGB.
 
-Each frame is shown at the time that the file gives it, at any rate. The thread decodes at most AHEAD frames in advance,
-and `at` waits for at most one frame to be decoded.
+Each frame is shown at the time that the file gives it, whatever the rate of the run. The thread decodes at most AHEAD
+frames in advance.
 
-The light of a high-range video, PQ or HLG, is computed by the published curves. The curve of ITU-R BT.2390 then rolls
-off light above what a common display shows, on the largest of the three primaries, which keeps the hue. At last the
-light is converted to the primaries of sRGB. Sources: PQ, HLG and its system gamma are ITU-R BT.2100-2; the roll-off is
-BT.2390-10, 5.4.1; reference white at 203 cd/m2 is BT.2408-5; the matrix is that of BT.2087-0.
+A video of high dynamic range, PQ or HLG, is converted in three steps:
+
+- The published curves give its light.
+- The curve of ITU-R BT.2390 reduces light above what a common display shows. The largest of the three primaries
+  decides the reduction of all three, which keeps the hue.
+- The light is converted to the primaries of sRGB.
+
+Sources: PQ, HLG and its system gamma are from ITU-R BT.2100-2; the reduction is from BT.2390-10, 5.4.1; reference white
+at 203 cd/m2 is from BT.2408-5; the matrix is from BT.2087-0.
 """
 
 from __future__ import annotations
@@ -29,7 +34,7 @@ from trilane.errors import BadInputError, TrilaneError
 from trilane.scene.lens import cover
 
 PQ, HLG = "PQ", "HLG"
-#: Light of white in the result, and the brightest light that can be told from it, cd/m2.
+#: Light of white on a common display, and the brightest light of a video that is still reduced, not cut; cd/m2.
 WHITE, PEAK = 203.0, 1000.0
 HLG_GAMMA = 1.2  # HLG's system gamma for a display whose peak is 1000 cd/m2
 STEPS = 4096
@@ -41,9 +46,11 @@ SRGB_FROM_2020 = np.array(
 
 
 def to_srgb(codes: NDArray[np.uint16], transfer: str, is_wide: bool) -> U8:
-    """Convert `codes` (h,w,3), R'G'B' of `transfer`, 0 to 65535, to sRGB (h,w,3) uint8.
+    """Return a picture of high dynamic range in sRGB, (h,w,3).
 
-    `is_wide`: whether their primaries are those of BT.2020; else they are those of sRGB.
+    `codes`: R'G'B' from 0 to 65535, (h,w,3).
+    `transfer`: PQ or HLG.
+    `is_wide`: whether the primaries are those of BT.2020; else they are those of sRGB.
     """
     light = _eotf(transfer)[codes >> 4]
     if transfer == HLG:
@@ -60,7 +67,7 @@ def to_srgb(codes: NDArray[np.uint16], transfer: str, is_wide: bool) -> U8:
 
 @cache
 def _eotf(transfer: str) -> F32:
-    """Return the light of each of STEPS codes: PQ's in cd/m2; HLG's of the scene, 0 to 1."""
+    """Return the light of STEPS codes from 0 to 1. PQ: light of the display, cd/m2; HLG: light of the scene, 0 to 1."""
     code = np.arange(STEPS) / (STEPS - 1)
     if transfer == PQ:
         return pq_light(code).astype(np.float32)
@@ -70,27 +77,27 @@ def _eotf(transfer: str) -> F32:
 
 
 def pq_light(code: F64) -> F64:
-    """Return the light in cd/m2 of PQ's `code`, 0 to 1."""
+    """Return the light, cd/m2, of `code`, a code of PQ from 0 to 1."""
     power = np.power(code, 1 / 78.84375)
     return np.asarray(10000 * np.power(np.maximum(power - 0.8359375, 0) / (18.8515625 - 18.6875 * power), 1 / M1))
 
 
 def pq_code(light: F64) -> F64:
-    """Return PQ's code, 0 to 1, for `light` in cd/m2."""
+    """Return the code of PQ, 0 to 1, of `light`, cd/m2."""
     power = np.power(light / 10000, M1)
     return np.asarray(np.power((0.8359375 + 18.8515625 * power) / (1 + 18.6875 * power), 78.84375))
 
 
 @cache
 def _gains() -> F32:
-    """Return factors on light, in STEPS steps of its square root from 0 to the square root of PEAK."""
+    """Return factors on light. Entry i belongs to the i-th of STEPS square roots of light, from 0 to that of PEAK."""
     light = np.maximum(np.linspace(0, np.sqrt(PEAK), STEPS), 1e-3) ** 2
     gains: F32 = (roll_off(light) / light).astype(np.float32)
     return gains
 
 
 def roll_off(light: F64) -> F64:
-    """Return the light of a display, 1 for white, for `light` up to PEAK: BT.2390's spline between codes of PQ."""
+    """Return `light`, cd/m2 up to PEAK, reduced to the range of a display, where white is 1: BT.2390's spline."""
     peak = pq_code(np.array(PEAK))
     code, most = pq_code(light) / peak, float(pq_code(np.array(WHITE)) / peak)
     knee = 1.5 * most - 0.5
@@ -101,7 +108,7 @@ def roll_off(light: F64) -> F64:
 
 @cache
 def _srgb() -> U8:
-    """Return sRGB of the square of each of STEPS numbers from 0 to 1."""
+    """Return the sRGB bytes of light. Entry i belongs to the i-th of STEPS square roots of light, from 0 to 1."""
     light = (np.arange(STEPS) / (STEPS - 1)) ** 2
     curve = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.power(light, 1 / 2.4) - 0.055)
     return (curve * 255 + 0.5).astype(np.uint8)
@@ -118,9 +125,12 @@ MICROSECONDS = 1e6  # in a second: the unit of a container's duration and of its
 
 
 class VideoReader:
-    """The first video stream of a file, scaled and cropped to `shape`, played in a loop. Raises BadInputError.
+    """The first video stream of a file, scaled and cropped, played in a loop.
 
-    `turned`: number of quarters that it is turned clockwise; None for what the file says.
+    `path`: video file.
+    `shape`: size of the pictures, (h,w).
+    `turned`: number of quarter turns clockwise; None for what the file says.
+    Raises BadInputError if the file cannot be decoded.
     """
 
     def __init__(self, path: Path, shape: Shape, turned: int | None = None) -> None:
@@ -133,10 +143,10 @@ class VideoReader:
         self._open(0.0)
 
     def at(self, time_s: float) -> U8 | None:
-        """Return the newest frame (h,w,3) uint8 not after `time_s`; None when the last call returned it already.
+        """Return the newest frame (h,w,3) that is not after `time_s`; None if an earlier call returned it.
 
-        Times may go back, as they do from the frames that are measured before a run to its first one: then the video is
-        opened again. Raises BadInputError when the file cannot be decoded.
+        If a time lies before that of the last frame, the video is opened again. This happens between the frames that
+        are measured before a run and the run's first frame. Raises BadInputError if the file cannot be decoded.
         """
         if time_s + ROUNDING_S < self._shown_s:
             self.close()
@@ -151,7 +161,7 @@ class VideoReader:
         return due
 
     def _open(self, from_s: float) -> None:
-        """Decode from `from_s` on, or from a little earlier."""
+        """Start to decode at `from_s` or a little earlier."""
         self._queue = queue.Queue(AHEAD)
         self._stop = threading.Event()
         self._shown_s = -1.0
@@ -183,7 +193,7 @@ class VideoReader:
                 return self._queue.put(item, timeout=0.1)
 
     def _frames(self, from_s: float) -> Iterator[tuple[float, U8]]:
-        """Yield pairs of time and picture without end, from `from_s` or a little earlier.
+        """Yield (time, picture) without end, starting at `from_s` or a little earlier.
 
         Raises BadInputError for a video without frames.
         """
@@ -202,7 +212,7 @@ class VideoReader:
             begin, seek_s = begin + self._period_s, 0.0
 
     def _one_round(self, seek_s: float) -> Iterator[tuple[float, U8]]:
-        """Yield the frames from the last key frame before `seek_s` to the end, with times from the first frame on."""
+        """Yield (time, picture) from the last key frame before `seek_s` on. The file's first frame has time 0."""
         try:
             with av.open(str(self._path), metadata_errors="replace") as container:
                 stream = video_stream(container, self._path)
@@ -221,9 +231,12 @@ class VideoReader:
 
 
 def fitted(frame: Any, pixels: Pixels, shape: Shape, turned: int | None = None) -> U8:
-    """Return `frame` covering `shape` (h,w), turned clockwise by `turned` quarters, or as its file says.
+    """Return the picture of `frame`, scaled, cropped and turned.
 
-    `pixels`: facts about its pixels. A frame that the file mirrors is mirrored only when the file decides.
+    `frame`: decoded frame.
+    `pixels`: facts about its pixels.
+    `shape`: size of the picture, (h,w).
+    `turned`: number of quarter turns clockwise; None for the turns and the mirroring that the file says.
     """
     quarters = quarters_of(frame) if turned is None else turned % 4
     stored = (frame.height, round(frame.width * pixels.aspect))
@@ -237,15 +250,15 @@ def fitted(frame: Any, pixels: Pixels, shape: Shape, turned: int | None = None) 
 
 
 def quarters_of(frame: Any) -> int:
-    """Return the quarters by which `frame` is turned clockwise to be shown, by its file."""
+    """Return the number of quarter turns clockwise that the file of `frame` says."""
     return int(-round(frame.rotation / 90) % 4)
 
 
 def is_mirrored(frame: Any) -> bool:
-    """Return whether the file says to mirror `frame` top to bottom before turning it, as a selfie's matrix does.
+    """Return whether the file says to mirror `frame` top to bottom before it is turned, as files of selfies do.
 
-    FFmpeg takes its angle from where x goes (`av_display_rotation_get`), so all that remains of a mirror image is that
-    y is reversed.
+    FFmpeg computes the angle from the direction of x (`av_display_rotation_get`). What then remains of a mirror image
+    is a reversed y.
     """
     for side in frame.side_data:
         if side.type == Type.DISPLAYMATRIX:
@@ -255,23 +268,24 @@ def is_mirrored(frame: Any) -> bool:
 
 
 def check_size(path: Path, frame: Any) -> None:
-    """Raise BadInputError when `frame` of `path` is too large."""
+    """Raise BadInputError if `frame` of `path` is too large."""
     if frame.width * frame.height > MAX_PIXELS:
         raise BadInputError(path, f"{frame.width}x{frame.height} pixels", f"at most {MAX_PIXELS} pixels")
 
 
 def video_stream(container: Any, path: Path) -> Any:
-    """Return the first video stream. Raises BadInputError when there is none."""
+    """Return the first video stream of `container`. Raises BadInputError if there is none."""
     if not container.streams.video:
         raise BadInputError(path, "no video stream", "a video")
     return container.streams.video[0]
 
 
 class Pixels(NamedTuple):
-    """The pixels of a video.
+    """Facts about the pixels of a video.
 
-    `aspect`: width of a pixel over its height. `transfer`: PQ or HLG, empty for the usual range. `is_wide`: whether
-    their primaries are those of BT.2020.
+    `aspect`: width of a pixel divided by its height.
+    `transfer`: PQ or HLG; empty for a video of the usual range.
+    `is_wide`: whether the primaries are those of BT.2020.
     """
 
     aspect: float = 1.0
