@@ -294,7 +294,7 @@ def smoothed(values: F64, certainty: F64, faces: Ints) -> F64:
 
 
 class _Pixels:
-    """Samples `covered` and `mask` of an outline at points."""
+    """Reads the images `covered` and `mask` of an outline at given points."""
 
     def __init__(self, outline: Outline) -> None:
         self._outline = outline

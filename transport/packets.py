@@ -6,7 +6,7 @@ needs to know about a frame travels in the frame's packet; no stage asks another
 
 Each edge has one region of memory without a name (memfd), of a fixed size. The parent makes the regions and keeps their
 descriptors; child processes inherit the descriptors and map the regions. The kernel frees a region when the last
-process that has the region ends, by a crash too.
+process that has the region ends, even by a crash.
 """
 
 from __future__ import annotations

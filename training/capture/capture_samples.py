@@ -204,7 +204,7 @@ NO_FLIP = (False, False)
 
 @dataclass(frozen=True)
 class Augmentation:
-    """The changes that make a sample of a frame.
+    """The geometric changes by which a frame becomes a sample.
 
     `centre` (x, y): point of the frame, in pixels, that moves to the middle of the target. `turn_rad`: clockwise turn
     about that point, radians. `scale` (x, y): target pixels per frame pixel along x and y, before the turn. `flip`
@@ -403,7 +403,7 @@ def zoomed_view(
     rule: ViewRule,
     screen: Shape,
 ) -> F64 | None:
-    """Return a random map (3,3) from the frame's pixels to the screen's; None if its centre is outside the frame.
+    """Return a random map (3,3) from the frame's pixels to the screen's; None if the view's centre is off the frame.
 
     `band`: band of the view, a name of `BANDS` or `anywhere`. `posed`: body in the frame. `centres`: chooses the
     vertex at the view's centre. `screen`: (height, width).
