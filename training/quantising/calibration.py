@@ -307,7 +307,10 @@ def _cut(name: str, data: Any, model: onnx.ModelProto) -> tuple[float, float]:
 
 
 def _step(low: float, high: float) -> float:
-    """Return the least power of two of which 256 steps cover the range from `low` to `high`, to within a step."""
+    """Return the step of a range: the least power of two with which 256 steps from `low` nearly reach `high`.
+
+    The gap is at most a step.
+    """
     step = 2.0 ** math.ceil(math.log2(max(high - low, 1e-9) / (BYTE + 1)))
     while high / step + _zero_point(low, step) > BYTE + 1:
         step *= 2

@@ -336,7 +336,10 @@ class _IdealGraph(NoiseGraph):
         return self.widened * low, self.widened * high, step
 
     def is_multiple(self, name: str, step: float) -> bool:
-        """Return whether tensor `name` only copies a stored tensor: joined and added tensors have their own steps."""
+        """Return whether all values of tensor `name` are already multiples of a stored tensor's step.
+
+        Only copies of a stored tensor are: joined and added tensors have their own steps.
+        """
         maker = self.makers.get(name)
         if maker is None or maker.op_type == "DequantizeLinear":
             return maker is not None

@@ -200,7 +200,7 @@ def _check_weights(model: onnx.ModelProto) -> None:
 
 
 def _describe(model: onnx.ModelProto, keep_float: Sequence[str]) -> None:
-    """Remove what runtimes do not read: other operator sets than ONNX's, and old metadata. Add the layers in float."""
+    """Remove other operator sets than ONNX's, and all metadata. Then list the layers `keep_float` in the metadata."""
     for entry in [entry for entry in model.opset_import if entry.domain not in ("", "ai.onnx")]:
         model.opset_import.remove(entry)
     del model.metadata_props[:]
