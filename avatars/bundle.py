@@ -108,7 +108,10 @@ class Bundle:
 
 
 def read_texture(path: Path, channels: int) -> NDArray[np.float32]:
-    """Return the neural texture (H, W, `channels`) float32, row 0 at v = 0, in a bundle's file. Raises BadInputError."""
+    """Return the neural texture (H, W, `channels`) float32 in a bundle's file, row 0 at v = 0. Raises BadInputError.
+
+    `channels`: number of channels that the texture must have.
+    """
     arrays = read_npz(path, TEXTURE_KEYS, "a neural texture")
     if "texture" not in arrays:
         raise BadInputError(path, "no array 'texture'", "a neural texture")

@@ -37,12 +37,12 @@ from trilane.unet_tables import (
 #
 # Rule: channel counts, kernels and strides come from `trilane.unet_tables`; this file builds layers from the tables.
 
-#: A function from a number of channels to a normalisation, and one from a channel count of the tables to that of the
-#: network's width.
+#: `Norm`: makes a normalisation for a number of channels. `Scale`: scales a channel count of the tables by the width of
+#: the network.
 Norm = Callable[[int], nn.Module]
 Scale = Callable[[int], int]
 
-#: Least number of input channels with which PyTorch's strided 1x1 convolution is safe in training: see `Shortcut`.
+#: From this number of input channels on, PyTorch's strided 1x1 convolution is safe in training, see `Shortcut`.
 SAFE_CHANNELS = 16
 ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {"relu": nn.ReLU, "relu6": nn.ReLU6, "hardswish": nn.Hardswish}
 

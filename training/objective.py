@@ -175,7 +175,7 @@ def loss_terms(
 def missing_db(difference: Tensor, near: Tensor) -> Tensor:
     """Return how far (N,), in dB, the PSNR of each picture is below 50 dB, over the pixels where `near` is 1.
 
-    The mean square of the difference is increased by `LEAST_SQUARE`, that of a PSNR of 50 dB.
+    50 dB is the PSNR of the mean square `LEAST_SQUARE`, which is added to the pictures' mean square.
 
     `difference`: (N, 3, H, W), picture minus target. `near`: (N, 1, H, W), 1 for pixels that count, else 0.
     """

@@ -214,7 +214,8 @@ class Outline(NamedTuple):
 class StandOff:
     """Measured offsets.
 
-    `offsets`: (V,3), metres at rest. `measured`: share of the vertices with a measurement; the others are interpolated.
+    `offsets`: (V,3), metres at rest. `measured`: share of the vertices with a measurement. The offsets of the other
+    vertices are interpolated.
     """
 
     offsets: F32

@@ -197,7 +197,7 @@ class TrainingSettings(Table):
     `average_share`: time constant of the moving average that becomes the avatar, as a share of the steps so far.
     `noise_steps`: largest noise on activations, in steps of a byte.
     `masked_texture`: whether texels that no sample of a batch shows keep their values and momenta.
-    `stand_off`: whether the body is drawn with offsets, so that it reaches the outline of clothes and hair.
+    `stand_off`: whether offsets of clothes and hair are measured, and the body is drawn with these offsets.
     `norm`: normalisation of the network.
     `bytes_from`: share after which weights and activations are rounded to the bundle's bytes, in float32.
     `mip_levels`: number of smaller levels of the texture that are learnt with it.

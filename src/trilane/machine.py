@@ -172,7 +172,7 @@ class Machine:
         return shutil.which(name, path=path if first is None else f"{first}{os.pathsep}{path}")
 
     def package_file(self, name: str) -> Path | None:
-        """Return the first file of a module or package, without importing it; None where it is not installed."""
+        """Return the file that importing `name` would run, without importing it; None if `name` is not installed."""
         found = importlib.util.find_spec(name)
         return None if found is None else Path(found.origin or "")
 
@@ -321,7 +321,7 @@ def awake(wanted: bool = True) -> Iterator[str]:
     """Keep idle cores of the whole machine awake inside the `with` block. Yield AWAKE, or `sleep: ` and the reason.
 
     A sleeping core takes 50 us and more to react to a message; a core that is kept awake takes power. Usually only root
-    may do this. The kernel undoes it when the process ends.
+    may keep cores awake. When the process ends, the kernel lets them sleep again.
     """
     if not wanted:
         yield "sleep: the performance profile asks for no haste"

@@ -248,7 +248,7 @@ def session(model: onnx.ModelProto) -> Any:
 # quantiser.
 #
 # Rule: only two facts are taken from the integer network: the places where it rounds, and whether its steps are powers
-# of two. The range of a stored tensor is that of its float values on this input, and has 255 steps. The weights of an
+# of two. The range of a stored tensor covers its float values on this input, and has 255 steps. The weights of an
 # output channel have `LARGEST_WEIGHT` steps to either side of 0; biases are exact. If steps are powers of two, each is
 # `POWER_OF_TWO` times as wide. For a stored tensor, rounding up to a power of two costs at most that factor; for a
 # weight, using only even multiples costs that factor. The steps of the picture are 1/255.
@@ -350,7 +350,7 @@ class _IdealGraph(NoiseGraph):
 #
 # Rule: both networks read the same input bytes, so the rounding of the input does not count as a layer's noise.
 
-#: Greatest SQNR that is reported: that of a layer without error is infinite, which JSON cannot express.
+#: Greatest SQNR that is reported. A layer without error has an infinite SQNR, which JSON cannot express.
 MAX_DB = 200.0
 
 
