@@ -296,8 +296,8 @@ def float_ranges(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> di
 class _FloatGraph(NoiseGraph):
     """Builds a float network that rounds nothing, and collects the names of the tensors that would be stored.
 
-    The integer network has no Relu: the lower end of the range before it clips as the Relu would. The Relus of `model`
-    are therefore added again.
+    The integer network has no Relu, because the range of a rectified tensor begins at 0. Without ranges, a Relu is
+    necessary; it is added where `model` has one.
     """
 
     def __init__(self, model: onnx.ModelProto, quantised: Quantised) -> None:
