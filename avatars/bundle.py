@@ -97,7 +97,7 @@ class Bundle:
         return _decoded(arrays["levels"], arrays.get("scale"), self.texture_path)
 
     def read_network(self) -> NetworkFile:
-        """Read the checked network. Raises BadInputError, also when it contradicts the manifest."""
+        """Return the checked network. Raises BadInputError, also for a network that contradicts the manifest."""
         network = read_network(self.network_path)
         entry = self.manifest.network
         if network.channels != entry.channels:
@@ -108,7 +108,10 @@ class Bundle:
 
 
 def read_texture(path: Path, channels: int) -> NDArray[np.float32]:
-    """Read a bundle's neural texture (H, W, `channels`), row 0 at v = 0, from a file. Raises BadInputError."""
+    """Return the neural texture (H, W, `channels`) float32 in a bundle's file, row 0 at v = 0. Raises BadInputError.
+
+    `channels`: number of channels that the texture must have.
+    """
     arrays = read_npz(path, TEXTURE_KEYS, "a neural texture")
     if "texture" not in arrays:
         raise BadInputError(path, "no array 'texture'", "a neural texture")

@@ -198,9 +198,9 @@ class Validation(AccuracyFigures):
     `other_runtimes`: figures of more runtimes, by name.
     `size`: tensor size, as `trilane run --size` takes it.
     `texture_filter`: filter of the neural texture.
-    `by_size`: cost of smaller tensors; None where nobody measured it.
-    More keys: `per_band`, views of each band and seed; `held_out`, digest of each motion; `float`, figures of the
-    network before it was quantised; `psnr_loss_db`, loss by quantising.
+    `by_size`: loss of quality by smaller tensors; None if it was not measured.
+    More keys: `per_band`, number of views of each band and seed; `held_out`, origin of each motion, by name; `float`,
+    figures of the network before it was quantised; `psnr_loss_db`, loss of PSNR by quantising, by band.
     """
 
     date: Day | None = None

@@ -131,7 +131,7 @@ def _part(network: NetworkFile, before: Cut, after: Cut) -> NetworkPart:
 
 
 def _needed(nodes: Sequence[onnx.NodeProto], outputs: Sequence[str]) -> list[onnx.NodeProto]:
-    """Return those of `nodes` that `outputs` depend on, in the order of `nodes`."""
+    """Return the nodes of `nodes`, in the same order, that the tensors `outputs` depend on."""
     wanted, needed = set(outputs), []
     for node in reversed(nodes):
         if wanted.intersection(node.output):

@@ -182,9 +182,9 @@ class SizeLoss:
     by_work: Mapping[int, float]
 
     def at(self, work: int) -> float | None:
-        """Return the loss in dB with `work` thousandths of the pixels: that of the next smaller measured size.
+        """Return the loss in dB of a tensor with `work` thousandths of the pixels; 0 for a tensor of the full size.
 
-        None if no smaller size was measured.
+        This is the loss measured at the next smaller size; None if no smaller size was measured.
         """
         if work >= WHOLE and self.by_work:
             return 0.0

@@ -1,4 +1,4 @@
-"""How an avatar is made: ground truth, the training itself (with PyTorch, an optional extra) and quantisation.
+"""How an avatar is made: ground truth, training (with PyTorch, an optional extra) and quantisation.
 
-It may use `stages/` and the folders below it.
+This folder may import `stages/` and the folders below that.
 """

@@ -333,7 +333,7 @@ def zoom(group: ShapeGroup) -> NDArray[np.float64]:
 
 
 def _labels(groups: list[ShapeGroup], settings: TrainingSettings) -> list[NDArray[np.int64]]:
-    """Return the labels (N,) of the samples of each group, as `batches` takes them, from the settings."""
+    """Return the labels (N,) of the samples of each group, see `batches`, that implement the settings of batches."""
     options = settings.batches
     rng = np.random.default_rng((settings.seed, 3))
     found = []

@@ -83,7 +83,7 @@ def head_on(uv: NDArray[np.float64], covered: NDArray[np.bool_], side: int) -> N
     """Return the weight (h,w) of each pixel of a UV image (h,w,2): 1 where the surface is close and seen head-on.
 
     Let s >= t be the singular values of the derivative of UV by pixel. The weight is (t / s)³. It is multiplied by
-    (1 / (side s))² if a pixel spans more than a texel. It is 0 across seams and at the outline, without a derivative.
+    (1 / (side s))² if a pixel spans more than a texel. Pixels at seams and outlines have no derivative and weight 0.
 
     `covered`: (h,w), whether a pixel shows the body. `side`: side of the texture in texels.
     """

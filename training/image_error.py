@@ -88,9 +88,9 @@ def over(image: U8, behind: NDArray[np.floating]) -> F64:
 
 
 def regions(alpha: U8) -> tuple[Mask, Mask, Mask]:
-    """Return the regions inside, edge and outside (h,w) of a true `alpha` (h,w).
+    """Return three masks (h,w) from the ground truth's `alpha` (h,w): inside, edge and outside of the person.
 
-    Outside the picture, alpha continues with the values at the border.
+    Beyond the picture, alpha is taken to continue with the values at the border.
     """
     near = [np.pad(alpha, EDGE_PX, mode="edge")]
     for axis in (0, 1):

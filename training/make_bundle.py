@@ -261,9 +261,9 @@ def held_out_views(renderer: SampleRenderer, bundle: Bundle, views: int) -> list
 
 
 def _tensors(renderer: SampleRenderer, bundle: Bundle, sample: Callable[[int], Sample], wanted: int) -> Iterator[F32]:
-    """Yield `wanted` inputs (H,W,C) of the network of `bundle`.
+    """Yield `wanted` inputs (H,W,C) of the network of `bundle`, of samples with a tensor of `CALIBRATION_SHAPE`.
 
-    They are those of the first samples of `sample(0)`, `sample(1)`, ... with a tensor of `CALIBRATION_SHAPE`.
+    `sample`: function that returns sample 0, 1, 2, ...; samples with another tensor shape are skipped.
     """
     levels = levels_of(bundle)
     found = (one for one in map(sample, count()) if one.crop.shape == CALIBRATION_SHAPE)

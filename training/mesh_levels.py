@@ -1,9 +1,9 @@
 """Makes the levels of a body's mesh: meshoptimizer simplifies it, then vertices are put back until no point moves far.
 
 meshoptimizer collapses edges onto existing vertices, keeps UV seams, and weighs UV as an attribute. Its error is a mean
-over quadrics, so single texels may be far off. The distance is therefore measured wherever edges of both meshes cross
-in UV, and at each left-out vertex; it is largest there (`avatars/mesh_levels.py`). Where it is too large, a vertex of
-the worst place in each triangle is locked, and the mesh is simplified again.
+over quadrics, so single texels may be far off. The distance between the meshes is therefore measured wherever their
+edges cross in UV, and at each left-out vertex: it is largest at such a place (`avatars/mesh_levels.py`). If it is too
+large, a vertex beside the worst place of each triangle is locked, and the mesh is simplified again.
 
 At a seam, the level's edge is a chord of the whole mesh's outline in UV. A vertex that is left out there, or lies
 beyond the chord, is paired with the nearest point of the chord.

@@ -1,6 +1,6 @@
-"""The avatar's network: an encoder, a decoder of five levels with skips, a colour head and a mask head.
+"""The avatar's network: an encoder, a decoder of five levels with skip connections, a colour head and a mask head.
 
-Rule: no other module defines a network that computes; every runtime runs a file exported from this one.
+Rule: only this module defines the network's layers. Every runtime runs a file that was exported from it.
 """
 
 from __future__ import annotations
@@ -32,15 +32,17 @@ from trilane.unet_tables import (
     squeeze_channels,
 )
 
-# The encoders in PyTorch: each turns (N, C, H, W), sides multiples of 32, into features at strides 2, 4, 8, 16 and 32,
-# finest first. `channels` are those of the features.
+# The encoders in PyTorch. An encoder turns (N, C, H, W), sides multiples of 32, into features at strides 2, 4, 8, 16
+# and 32, finest first. `channels` are the numbers of channels of these features.
 #
-# Rule: channel counts, kernels and strides come from `trilane.unet_tables`; this file only says what a row means.
+# Rule: channel counts, kernels and strides come from `trilane.unet_tables`; this file builds layers from the tables.
 
+#: `Norm`: makes a normalisation for a number of channels. `Scale`: scales a channel count of the tables by the width of
+#: the network.
 Norm = Callable[[int], nn.Module]
 Scale = Callable[[int], int]
 
-#: A strided 1x1 convolution of at least this many channels is trained unchanged: it fills a whole vector of floats.
+#: From this number of input channels on, PyTorch's strided 1x1 convolution is safe in training, see `Shortcut`.
 SAFE_CHANNELS = 16
 ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {"relu": nn.ReLU, "relu6": nn.ReLU6, "hardswish": nn.Hardswish}
 
@@ -48,13 +50,13 @@ ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {"relu": nn.ReLU, "relu6": nn.
 class Shortcut(nn.Conv2d):
     """A strided 1x1 convolution without bias.
 
-    Where gradients are kept and channels are few, it picks the strided pixels before the convolution. oneDNN's float32
-    backward pass of a strided one with 8 channels or fewer, channels last, writes beyond its memory. This was seen with
-    PyTorch 2.13: from 4 and 8 channels under AVX-512, from 3 and 4 channels under AVX2.
+    With gradients and few channels, the strided pixels are picked before a convolution without stride. The reason:
+    oneDNN's float32 backward pass of a strided 1x1 convolution with few channels, channels last, writes beyond its
+    memory. This was seen with PyTorch 2.13: with 4 and 8 channels under AVX-512, with 3 and 4 channels under AVX2.
     """
 
     def __init__(self, c_in: int, c_out: int, stride: int) -> None:
-        """Build a shortcut from `c_in` to `c_out` channels that reads every `stride`-th pixel of each axis."""
+        """Build a shortcut from `c_in` to `c_out` channels that reads every `stride`-th pixel along both axes."""
         super().__init__(c_in, c_out, 1, stride, bias=False)
 
     def forward(self, x: Tensor) -> Tensor:
@@ -65,14 +67,14 @@ class Shortcut(nn.Conv2d):
 
 
 class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions, added to a shortcut, which is a strided 1x1 convolution where the shape changes."""
+    """Two 3x3 convolutions, added to a shortcut. If the shape changes, the shortcut is a strided 1x1 convolution."""
 
     def __init__(self, c_in: int, c_out: int, stride: int, norm: Norm) -> None:
         """Build a block.
 
-        `c_in`, `c_out`: channels of its input and output.
-        `stride`: stride of its first convolution.
-        `norm`: makes a normalisation for a number of channels.
+        `c_in`, `c_out`: number of channels of the input and of the output.
+        `stride`: stride of the first convolution.
+        `norm`: function that makes a normalisation for a number of channels.
         """
         super().__init__()
         self.body = nn.Sequential(
@@ -92,7 +94,7 @@ class ResidualBlock(nn.Module):
 
 
 class ResNet18(nn.Module):
-    """7x7 stride-2 stem, 3x3 stride-2 max pool, four stages of two residual blocks."""
+    """A 7x7 stride-2 stem, a 3x3 stride-2 max pool, and four stages of two residual blocks."""
 
     def __init__(self, c_in: int, scale: Scale, norm: Norm) -> None:
         super().__init__()
@@ -117,7 +119,7 @@ class ResNet18(nn.Module):
 
 
 class SqueezeExcite(nn.Module):
-    """Squeeze-and-excitation: scales each channel by a factor computed from the channels' means over the picture."""
+    """Squeeze-and-excitation: scales each channel by a factor that is computed from the means of all channels."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -136,15 +138,18 @@ class SqueezeExcite(nn.Module):
 
 
 class InvertedResidual(nn.Module):
-    """1x1 expansion, depthwise convolution, optional squeeze, linear 1x1 projection, added where shapes agree."""
+    """A 1x1 expansion, a depthwise convolution, an optional squeeze-and-excitation, and a linear 1x1 projection.
+
+    If input and output have the same shape, the input is added to the output.
+    """
 
     def __init__(self, c_in: int, row: MobileBlock, scale: Scale, norm: Norm) -> None:
-        """Build the block of one row of the table.
+        """Build the block of one row of an encoder's table.
 
-        `c_in`: channels of its input.
-        `row`: kernel, channels, stride and activation of the block.
-        `scale`: scales a channel count by the network's width.
-        `norm`: makes a normalisation for a number of channels.
+        `c_in`: number of channels of the input.
+        `row`: row of the table.
+        `scale`: function that scales a channel count by the network's width.
+        `norm`: function that makes a normalisation for a number of channels.
         """
         super().__init__()
         inner, c_out = scale(row.expanded), scale(row.channels)
@@ -169,18 +174,17 @@ class InvertedResidual(nn.Module):
 
 
 class MobileFeatures(nn.Module):
-    """A 3x3 stride-2 stem, inverted residual blocks, a last 1x1 layer.
+    """A 3x3 stride-2 stem, inverted residual blocks, and a last 1x1 layer.
 
-    Its features are the tensors that enter the strided blocks, and the last layer's output.
+    The features are the inputs of the strided blocks, and the output of the last layer.
     """
 
     def __init__(self, spec: MobileEncoder, c_in: int, scale: Scale, norm: Norm) -> None:
-        """Build the encoder of one table.
+        """Build the encoder of the table `spec`.
 
-        `spec`: table of the encoder.
-        `c_in`: channels of its input.
-        `scale`: scales a channel count by the network's width.
-        `norm`: makes a normalisation for a number of channels.
+        `c_in`: number of channels of the input.
+        `scale`: function that scales a channel count by the network's width.
+        `norm`: function that makes a normalisation for a number of channels.
         """
         super().__init__()
         before = scale(spec.stem)
@@ -221,7 +225,7 @@ CHANNEL_STEP = 4
 
 
 class GroupNorm(nn.GroupNorm):
-    """`nn.GroupNorm` in operators that quantise: an instance norm over groups, then a depthwise 1x1 convolution."""
+    """`nn.GroupNorm` made of operators that can be quantised: an instance norm, then a depthwise 1x1 convolution."""
 
     def forward(self, x: Tensor) -> Tensor:
         n, c, h, w = x.shape
@@ -231,13 +235,13 @@ class GroupNorm(nn.GroupNorm):
 
 
 class NoNorm(nn.BatchNorm2d):
-    """A learnt scale and shift of each channel, and no statistics: a batch norm that never measures.
+    """A learnt scale and shift of each channel: a batch norm whose statistics stay mean 0 and variance 1.
 
-    It is exported, and folded into the convolution before it, as a batch norm is.
+    Like a batch norm, it is folded into the convolution before it when the network is exported.
     """
 
     def train(self, mode: bool = True) -> Self:
-        """Stay in evaluation mode, in which the mean is 0 and the variance 1; `mode` changes nothing."""
+        """Stay in evaluation mode, so that mean and variance never change. `mode` has no effect."""
         del mode
         super().train(False)
         return self
@@ -252,7 +256,7 @@ NORMS: dict[str, Callable[[int], nn.Module]] = {
 
 
 class UNet(nn.Module):
-    """The whole network: (N, channels, H, W) float32 to (N, 4, H, W), straight colour and mask, each in 0..1.
+    """The whole network: from (N, channels, H, W) float32 to (N, 4, H, W) in 0..1, colour and mask, straight alpha.
 
     H and W are multiples of 32.
     """
@@ -270,9 +274,9 @@ class UNet(nn.Module):
         `encoder`: a name of `ENCODERS`.
         `norm`: a name of `NORMS`.
         `width`: 64 is the full network; every channel count is scaled by `width` / 64 and rounded to a multiple of 4.
-        `channels`: channels of the input.
-        `input_skip`: whether the last level also reads the input, the only tensor of full resolution; the paper's does
-        not.
+        `channels`: number of channels of the input.
+        `input_skip`: whether the last decoder level also reads the network's input, the only tensor of full resolution.
+        The paper's network has no such skip connection.
         Raises BadInputError for an unknown encoder or norm, or a width or channel count out of range.
         """
         super().__init__()
@@ -301,7 +305,7 @@ class UNet(nn.Module):
         return torch.sigmoid(torch.cat((self.colour(x), self.mask(x)), dim=1))
 
     def features(self, x: Tensor) -> Tensor:
-        """Return the features (N, width, H, W) that both heads read."""
+        """Return the features (N, C, H, W) that both heads read, for the network's input `x`."""
         whole = x if self.input_skip else None
         *skips, x = self.encoder(x)
         for level, skip in zip(self.levels, (*reversed(skips), whole), strict=True):
@@ -323,22 +327,22 @@ def _check(encoder: str, norm: str, width: int, channels: int) -> None:
             raise BadInputError("network", f"{name} {number}", f"a number from 1 to {top}")
 
 
-# Noise on activations while training, so that the picture hardly changes on a runtime that rounds differently.
+# Noise on activations in training, so that pictures hardly change on a runtime that rounds differently.
 #
-# Rule: noise is added only in training, to positive outputs of ReLUs, and is about as large as one step of a byte.
+# Rule: noise is added only in training mode, to positive outputs of ReLUs. It is about as large as one step of a byte.
 
 BYTE_STEPS = 255
-#: Number of random values beyond those of the largest output. Noise starts at a random one of them, which costs a fifth
-#: of drawing all of it again.
+#: Noise is a slice of a fixed array of random values, from a random start below this. That costs a fifth of drawing new
+#: values each time.
 STARTS = 1 << 16
 
 
 def add_activation_noise(network: nn.Module, steps: float) -> None:
-    """Make every ReLU of `network` add noise of up to `steps` times 1/255 of its largest output, in training mode."""
+    """Make every ReLU of `network` add noise in training mode, up to ±`steps` / 255 times its largest output."""
     bank = torch.empty(0)
 
     def noise_for(output: Tensor) -> Tensor:
-        """Return noise in the shape of `output`, uniform in -1..1."""
+        """Return uniform noise in -1..1 with the shape of `output`."""
         nonlocal bank
         if len(bank) < output.numel() + STARTS or bank.dtype != output.dtype or bank.device != output.device:
             drawn = torch.rand(output.numel() + STARTS, generator=torch.Generator().manual_seed(0))
@@ -360,11 +364,14 @@ def add_activation_noise(network: nn.Module, steps: float) -> None:
 
 # Dropout of whole channels after each level of encoder and decoder.
 #
-# Rule: it acts in training mode only and adds no weights, so export and resume do not notice it.
+# Rule: dropout acts only in training mode and adds no weights, so it changes neither the export nor a stored state.
 
 
 def add_dropout(network: UNet, probability: float) -> None:
-    """Make each level of `network` set a channel to 0 with `probability`; the others grow, so that the mean stays."""
+    """Make each level of `network` set a channel to 0 with `probability` in training mode.
+
+    The other channels are scaled up, so that the mean stays the same.
+    """
 
     def hook(module: nn.Module, _inputs: Any, output: Tensor) -> Tensor | None:
         return functional.dropout2d(output, probability) if module.training else None
@@ -376,16 +383,19 @@ def add_dropout(network: UNet, probability: float) -> None:
                     part.register_forward_hook(hook)
 
 
-# Exports the network as a float ONNX model of one static shape, with batch norms folded into the convolutions.
+# Exports the network as a float ONNX model of a fixed shape, with batch norms folded into the convolutions.
 #
-# Rule: the model computes the same as the network; only the layout of the two heads differs.
+# Rule: the model computes the same as the network. Only the two heads are arranged differently.
 
 OPSET = 17
 INPUT, OUTPUT = "tensor", "rgba"
 
 
 class _OneHead(nn.Module):
-    """Both heads as one, so that the features are read once: first layers side by side, second ones block-diagonal."""
+    """The network with both heads joined, so that the features are read only once.
+
+    The heads' first convolutions become one with twice the channels, their second ones a block-diagonal one.
+    """
 
     def __init__(self, network: UNet) -> None:
         super().__init__()
@@ -412,9 +422,9 @@ def _fused(head: nn.Sequential) -> tuple[nn.Conv2d, nn.Conv2d]:
 
 
 def export_onnx(network: UNet, height: int, width: int) -> onnx.ModelProto:
-    """Export a float model for (1, C, height, width): input `tensor`, output `rgba` (1, 4, height, width) in 0..1.
+    """Return a float model: input `tensor` (1, C, height, width), output `rgba` (1, 4, height, width) in 0..1.
 
-    `network`: network, which is put into evaluation mode. `height`, `width`: multiples of 32.
+    `network`: network to export; it is put into evaluation mode. `height`, `width`: multiples of 32.
     """
     network.eval()
     batch_norm = isinstance(network.colour[1], nn.BatchNorm2d)
@@ -438,7 +448,7 @@ def export_onnx(network: UNet, height: int, width: int) -> onnx.ModelProto:
 
 
 def _free_reshapes(model: onnx.ModelProto) -> None:
-    """Make every Reshape take batch and width from its input and compute the height, so that no shape is fixed."""
+    """Make every Reshape copy batch and width from its input and infer the height, so that any input shape works."""
     makers = {out: node for node in model.graph.node for out in node.output}
     for node in model.graph.node:
         if node.op_type == "Reshape":

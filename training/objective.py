@@ -1,6 +1,7 @@
-"""The objective that training minimises: the loss terms, including the terms that need networks of their own.
+"""The objective that training minimises: the loss terms, including those that need networks (VGG-16, discriminators).
 
-Rule: a term is computed only where it has a weight, and the same step on the same pictures gives the same numbers.
+Rule: a term that needs a network or blurs is computed only if it has a weight. The same step on the same pictures gives
+the same numbers.
 """
 
 from __future__ import annotations
@@ -21,18 +22,19 @@ from torch.nn import functional
 
 from trilane.errors import BadInputError, MissingPartError, package_line, reason
 from trilane.training.image_error import backgrounds
+from trilane.training.training_settings import LossWeights
 
 PERCEPTUAL = "perceptual"
-#: Key of the discriminators' own error, in bits; it is reported with the terms but is not one of them.
+#: Key of the discriminators' error, in bits. It is reported beside the loss terms but is not minimised by the avatar.
 JUDGES = "discriminators"
 
 
 @dataclass(frozen=True)
 class Objective:
-    """What a training minimises.
+    """The objective of a training.
 
-    `weights`: weights of the terms, by name. `vgg`: network of the perceptual loss; None for MS-SSIM. `adversary`:
-    discriminators, or None.
+    `weights`: weights of the terms, by name. `vgg`: network of the perceptual loss; if None, the perceptual loss is one
+    minus MS-SSIM. `adversary`: discriminators, or None.
     """
 
     weights: Mapping[str, float] = field(default_factory=lambda: WEIGHTS)
@@ -40,9 +42,9 @@ class Objective:
     adversary: Adversary | None = None
 
     def terms(self, output: Tensor, target: Tensor) -> dict[str, Tensor]:
-        """Return the terms by name, before weighting; the backgrounds behind both pictures are drawn here.
+        """Return the loss terms by name, before weighting, with random backgrounds behind both pictures.
 
-        `output`, `target` (N, 4, H, W): straight colour and mask, 0..1.
+        `output`, `target`: (N, 4, H, W) in 0..1, colour and mask, straight alpha.
         """
         behind = drawn_behind(target)
         terms = loss_terms(output, target, behind, self.weights)
@@ -53,32 +55,38 @@ class Objective:
         return terms if self.adversary is None else terms | self.adversary.terms(output, target, behind)
 
     def total(self, terms: Mapping[str, Tensor]) -> Tensor:
-        """Return the weighted sum of `terms`, which is minimised."""
+        """Return the sum of `terms`, weighted by the objective's weights."""
         return total_loss(terms, self.weights)
 
     def learn(self, output: Tensor, target: Tensor) -> dict[str, float]:
-        """Train the discriminators, if any, by one step on these pictures, and return their error by name."""
+        """Train the discriminators, if any, by one step. Return their error in bits under the key `JUDGES`.
+
+        `output`, `target`: as in `terms`.
+        """
         return {} if self.adversary is None else {JUDGES: self.adversary.learn(output, target, drawn_behind(target))}
 
 
-# MS-SSIM of pictures, in a form that can be minimised: structure at five scales, without any network's weights.
+# MS-SSIM of pictures in PyTorch, with gradients: similarity at five scales.
 #
-# Rule: windows lie wholly inside the picture. A picture that is too small for some scales is compared at those that it
-# has, with their weights scaled to a sum of 1.
+# Rule: windows lie wholly inside the picture. Scales at which the picture is smaller than a window are left out, and
+# the weights of the remaining scales are scaled to a sum of 1.
 
 #: Weights of the scales, finest first: Wang, Simoncelli, Bovik, Multiscale structural similarity, 2003, section 3.2.
 SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
 WINDOW, SIGMA = 11, 1.5
 #: Constants of luminance and of contrast, for values in 0..1.
 C1, C2 = 0.01**2, 0.03**2
-#: Replaces a negative structure, because a negative number has no real power.
+#: Lower bound of a similarity before it is raised to a power: a negative number has no real power.
 LEAST = 1e-6
 
 
 def ms_ssim(one: Tensor, other: Tensor) -> Tensor:
-    """Return (N,): the product of the mean contrast and structure of each scale, with luminance at the last one.
+    """Return the MS-SSIM (N,) of pictures `one` and `other`: formula 7 of the paper above.
 
-    `one`, `other` (N, C, H, W) in 0..1, H and W at least 11. Formula 7 of the paper above, with equal exponents.
+    It is the product over the scales of the mean contrast-structure similarity, to the power of the scale's weight. At
+    the last scale, the luminance is included.
+
+    `one`, `other`: (N, C, H, W) in 0..1, H and W at least 11.
     """
     sizes = [min(one.shape[-2:]) >> scale for scale in range(len(SCALES))]
     weights = [weight for weight, size in zip(SCALES, sizes, strict=True) if size >= WINDOW]
@@ -92,7 +100,7 @@ def ms_ssim(one: Tensor, other: Tensor) -> Tensor:
 
 
 def _similarity(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
-    """Return two tensors (N,): the mean SSIM, and the mean of its factor of contrast and structure."""
+    """Return the mean SSIM (N,), and the mean (N,) of its factor for contrast and structure."""
     mean_one, mean_other = _blurred(one), _blurred(other)
     variances = _blurred(one**2) - mean_one**2 + _blurred(other**2) - mean_other**2
     covariance = _blurred(one * other) - mean_one * mean_other
@@ -102,7 +110,7 @@ def _similarity(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _blurred(picture: Tensor) -> Tensor:
-    """Return `picture` (N, C, H, W) blurred by a Gaussian window, where the window lies inside it."""
+    """Return `picture` (N, C, H, W) blurred by a Gaussian window, (N, C, H - 10, W - 10), without padding."""
     places = torch.arange(WINDOW, dtype=picture.dtype, device=picture.device) - WINDOW // 2
     bell = torch.exp(-(places**2) / (2 * SIGMA**2))
     bell = (bell / bell.sum()).expand(picture.shape[1], 1, WINDOW)
@@ -112,26 +120,18 @@ def _blurred(picture: Tensor) -> Tensor:
 
 # The loss terms of training: errors of the picture, of its PSNR, colours, edges, structure and mask.
 #
-# Rule: every term is a mean over the pixels it is about, so that a weight means the same for every view. Each picture
-# of a batch stands before a background of its own: before one colour for all, a person who lets that colour through has
-# no error.
+# Rule: every term is a mean over the pixels that it concerns, so that a weight means the same for every view. Each
+# picture of a batch has a random background: in front of a fixed colour, a person who lets that colour through has no
+# error.
 #
-# The colour where there is no person is not visible and is trained to be black: otherwise it would be noise that
+# The colour of pixels without a person is invisible. It is trained to be black: otherwise it would be noise that
 # differs from runtime to runtime.
 
-#: Pixels round the person that count as its outline.
+#: Width in pixels of the border around the person that the terms count too.
 MARGIN_PX = 5
-WEIGHTS: Mapping[str, float] = {
-    "composite": 0.4,
-    "decibels": 0.03,
-    "colour": 0.1,
-    "edges": 0.2,
-    "coarse": 0.2,
-    "mask": 0.1,
-    "background": 0.05,
-    "overlap": 0.1,
-}
-#: One minus MS-SSIM. It is computed only where it has a weight, because it takes several blurs.
+#: Weights of the default avatar's loss.
+WEIGHTS: Mapping[str, float] = {name: weight for name, weight in LossWeights().by_name().items() if weight}
+#: Name of the term that is one minus MS-SSIM. It is computed only if it has a weight, because it takes several blurs.
 STRUCTURE = "structure"
 LEAST_SQUARE = 1e-5
 
@@ -139,12 +139,13 @@ LEAST_SQUARE = 1e-5
 def loss_terms(
     output: Tensor, target: Tensor, behind: Tensor, weights: Mapping[str, float] = WEIGHTS
 ) -> dict[str, Tensor]:
-    """Return the terms by name, before weighting.
+    """Return the loss terms by name, before weighting.
 
-    `output`, `target` (N, 4, H, W): straight colour and mask, 0..1.
-    `behind` (N, 3, H, W): background of both, as `drawn_behind` draws it.
-    `weights`: weights by name; the one of `STRUCTURE` decides whether that term is computed.
-    The term `overlap` is the Dice loss, with one pixel more in numerator and denominator, so it is 0 without a person.
+    `overlap` is the Dice loss with 1 added to numerator and denominator, so that it is 0 without a person.
+
+    `output`, `target`: (N, 4, H, W) in 0..1, colour and mask, straight alpha.
+    `behind`: background (N, 3, H, W) of both, as `drawn_behind` returns it.
+    `weights`: weights by name. Only the weight of `STRUCTURE` matters: without it, that term is not computed.
     """
     mask, true_mask = output[:, 3:], target[:, 3:]
     near = _grown(true_mask)
@@ -172,10 +173,11 @@ def loss_terms(
 
 
 def missing_db(difference: Tensor, near: Tensor) -> Tensor:
-    """Return the loss of PSNR (N,) in dB that each picture's `difference` causes where `near` is 1.
+    """Return how far (N,), in dB, the PSNR of each picture is below 50 dB, over the pixels where `near` is 1.
 
-    `difference` (N, 3, H, W), `near` (N, 1, H, W). The loss counts from a mean square of `LEAST_SQUARE`, a PSNR of 50
-    dB, which is as good as no difference.
+    50 dB is the PSNR of the mean square `LEAST_SQUARE`, which is added to the pictures' mean square.
+
+    `difference`: (N, 3, H, W), picture minus target. `near`: (N, 1, H, W), 1 for pixels that count, else 0.
     """
     pixels = 3 * near.sum(dim=(1, 2, 3)) + 1
     square = (difference.square() * near).sum(dim=(1, 2, 3)) / pixels
@@ -183,7 +185,7 @@ def missing_db(difference: Tensor, near: Tensor) -> Tensor:
 
 
 def _grown(mask: Tensor) -> Tensor:
-    """Return (N, 1, H, W): 1 on the person of `mask` and up to `MARGIN_PX` around it, else 0."""
+    """Return (N, 1, H, W): 1 on the person in `mask` (N, 1, H, W) and up to `MARGIN_PX` around the person, else 0."""
     grown = mask.detach().contiguous()
     for along in ((1, 0), (0, 1)):
         kernel, padding = tuple(2 * MARGIN_PX * side + 1 for side in along), tuple(MARGIN_PX * side for side in along)
@@ -192,18 +194,18 @@ def _grown(mask: Tensor) -> Tensor:
 
 
 def total_loss(terms: Mapping[str, Tensor], weights: Mapping[str, float] = WEIGHTS) -> Tensor:
-    """Return the sum of the terms, weighted by `weights`; a term without a weight counts nothing."""
+    """Return the sum of `terms`, weighted by `weights`; a term without a weight counts as 0."""
     return torch.stack([weights.get(name, 0.0) * term for name, term in terms.items()]).sum()
 
 
 def composite(image: Tensor, behind: Tensor) -> Tensor:
-    """Composite `image` (N, 4, H, W) over `behind` (N, 3, H, W) and return (N, 3, H, W)."""
+    """Return `image` (N, 4, H, W), straight alpha, composited over `behind` (N, 3, H, W), as (N, 3, H, W)."""
     mask = image[:, 3:]
     return image[:, :3] * mask + behind * (1 - mask)
 
 
 def drawn_behind(target: Tensor) -> Tensor:
-    """Return a background (N, 3, H, W) for each picture of `target` (N, 4, H, W), drawn by PyTorch's random numbers."""
+    """Return a random background for each picture of `target` (N, 4, H, W), as (N, 3, H, W), from PyTorch's seed."""
     rng = np.random.default_rng(int(torch.randint(2**62, ())))
     drawn = backgrounds(len(target), (target.shape[2], target.shape[3]), rng)
     return torch.from_numpy(drawn).permute(0, 3, 1, 2).to(target.device)
@@ -211,12 +213,13 @@ def drawn_behind(target: Tensor) -> Tensor:
 
 # The perceptual loss by features of VGG-16, whose weights the user supplies as a file.
 #
-# Rule: the file is data: only tensors are read from it, and each must have the size that VGG-16 requires.
+# Rule: only tensors are read from the file, no code. Each tensor must have the shape that VGG-16 requires.
 
-#: Number of convolutions and channels of the five blocks, between which the picture is halved: Simonyan and Zisserman,
-#: Very deep convolutional networks for large-scale image recognition, 2014, table 1, column D.
+#: Number of convolutions and number of channels of each of the five blocks; the picture is halved between blocks.
+#: Source: Simonyan and Zisserman, Very deep convolutional networks for large-scale image recognition, 2014, table 1,
+#: column D.
 BLOCKS = ((2, 64), (2, 128), (3, 256), (3, 512), (3, 512))
-#: Mean and deviation of ImageNet's colours, for which the weights were trained.
+#: Mean and standard deviation of ImageNet's colours, by which VGG-16's input is normalised.
 MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 EXPECTED = "weights of VGG-16 by torchvision's names (features.0.weight ...)"
 SAFETENSORS = ".safetensors"
@@ -224,7 +227,7 @@ LEAST_LENGTH = 1e-10
 
 
 class Vgg16(nn.Module):
-    """The convolutions of VGG-16, without weights of its own; its parameters are never trained."""
+    """The convolutions of VGG-16. Their weights come from a file (`read_vgg16`) and are never trained."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -240,7 +243,7 @@ class Vgg16(nn.Module):
         self.requires_grad_(False)
 
     def forward(self, picture: Tensor) -> list[Tensor]:
-        """Return the last features of each block for `picture` (N, 3, H, W) in 0..1, sides at least 16."""
+        """Return the last features (N, C, h, w) of each block for `picture` (N, 3, H, W) in 0..1, sides at least 16."""
         x, found = (picture - self.mean) / self.deviation, list[Tensor]()
         for layer, after in pairwise([*self.features, nn.MaxPool2d(2)]):
             x = layer(x)
@@ -249,11 +252,11 @@ class Vgg16(nn.Module):
         return found
 
     def distance(self, one: Tensor, other: Tensor) -> Tensor:
-        """Return the perceptual distance (N,) of pictures (N, 3, H, W) in 0..1.
+        """Return the perceptual distance (N,) of the pictures `one` and `other` (N, 3, H, W) in 0..1.
 
-        It is the squared difference of features that are scaled to length 1, summed over blocks. Zhang et al., The
-        unreasonable effectiveness of deep features as a perceptual metric, 2018, formula 1, with all learned channel
-        weights set to 1.
+        It is the squared difference of features that are normalised to length 1, averaged over pixels and summed over
+        channels and blocks. Source: Zhang et al., The unreasonable effectiveness of deep features as a perceptual
+        metric, 2018, formula 1, with all learned channel weights set to 1.
         """
         parts = [
             (functional.normalize(mine, eps=LEAST_LENGTH) - functional.normalize(theirs, eps=LEAST_LENGTH))
@@ -266,9 +269,9 @@ class Vgg16(nn.Module):
 
 
 def read_vgg16(path: Path) -> Vgg16:
-    """Read the network from a state dict in the file `path` (.pth, .pt or .safetensors).
+    """Return the network with the weights of a state dict in the file `path` (.pth, .pt or .safetensors).
 
-    Raises BadInputError; MissingPartError for a .safetensors file where that package is not installed.
+    Raises BadInputError; MissingPartError for a .safetensors file if the package safetensors is not installed.
     """
     found, network = _tensors(path), Vgg16()
     for name, wanted in network.state_dict().items():
@@ -291,7 +294,7 @@ def _tensors(path: Path) -> dict[str, object]:
 
 
 def _saved_tensors(path: Path) -> dict[str, object]:
-    """Read what `torch.save` wrote; with `weights_only` the file can hold tensors and plain values, and no code."""
+    """Return the state dict in a file of `torch.save`. `weights_only` refuses pickled code."""
     found = torch.load(path, map_location="cpu", weights_only=True)
     if not isinstance(found, dict):
         raise ValueError(f"a {type(found).__name__}, not a state dict")
@@ -310,17 +313,17 @@ def _safe_tensors(path: Path) -> dict[str, object]:
         raise ValueError(str(error)) from error
 
 
-# Three discriminators, which tell pictures of the person from painted ones, and the terms that they add to the avatar's
-# loss.
+# Three discriminators, which learn to distinguish the avatar's pictures from ground truth, and the terms that they add
+# to the avatar's loss.
 #
-# Rule: the avatar's loss does not change the discriminators, and their loss does not change the avatar. They have no
-# normalisation, so that a picture's score does not depend on the others of its batch.
+# Rule: the avatar's loss does not change the discriminators, and the discriminators' loss does not change the avatar.
+# Discriminators have no normalisation, so that a picture's score does not depend on other pictures of its batch.
 #
 # The thesis has three networks of falling resolution and rising channels, each with one probability for a picture, and
-# does not say what each of the three sees. Here each sees the mask and the colours before a background, at the whole,
-# half and quarter size (Wang et al., High-resolution image synthesis with conditional GANs, 2018, section 3.2).
+# does not state their inputs. Here, each network reads the composited colours and the mask, at full, half or quarter
+# size (Wang et al., High-resolution image synthesis with conditional GANs, 2018, section 3.2).
 
-#: Factor by which the picture is shrunk for each discriminator.
+#: Factor by which the picture is shrunk, for each discriminator.
 SHRUNK = (1, 2, 4)
 SEEN_CHANNELS = 4
 #: Channels of a discriminator's levels, as multiples of its width; each level halves the picture.
@@ -330,9 +333,9 @@ BETAS = (0.9, 0.999)
 
 
 class Judgement(NamedTuple):
-    """The findings of a discriminator.
+    """The output of a discriminator.
 
-    `features`: features of each level, (N, C, H, W). `score` (N,): log odds that the picture is a true one.
+    `features`: features (N, C, H, W) of each level. `score`: log odds (N,) that the picture is ground truth.
     """
 
     features: list[Tensor]
@@ -340,7 +343,7 @@ class Judgement(NamedTuple):
 
 
 class Discriminator(nn.Module):
-    """Strided 3x3 convolutions, then a last 1x1 convolution whose output is averaged over the picture."""
+    """Strided 3x3 convolutions, then a 1x1 convolution whose output is averaged over the picture."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -360,12 +363,12 @@ class Discriminator(nn.Module):
 
 
 class Adversary:
-    """The discriminators and Adam, which trains them."""
+    """The discriminators and their optimiser."""
 
     def __init__(self, width: int, rate: float, seed: int, device: torch.device | str = "cpu") -> None:
         """Build the discriminators.
 
-        `width`: channels of the first level. `rate`: learning rate. `seed`: seed of the first weights.
+        `width`: number of channels of the first level. `rate`: learning rate. `seed`: seed of the initial weights.
         """
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed)
@@ -373,11 +376,13 @@ class Adversary:
         self.optimiser = torch.optim.Adam(self.discriminators.parameters(), lr=rate, betas=BETAS)
 
     def terms(self, output: Tensor, target: Tensor, behind: Tensor) -> dict[str, Tensor]:
-        """Return the terms that the avatar minimises against the discriminators.
+        """Return the loss terms `adversarial` and `features`, which the avatar minimises.
 
-        `output`, `target` (N, 4, H, W): straight colour and mask in 0..1; both are judged over `behind` (N, 3, H, W).
-        `adversarial` falls as the discriminators take painted pictures for true ones. `features` is the mean difference
-        of their features (feature matching).
+        `adversarial` falls when the discriminators take `output` for ground truth. `features` is the mean difference
+        between the features of `output` and of `target` (feature matching).
+
+        `output`, `target`: (N, 4, H, W) in 0..1, colour and mask, straight alpha.
+        `behind`: background (N, 3, H, W) of both.
         """
         self.discriminators.requires_grad_(False)
         painted, true = self._judged(output, behind), self._judged(target, behind)
@@ -391,9 +396,9 @@ class Adversary:
         return {"adversarial": fooled.mean(), "features": torch.stack(differences).mean()}
 
     def learn(self, output: Tensor, target: Tensor, behind: Tensor) -> float:
-        """Train the discriminators by one step on these pictures and return their mean error before it, in bits.
+        """Train the discriminators by one step, and return their mean error before the step, in bits.
 
-        The error is 1 bit where they guess.
+        The error of guessing is 1 bit. The parameters are those of `terms`.
         """
         wrong = [
             (bits(mine.score, true=False) + bits(theirs.score, true=True)) / 2
@@ -414,8 +419,8 @@ class Adversary:
 
 
 def bits(score: Tensor, true: bool) -> Tensor:
-    """Return the mean binary cross entropy of log odds `score` (N,), in bits (thesis, formula 3.1).
+    """Return the mean binary cross entropy of the log odds `score` (N,), in bits (thesis, formula 3.1).
 
-    `true`: whether all the pictures are true ones; else all are painted.
+    `true`: whether all pictures are ground truth; otherwise all are the avatar's.
     """
     return functional.softplus(-score if true else score).mean() / math.log(2)

@@ -1,6 +1,6 @@
-"""Random cameras around a posed body, by band: how much of the body fills the screen; and random poses for it.
+"""Random cameras around a posed body, and random poses. A camera's band tells how much of the body fills the screen.
 
-Rule: a close-up is taken by a camera that is near or has a long lens; pixels are never enlarged.
+Rule: the camera of a close-up is near or has a long lens; pixels are never enlarged.
 """
 
 from __future__ import annotations
@@ -22,9 +22,10 @@ from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.training.clothing import Layer
 
 NEAR_M, FAR_M = 0.05, 100.0
+#: Least distance of a camera from the joint that it aims at.
 NEAREST_M = 0.45
-#: For each band, the joints that a camera may aim at, and the least and greatest height that fills the screen, metres
-#: at the aim.
+#: For each band, the joints that a camera may aim at, and the least and greatest height in metres, at the distance of
+#: the joint, that fills the screen.
 BANDS: dict[str, tuple[tuple[str, ...], float, float]] = {
     "far": (("pelvis", "spine1"), 4.5, 10.0),
     "full_body": (("pelvis", "spine1"), 1.9, 3.4),
@@ -50,7 +51,7 @@ FOV_DEG = (24.0, 60.0)
 
 @dataclass(frozen=True)
 class View:
-    """A random camera.
+    """A camera and its screen.
 
     `view`, `projection`: OpenGL matrices (4,4). `aspect`: width of the screen over its height.
     """
@@ -61,7 +62,7 @@ class View:
 
     @property
     def near_reach_m(self) -> float:
-        """Distance in metres from the camera to a corner of its near plane, which cuts nothing that is farther away."""
+        """Distance in metres from the camera to a corner of its near plane: farther points are never cut."""
         half_height = 1 / self.projection[1, 1]
         return NEAR_M * float(np.sqrt(1 + half_height**2 * (1 + self.aspect**2)))
 
@@ -88,9 +89,9 @@ def random_view(rng: np.random.Generator, band: str, joints: F64) -> View:
 
 
 def look_at(eye: F64, at: F64, roll: float = 0.0) -> F64:
-    """Return the matrix (4,4) from world to camera for a camera at `eye` that looks at `at`.
+    """Return the matrix (4,4) from world to camera for a camera at `eye` (3,) that looks at `at` (3,).
 
-    `roll`: angle about the direction of sight, radians.
+    `roll`: angle about the viewing direction, radians.
     """
     z = (eye - at) / np.linalg.norm(eye - at)
     x = np.cross([0.0, 1.0, 0.0], z)
@@ -104,7 +105,7 @@ def look_at(eye: F64, at: F64, roll: float = 0.0) -> F64:
 
 
 def perspective(fov_y: float, aspect: float, near: float = NEAR_M, far: float = FAR_M) -> F64:
-    """Return an OpenGL projection (4,4).
+    """Return an OpenGL projection matrix (4,4).
 
     `fov_y`: vertical field of view, radians.
     `aspect`: width over height.
@@ -122,7 +123,7 @@ def _pitch(rng: np.random.Generator) -> float:
     return float(rng.triangular(low, 5.0, high))
 
 
-# The crop of a sample: the pipeline's rectangle, bucket and projection for one body in one view.
+# The crop of a sample: the pipeline's crop rectangle, shape bucket and projection for one body in one view.
 #
 # Rule: crops are computed by the functions that the pose stage calls, so training sees what the pipeline draws.
 
@@ -134,8 +135,8 @@ OUTPUT_ROWS = 480
 class Crop:
     """The crop of a sample.
 
-    `shape`: shape of the tensor. `projection` (4,4): projection of the crop. `pixels`: number of screen pixels in the
-    body's rectangle.
+    `shape`: (height, width) of the tensor. `projection`: projection matrix (4,4) of the crop. `pixels`: number of
+    screen pixels in the body's rectangle.
     """
 
     shape: Shape
@@ -144,17 +145,14 @@ class Crop:
 
 
 class Cropper:
-    """Crops of one shaped body."""
+    """Computes crops of one shaped body."""
 
     def __init__(self, shaped: ShapedBody, pose_blend: bool = False) -> None:
-        """Make crops of `shaped`.
-
-        `pose_blend`: whether its pose blend shapes, if any, are drawn.
-        """
+        """Prepare crops of `shaped`. `pose_blend`: whether the pose blend shapes of the body, if any, are drawn."""
         self._bounds = MeshBounds(shaped, standoff_m=CLOTHES_STANDOFF_M, pose_blend=pose_blend)
 
     def crop(self, posed: Posed, view: View, buckets: Sequence[Shape]) -> Crop | None:
-        """Return the crop of the body as seen from `view`; None when the body is not seen.
+        """Return the crop of the body in the pose `posed`, as seen from `view`; None if the body is not seen.
 
         `buckets`: tensor shapes to choose from.
         """
@@ -167,14 +165,14 @@ class Cropper:
         return Crop(shape, crop_projection(view.projection, grown), pixels)
 
 
-# Finds cameras that stand clear of a clothed body: their near plane cannot cut it.
+# Finds cameras that are clear of a clothed body: the near plane cannot cut the body.
 #
-# Rule: a cut body has no ground truth, because its picture shows the inside of clothes and limbs. The bound comes from
-# the triangles themselves, so that every other near view stays.
+# Rule: a cut body has no ground truth, because its picture shows the inside of clothes and limbs. The limit on the
+# distance follows from the triangles, so that no more close views than necessary are rejected.
 
 
 class ClothedSurface:
-    """The surface of all `layers` of a clothed body, as points that each stand for the triangles around them."""
+    """The surface of all `layers` of a clothed body, as balls around the vertices that cover all triangles."""
 
     def __init__(self, layers: Sequence[Layer]) -> None:
         self._rest = np.concatenate([layer.vertices for layer in layers])
@@ -182,23 +180,25 @@ class ClothedSurface:
         self._reach = np.concatenate([vertex_reach(layer.vertices, layer.faces) for layer in layers])
 
     def posed(self, posed: Posed) -> F64:
-        """Return the points (N,3), world metres, in the pose `posed`."""
+        """Return the vertices (N,3) of all layers, world metres, in the pose `posed`."""
         matrices = posed.matrices.reshape(JOINTS, 12).astype(np.float64)
         moved = blend_matrices(self._weights, matrices).reshape(-1, 3, 4)
         return np.asarray(np.einsum("vab,vb->va", moved[:, :, :3], self._rest) + moved[:, :, 3])
 
     def is_clear_of(self, view: View, points: F64) -> bool:
-        """Return whether the near plane of `view` cannot cut the surface whose `points` the method `posed` returned."""
+        """Return whether the near plane of `view` cannot cut the surface. `points`: vertices (N,3) from `posed`."""
         eye = np.linalg.inv(view.view)[:3, 3]
         distance = np.linalg.norm(points - eye, axis=1)
         return bool((distance - self._reach).min() > view.near_reach_m)
 
 
 def vertex_reach(vertices: F64, faces: NDArray[np.int64]) -> F64:
-    """Return a radius (N,) in metres around each vertex: the balls at a triangle's corners cover the triangle.
+    """Return the radius (N,), metres, of a ball around each vertex, so that the balls cover all triangles.
 
-    A triangle's point is at most its longest edge over the root of 3 from the nearest corner; the middle of an
-    equilateral triangle reaches that. `vertices` (N,3), `faces` (F,3).
+    A point of a triangle is at most the longest edge / √3 away from the nearest corner. The middle of an equilateral
+    triangle is exactly so far away.
+
+    `vertices`: (N,3), metres. `faces`: (F,3).
     """
     corners = vertices[faces]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -207,11 +207,13 @@ def vertex_reach(vertices: F64, faces: NDArray[np.int64]) -> F64:
     return reach
 
 
-# Random natural poses, drawn from a table of attitudes (stand, walk, reach, ...) with ranges of joint angles.
+# Random natural poses: a random attitude of a table (stand, walk, reach, ...) with random joint angles.
 #
-# Rule: a pose depends only on the random generator. No recorded or built-in motion is used, so those can be held out.
+# Rule: a pose depends only on the random generator. Recorded and built-in motions are not used, so they can be held
+# out.
 
-#: Standard deviation, in degrees about x, y, z, of the angles added to the joints of every pose. Fingers: `_curl_hand`.
+#: Standard deviation, in degrees about x, y, z, of the random angles that are added to every pose. Fingers have
+#: `_curl_hand` instead.
 JITTER_DEG = {
     "spine1": (5, 5, 3),
     "spine2": (4, 5, 3),
@@ -241,9 +243,9 @@ SIDES = {"left": 1.0, "right": -1.0}
 
 
 def random_pose(rng: np.random.Generator) -> F64:
-    """Return axis-angle rotations (55,3), radians, in SMPL-X joint order.
+    """Return a random pose: axis-angle rotations (55,3), radians, in SMPL-X joint order.
 
-    The root only leans, because the cameras go around it.
+    The root leans but does not turn about Y, because random cameras turn about the body.
     """
     pose = np.zeros((JOINTS, 3))
     ATTITUDES[_pick(rng, WEIGHTS)](pose, rng)
@@ -320,10 +322,10 @@ WEIGHTS = {"stand": 0.20, "walk": 0.26, "reach": 0.20, "overhead": 0.15, "sit": 
 
 
 def _arm(pose: F64, side: str, raised: float, swung: float, bent: float, twisted: float = 0.0) -> None:
-    """Set one arm of `pose`, in degrees from the T pose.
+    """Set one arm of `pose`. All angles are degrees from the T pose.
 
-    `raised` 90 is overhead, -90 hanging; `swung` > 0 is backwards; `bent` is the elbow's angle; `twisted` < 0 turns the
-    forearm upwards.
+    `raised`: 90 is overhead, -90 is hanging. `swung`: positive is backwards. `bent`: angle of the elbow. `twisted`:
+    turn about the upper arm; negative turns a bent forearm upwards.
     """
     sign = SIDES[side]
     hanging, level = max(0.0, -np.sin(np.radians(raised))), np.cos(np.radians(raised))
@@ -334,9 +336,9 @@ def _arm(pose: F64, side: str, raised: float, swung: float, bent: float, twisted
 
 
 def _leg(pose: F64, side: str, flexed: float, bent: float, spread: float) -> None:
-    """Set one leg of `pose`, in degrees from standing.
+    """Set one leg of `pose`. All angles are degrees from standing upright.
 
-    `flexed` < 0 lifts the thigh forwards, `bent` is the knee's angle, `spread` moves the leg to the side.
+    `flexed`: negative lifts the thigh forwards. `bent`: angle of the knee. `spread`: turn of the leg to its side.
     """
     sign = SIDES[side]
     turn = about(2, np.radians(sign * spread)) @ about(0, np.radians(flexed))

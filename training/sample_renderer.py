@@ -1,7 +1,7 @@
-"""Renders one sample of the training: the UV image of the default body and a picture of it clothed.
+"""Renders training samples of the default body: the UV image of the body, and a picture of the clothed body.
 
-Rule: crop, tensor shape and both rasters are the pipeline's. A sample depends only on its seed. No near plane cuts the
-body or its clothes.
+Rule: crop, tensor shape and rasterisation are those of the pipeline. A sample depends only on its seed. No near plane
+cuts the body or its clothes.
 """
 
 from __future__ import annotations
@@ -35,16 +35,17 @@ PoseSource = Callable[[np.random.Generator], F64]
 
 @dataclass(frozen=True)
 class Sample:
-    """A sample to render.
+    """A planned sample of the synthetic person.
 
-    `pose`: axis-angle (55,3), radians. `band`: an index into BAND_NAMES, or ANYWHERE_BAND.
+    `pose`: axis-angle (55,3), radians. `view`: camera of the whole screen. `crop`: part of the screen that the tensor
+    shows. `band`: an index into BAND_NAMES, or ANYWHERE_BAND.
     """
 
     pose: F64
     view: View
     crop: Crop
     band: int
-    picture: int = 0  # samples of the synthetic person are cut from no frame
+    picture: int = 0  # number of a capture's frame, see `Planned`; the synthetic person has no frames
 
 
 class SampleRenderer:
@@ -53,10 +54,10 @@ class SampleRenderer:
     def __init__(self, shaped: ShapedBody, threads: int | None = None, samples: int = 2, look: Look = DEFAULT) -> None:
         """Put clothes on the body and open the context.
 
-        `shaped`: body. The UV image is drawn with its offsets, if any; clothes are put on the skin.
-        `threads`: threads of a software OpenGL driver; None for its default.
-        `samples`: samples of the ground truth along each side of a pixel, an even number.
-        `look`: clothes of the body; the build is that of `shaped`.
+        `shaped`: body. The UV image is drawn with the body's offsets, if any; clothes are put on the skin.
+        `threads`: number of threads of a software OpenGL driver; None for the driver's default.
+        `samples`: number of samples of the ground truth along each side of a pixel, even.
+        `look`: clothes and colours. The shape of the body is that of `shaped`.
         Raises MissingPartError without OpenGL.
         """
         body = shaped.body
@@ -74,10 +75,12 @@ class SampleRenderer:
         self.clothed_body = ClothedBody(self.ctx, layers, landmarks, samples, look)
 
     def plan(self, seed: Sequence[int], source: PoseSource, band: str, size: str) -> Sample:
-        """Plan the sample of `seed`: draw views until enough of the body is on the screen and none of it is cut.
+        """Return the planned sample of `seed`: a pose, and the first random view that is usable.
 
-        `seed`: numbers that alone decide the sample.
-        `source`: draws the pose.
+        A view is usable if enough of the body is on the screen and the near plane cuts nothing.
+
+        `seed`: numbers that seed the random generator.
+        `source`: function that returns a pose from the random generator.
         `band`: a name of BANDS, or `anywhere`.
         `size`: tensor size, as `shape_buckets` takes it.
         """
@@ -94,16 +97,19 @@ class SampleRenderer:
                 return Sample(pose, view, crop, BAND_NAMES.index(band) if band in BANDS else ANYWHERE_BAND)
 
     def training_sample(self, seed: Sequence[int], band: str, size: str) -> Sample:
-        """Plan a sample as `plan` does, in a random pose."""
+        """Return the planned sample of `seed` in a random pose, see `plan`."""
         return self.plan(seed, random_pose, band, size)
 
     def placed(self, sample: Sample) -> tuple[F64, Placement]:
-        """Return the camera (4,4) of `sample`, and its body as the packed pass draws it; valid until the next pose."""
+        """Return the view matrix (4,4) of `sample`, and the placement of its body for the GPU unit's packed pass.
+
+        The placement is valid until the next call that poses the body.
+        """
         joints, crop = self.skeleton.pose(sample.pose).matrices, sample.crop
         return sample.view.view, Placement(joints, crop.projection, (0, 0, *crop.shape))
 
     def render(self, sample: Sample) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Return the UV image (h,w,3) float32 of u, v, coverage, and the ground truth (h,w,4) uint8, straight alpha."""
+        """Return the UV image (h,w,3) float32 (u, v, coverage) and the ground truth (h,w,4) uint8, straight alpha."""
         joints = self.skeleton.pose(sample.pose).matrices
         crop = sample.crop
         uv = self._uv.render(joints, sample.view.view, crop.projection, crop.shape)
@@ -111,13 +117,13 @@ class SampleRenderer:
         return uv, rgba
 
 
-# The UV image of a skinned mesh: u and v of every pixel, as float32 or as bytes, before any texture is read.
+# The UV image of a skinned mesh: u and v of every pixel, as float32 or as bytes.
 #
-# Rule: vertices, rasterisation and pixel centres are those of the packed pass; there is no antialiasing.
+# Rule: vertices, rasterisation and pixel centres are those of the GPU unit's packed pass. There is no antialiasing.
 
 
 class _MeshTarget:
-    """Draws a mesh with one fragment shader into framebuffers, and keeps one for each shape."""
+    """Draws a mesh with one fragment shader into framebuffers; keeps a framebuffer for each picture shape."""
 
     def __init__(self, ctx: Any, mesh: SkinnedMesh, fragment: str, components: int, dtype: str) -> None:
         self._ctx, self._mesh = ctx, mesh
@@ -126,7 +132,7 @@ class _MeshTarget:
         self._targets: dict[tuple[int, int], Any] = {}
 
     def draw(self, pose: BodyPose, view: Floats, projection: Floats, shape: tuple[int, int]) -> Any:
-        """Return the framebuffer of `shape` with the mesh in it; pixels elsewhere are 0."""
+        """Draw the mesh and return the framebuffer of `shape`; pixels off the mesh are 0."""
         target = self._target(shape)
         target.use()
         self._mesh.prepare(self._ctx)
@@ -143,7 +149,7 @@ class _MeshTarget:
 
 
 class UvRaster:
-    """Draws a mesh into UV images of float32."""
+    """Draws a mesh into float32 UV images."""
 
     def __init__(self, ctx: Any, mesh: SkinnedMesh) -> None:
         self._target = _MeshTarget(ctx, mesh, "uv_and_coverage.frag", 4, "f4")
@@ -151,14 +157,14 @@ class UvRaster:
     def render(
         self, joints: F32, view: Floats, projection: Floats, shape: tuple[int, int], feature: F32 | None = None
     ) -> F32:
-        """Return the UV image (h,w,3) float32 of u, v, coverage, row 0 on top.
+        """Return the UV image (h,w,3) float32 (u, v, coverage), row 0 on top.
 
-        Coverage is 1 on the mesh; pixels elsewhere are 0, 0, 0.
+        Coverage is 1 on the mesh; pixels off the mesh are 0, 0, 0.
 
         `joints`: skinning matrices (55,3,4).
         `view`, `projection`: matrices (4,4) of the camera; for a crop, the crop's projection.
         `shape`: (height, width) of the image.
-        `feature`: (486,) of a mesh with pose blend shapes.
+        `feature`: factors (486,) of pose blend shapes; None if the mesh has none.
         """
         pixels = np.empty((*shape, 4), np.float32)
         target = self._target.draw(BodyPose(joints, feature), view, projection, shape)
@@ -167,7 +173,7 @@ class UvRaster:
 
 
 class UvBytes:
-    """Draws a mesh into images of two bytes a pixel, for networks that read UV coordinates instead of a texture."""
+    """Draws a mesh into UV images of two bytes a pixel, for networks whose input is UV coordinates without texture."""
 
     def __init__(self, ctx: Any, mesh: SkinnedMesh) -> None:
         self._target = _MeshTarget(ctx, mesh, "uv_only.frag", 2, "f1")
@@ -184,10 +190,10 @@ class UvBytes:
         target.read_into(tensor, components=2, alignment=1)
 
 
-# The clothed body on the GPU: all its layers, each with its paint, drawn together.
+# The clothed body on the GPU: all layers, painted by `paint.frag`.
 #
-# Rule: pictures come from the GPU stage's own raster, with the layers and the uniforms of `paint.frag`. The shader
-# writes linear light; samples are averaged in linear light, then written as sRGB.
+# Rule: the layers are drawn by `MeshDraw` of the GPU stages. The shader writes linear light; samples are averaged in
+# linear light, then encoded as sRGB.
 
 WEIGHTS_PER_VERTEX = 8
 PAINT = Path(__file__).with_name("paint.frag")
@@ -197,7 +203,7 @@ class ClothedBody:
     """Draws the layers of a clothed body."""
 
     def __init__(self, ctx: Any, layers: list[Layer], landmarks: Landmarks, samples: int, look: Look = DEFAULT) -> None:
-        """Put the layers on the GPU.
+        """Upload the layers to the GPU.
 
         `ctx`: OpenGL context.
         `layers`: layers from `clothing_layers`.
@@ -214,7 +220,7 @@ class ClothedBody:
         self._targets: dict[tuple[int, int], tuple[Any, Any, Any]] = {}
 
     def render(self, joints: F32, view: Floats, projection: Floats, shape: tuple[int, int]) -> U8:
-        """Return the picture (h,w,4) uint8, sRGB, straight alpha, row 0 on top; 0, 0, 0, 0 where no layer is.
+        """Return the picture (h,w,4) uint8, sRGB, straight alpha, row 0 on top; pixels off all layers are 0.
 
         `joints`: skinning matrices (55,3,4).
         `view`, `projection`: matrices (4,4) of the camera.
@@ -264,7 +270,7 @@ def _mesh(ctx: Any, layer: Layer) -> SkinnedMesh:
 
 
 def _places(landmarks: Landmarks) -> dict[str, Any]:
-    """Return the uniforms of `paint.frag` that say where things are on the body."""
+    """Return the uniforms of `paint.frag` that hold landmarks, by name."""
     joints = landmarks.joints
     named = {
         "pelvis": joints[joint.PELVIS],

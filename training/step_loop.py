@@ -31,7 +31,7 @@ from trilane.training.trainable_avatar import ByteGrid, TrainableAvatar, load_ba
 from trilane.training.training_settings import OptimiserOptions, TrainingSettings
 from trilane.writing import write_atomically
 
-#: Share of the steps in which the learning rate rises.
+#: The learning rate rises during this share of the steps, at the beginning.
 WARM_UP = 0.02
 #: Number of steps that are measured to estimate the duration of a training.
 MEASURED = 4

@@ -214,7 +214,8 @@ class Outline(NamedTuple):
 class StandOff:
     """Measured offsets.
 
-    `offsets`: (V,3), metres at rest. `measured`: share of the vertices with a measurement; the others are interpolated.
+    `offsets`: (V,3), metres at rest. `measured`: share of the vertices with a measurement. The offsets of the other
+    vertices are interpolated.
     """
 
     offsets: F32
@@ -294,7 +295,7 @@ def smoothed(values: F64, certainty: F64, faces: Ints) -> F64:
 
 
 class _Pixels:
-    """Samples `covered` and `mask` of an outline at points."""
+    """Reads the images `covered` and `mask` of an outline at given points."""
 
     def __init__(self, outline: Outline) -> None:
         self._outline = outline

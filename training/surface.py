@@ -1,6 +1,6 @@
-"""The surface of a body at rest: its arrays, and the geometry of triangles that clothes and textures are made from.
+"""The surface of a body at rest: its arrays, and functions on triangle meshes for making clothes and textures.
 
-Rule: arrays are float64 and int64, so that the geometry is computed without rounding to float32.
+Rule: arrays are float64 and int64, so that no result is rounded to float32.
 """
 
 from __future__ import annotations
@@ -18,7 +18,8 @@ from trilane.body.body import ShapedBody
 class BodyArrays:
     """Arrays of a body at rest.
 
-    `vertices` (V,3) metres, `faces` (F,3), `uv` (T,2), `uv_faces` (F,3), `weights` (V,55), `joints` (55,3) metres.
+    `vertices`: (V,3), metres. `faces`: (F,3) indices of vertices. `uv`: texture coordinates (T,2). `uv_faces`: (F,3)
+    indices of `uv`. `weights`: skin weights (V,55). `joints`: (55,3), metres.
     """
 
     vertices: F64
@@ -30,7 +31,7 @@ class BodyArrays:
 
 
 def body_arrays(shaped: ShapedBody) -> BodyArrays:
-    """Return the arrays of a body, from which clothes are made."""
+    """Return the arrays of `shaped`, as float64 and int64."""
     body = shaped.body
     return BodyArrays(
         vertices=shaped.vertices.astype(np.float64),
@@ -44,11 +45,14 @@ def body_arrays(shaped: ShapedBody) -> BodyArrays:
 
 # Geometry of triangle surfaces: normals, areas, smoothing, shells that stand off, obscurance.
 #
-# Rule: functions take arrays and return arrays; none knows a body or a garment.
+# Rule: functions take and return arrays; they know nothing of bodies and garments.
 
 
 def vertex_normals(vertices: F64, faces: Ints) -> F64:
-    """Return unit normals (V,3) of the vertices: face normals weighted by area. A vertex without a face has +Y."""
+    """Return unit normals (V,3) of the vertices: mean face normals, weighted by area; +Y for a vertex without a face.
+
+    `vertices`: (V,3). `faces`: (F,3).
+    """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     face_normal = np.cross(b - a, c - a)
     total = np.stack([_scatter(faces, np.repeat(face_normal[:, k], 3), len(vertices)) for k in range(3)], axis=1)
@@ -57,14 +61,17 @@ def vertex_normals(vertices: F64, faces: Ints) -> F64:
 
 
 def vertex_areas(vertices: F64, faces: Ints) -> F64:
-    """Return a third of the area of the faces around each vertex (V,), square metres."""
+    """Return the area (V,) of each vertex: a third of the total area of its faces, square metres."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6.0
     return _scatter(faces, np.repeat(area, 3), len(vertices))
 
 
 class Smoother:
-    """Computes means over the neighbours of each vertex of a mesh; a vertex without a face keeps its value."""
+    """Smooths values at the vertices of a mesh by means over neighbours. A vertex without a face keeps its value.
+
+    `faces`: (F,3). `count`: number V of vertices.
+    """
 
     def __init__(self, faces: Ints, count: int) -> None:
         edges = np.unique(np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1), axis=0)
@@ -74,24 +81,24 @@ class Smoother:
         self._count = count
 
     def mean(self, values: F64) -> F64:
-        """Return the mean of the neighbours' `values`, (V,) or (V,C), in the same shape."""
+        """Return the mean of the neighbours' values at each vertex; `values` and result are (V,) or (V,C)."""
         columns = values.reshape(self._count, -1)
         sums = [np.bincount(self._to, weights=column[self._from], minlength=self._count) for column in columns.T]
         around = np.stack(sums, axis=1) / np.maximum(self._degree, 1)[:, None]
         return np.where(self._degree[:, None] > 0, around, columns).reshape(values.shape)
 
     def smooth(self, values: F64, rounds: int) -> F64:
-        """Return `values` moved half way to the mean of the neighbours, `rounds` times."""
+        """Return `values` (V,) or (V,C), moved half way to the mean of the neighbours, `rounds` times."""
         for _ in range(rounds):
             values = 0.5 * (values + self.mean(values))
         return values
 
 
 def shell(vertices: F64, faces: Ints, offset: F64, least: F64, rounds: int) -> F64:
-    """Return a smooth surface (V,3) over a mesh, which bridges hollows as cloth does.
+    """Return the vertices (V,3) of a smooth surface over a mesh, which bridges hollows as cloth does.
 
-    The mesh is raised along smoothed normals. Each round then smooths the surface and lifts it back along the normals
-    to its least height.
+    The mesh is raised along smoothed normals. Each round then smooths the surface, and lifts vertices that sank too low
+    back along the normals.
 
     `vertices`, `faces`: mesh, (V,3) and (F,3).
     `offset`: height by which the mesh is raised, (V,), metres.
@@ -110,12 +117,12 @@ def shell(vertices: F64, faces: Ints, offset: F64, least: F64, rounds: int) -> F
 
 
 def obscurance(points: F64, normals: F64, emitters: F64, emitter_normals: F64, areas: F64, reach: float) -> F64:
-    """Return the share of light (N,) in 0..1 that reaches points past discs that stand in the way.
+    """Return the share (N,) of ambient light, in 0..1, that reaches points past discs that occlude it.
 
     The share follows from disc-to-point form factors: M. Bunnell, Dynamic Ambient Occlusion and Indirect Lighting, GPU
     Gems 2, 2005.
 
-    `points`, `normals`: places (N,3) where the light is computed.
+    `points`, `normals`: points (N,3) at which the light is computed, and normals (N,3) there.
     `emitters`, `emitter_normals`: centres and normals (M,3) of the discs.
     `areas`: areas (M,) of the discs, square metres.
     `reach`: distance in metres at which a disc's effect has faded out.
@@ -137,7 +144,7 @@ def obscurance(points: F64, normals: F64, emitters: F64, emitter_normals: F64, a
 
 
 def smoothstep(low: float, high: float, values: F64) -> F64:
-    """Return 0 at `low`, 1 at `high`, a cubic between them and a constant beyond; `low` may exceed `high`."""
+    """Return GLSL's smoothstep of `values`: 0 at `low`, 1 at `high`, a cubic between. `low` may exceed `high`."""
     t = np.clip((values - low) / (high - low), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 

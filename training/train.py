@@ -1,7 +1,7 @@
-"""Trains an avatar of a capture or of a clothed default body: draws samples, trains by steps, quantises and measures.
+"""Trains an avatar of a capture or of the clothed default body: renders samples, trains, quantises and measures.
 
-Rule: finished work is kept in the work folder and not done again. Each part of the work says what it will cost before
-it starts.
+Rule: finished work is kept in the work folder and not repeated. Each part of the work reports its expected duration
+before it starts.
 """
 
 from __future__ import annotations
@@ -70,9 +70,10 @@ DEFAULT_NETWORK = Path(__file__).with_name("default-network.npz")
 SAMPLES, SAMPLE_FACTS, STATE, NETWORK, SHEETS = "samples", "samples.json", "state.npz", "network.npz", "sheets"
 LOSS_BEFORE = "loss-before.json"
 LEAST_STEPS = 10
-#: Most sheets of a training, evenly over its steps, and least steps between two: a sheet takes about as long as a step.
+#: Most sheets of a training, evenly over its steps, and least number of steps between two sheets. A sheet takes about
+#: as long as a step.
 SHEET_COUNT, SHEET_STEPS = 10, 10
-#: Seconds between two states that are written to the disk.
+#: Least number of seconds between two states that are written to the disk.
 SAVE_S = 60.0
 ANOTHER_WORK = "use another --work folder, or remove this one"
 
@@ -81,9 +82,9 @@ ANOTHER_WORK = "use another --work folder, or remove this one"
 class TrainingPlaces:
     """Folders and files of one training.
 
-    `capture`: folder of the capture; None where the settings have a look. `out`: folder of the bundle. `work`: folder
-    of samples, state and sheets. `name`: name of the avatar. `vgg`: file of VGG-16's weights, for a perceptual loss by
-    its features.
+    `capture`: folder of the capture; None if the settings have a look. `out`: folder of the bundle. `work`: folder of
+    samples, state and sheets. `name`: name of the avatar. `vgg`: file of VGG-16's weights for the perceptual loss, or
+    None.
     """
 
     capture: Path | None
@@ -97,20 +98,20 @@ class Listener(Protocol):
     """Receives messages about the progress of the work."""
 
     def say(self, line: str) -> None:
-        """Take a line about what was found, or what the next part of the work costs."""
+        """Receive a line about a result, or about the expected duration of the next part of the work."""
 
     def track(self, text: str, numbers: Iterable[Any], total: int) -> Iterable[Any]:
-        """Yield the `total` items of `numbers` and show how far the work `text` is."""
+        """Yield the `total` items of `numbers`, and show the progress of the work that `text` names."""
 
     def trained(self, step: int, total: int, terms: dict[str, float], loss: float) -> None:
-        """Take the `terms` of the loss at `step` of `total`, before weighting, and their weighted sum `loss`."""
+        """Receive the `terms` of the loss after `step` of `total` steps, before weighting, and their weighted sum."""
 
 
 def train_avatar(places: TrainingPlaces, asked: TrainingSettings, listener: Listener) -> dict[str, Any]:
-    """Train as `asked`, write the bundle, and return facts about the training and about held-out frames.
+    """Train as `asked`, write the bundle, and return facts about the training and the error on held-out frames.
 
-    A training that was ended before goes on from its last state.
-    Raises BadInputError; FaultyCaptureError with all faults; MissingPartError without OpenGL.
+    An interrupted training continues from its last state.
+    Raises BadInputError; FaultyCaptureError with all faults of the capture; MissingPartError without OpenGL.
     """
     started = time.monotonic()
     settings = resumed_settings(places.work / NAME, with_vgg(asked, places.vgg))
@@ -155,7 +156,10 @@ def train_avatar(places: TrainingPlaces, asked: TrainingSettings, listener: List
 
 
 def _subject(places: TrainingPlaces, settings: TrainingSettings, listener: Listener) -> Subject:
-    """Return the person of the capture, or the default body in a look. Raises BadInputError for both or none."""
+    """Return the person of the capture, or the default body in the look of the settings, as a subject.
+
+    Raises BadInputError if there are both a capture and a look, or neither.
+    """
     if places.capture is None:
         if settings.look is None:
             raise BadInputError("CAPTURE", "none", "the folder of a capture", "or settings (--config) with a `look`")
@@ -166,7 +170,10 @@ def _subject(places: TrainingPlaces, settings: TrainingSettings, listener: Liste
 
 
 def with_vgg(asked: TrainingSettings, file: Path | None) -> TrainingSettings:
-    """Add the digest of the weights in `file` to `asked`. Raises BadInputError where only one of the two is given."""
+    """Return `asked` with the digest of `file`, the weights of VGG-16; unchanged without a file.
+
+    Raises BadInputError for a digest without a file, a file with another digest, or a file without perceptual loss.
+    """
     if file is None:
         if asked.vgg is not None:
             raise BadInputError("vgg", "no file of weights", f"that with SHA-256 {asked.vgg}", "give it with --vgg")
@@ -180,7 +187,7 @@ def with_vgg(asked: TrainingSettings, file: Path | None) -> TrainingSettings:
 
 
 def _raised(subject: Subject, places: TrainingPlaces, settings: TrainingSettings, listener: Listener) -> Subject:
-    """Add the offsets of clothes and hair to `subject` where the settings ask for them."""
+    """Return `subject` with offsets of clothes and hair, if the settings want them; else unchanged."""
     if not settings.stand_off:
         return subject
 
@@ -191,9 +198,9 @@ def _raised(subject: Subject, places: TrainingPlaces, settings: TrainingSettings
 
 
 def resumed_settings(path: Path, asked: TrainingSettings) -> TrainingSettings:
-    """Return the settings in the file `path` where a training has begun there, else `asked`.
+    """Return the settings in the file `path` of an interrupted training; without that file, `asked`.
 
-    A number of steps that was worked out before stays. Raises BadInputError when the file differs from `asked`.
+    If `asked` has no number of steps, the file's number stays. Raises BadInputError when the file differs from `asked`.
     """
     if not path.exists():
         return asked
@@ -208,7 +215,10 @@ def resumed_settings(path: Path, asked: TrainingSettings) -> TrainingSettings:
 
 
 def _draw_samples(subject: Subject, places: TrainingPlaces, settings: TrainingSettings, listener: Listener) -> None:
-    """Draw the samples into the work folder, unless they are there. Raises BadInputError where other samples are."""
+    """Render the samples into the work folder, if they are not there yet.
+
+    Raises BadInputError if the folder has samples of other settings.
+    """
     facts = places.work / SAMPLE_FACTS
     decides = ("samples", "seed", "stand_off")
     who = {"look": settings.look} if places.capture is None else {"capture": str(places.capture.resolve())}
@@ -233,7 +243,7 @@ def _draw_samples(subject: Subject, places: TrainingPlaces, settings: TrainingSe
 
 
 def _sample_cost(subject: Subject, samples: list[Planned], settings: TrainingSettings) -> str:
-    """Say what drawing `samples` costs, by drawing some of them."""
+    """Return a line about the time and disk space for rendering `samples`, estimated by rendering some of them."""
     start, tried = time.monotonic(), samples[:: max(1, len(samples) // 4)][:4]
     for sample in tried:
         subject.renderer.render(sample)
@@ -246,7 +256,7 @@ def _sample_cost(subject: Subject, samples: list[Planned], settings: TrainingSet
 
 
 def _first_avatar(subject: Subject, places: TrainingPlaces, settings: TrainingSettings) -> TrainableAvatar:
-    """Return what training starts from; once a state is on the disk, only its shapes matter."""
+    """Return the avatar that training starts from. If a state is on the disk, only the avatar's shapes matter."""
     groups = open_groups(places.work / SAMPLES)
     network = UNet(norm=settings.norm, width=settings.width, channels=CHANNELS, input_skip=True)
     if (places.work / STATE).exists():
@@ -266,7 +276,10 @@ def _first_avatar(subject: Subject, places: TrainingPlaces, settings: TrainingSe
 def _with_steps(
     avatar: TrainableAvatar, places: TrainingPlaces, settings: TrainingSettings, vgg: Vgg16 | None, listener: Listener
 ) -> TrainingSettings:
-    """Return `settings` with a number of steps, and say what they take; by default as many as fit into the minutes."""
+    """Return `settings` with a number of steps, and report the expected duration.
+
+    If the settings have no number of steps, as many steps are chosen as fit into `minutes`.
+    """
     seconds = step_seconds(avatar, open_groups(places.work / SAMPLES), settings, vgg)
     count = settings.steps or max(LEAST_STEPS, int(60 * settings.minutes / seconds))
     memory = memory_words(chosen_device(settings.device))
@@ -278,7 +291,7 @@ def _with_steps(
 def _train(
     state: TrainingState, subject: Subject, places: TrainingPlaces, settings: TrainingSettings, listener: Listener
 ) -> None:
-    """Do all steps that are left, with a sheet and a state on the disk now and then."""
+    """Do all remaining steps. At intervals, write a sheet, and write the state to the disk."""
     path, count = places.work / STATE, settings.steps or LEAST_STEPS
     if path.exists():
         load_state(state, path)
@@ -297,7 +310,7 @@ def _train(
 
 
 def _loss_before(state: TrainingState, places: TrainingPlaces, groups: list[ShapeGroup]) -> float:
-    """Return the loss before the first step; a training that goes on reads it from the work folder."""
+    """Return the loss before the first step; a resumed training reads it from the work folder."""
     path = places.work / LOSS_BEFORE
     if not (places.work / STATE).exists():
         write_bytes(path, json.dumps(probe_loss(state, groups)).encode())
@@ -305,7 +318,7 @@ def _loss_before(state: TrainingState, places: TrainingPlaces, groups: list[Shap
 
 
 def _measure(places: TrainingPlaces, subject: Subject, settings: TrainingSettings) -> dict[str, Any]:
-    """Measure the bundle on frames that training never read, and write the error into it."""
+    """Measure the bundle on held-out frames, write the error into its manifest, and return the error."""
     assert subject.frames is not None
     bundle = load_bundle(places.out)
     facts = error_facts(frame_errors(bundle, subject.frames, subject.held_out, settings.threads))
@@ -313,18 +326,18 @@ def _measure(places: TrainingPlaces, subject: Subject, settings: TrainingSetting
     return facts
 
 
-# Sheets of a training on a capture: held-out frames beside what the avatar paints of them so far.
+# Sheets of a training on a capture: held-out frames beside the avatar's pictures of them.
 #
-# Rule: frames are taken whole, as they are measured at the end, and painting changes nothing of the training.
+# Rule: frames are cropped to the whole person, as in the measurement at the end. Painting does not change the training.
 
-#: Held-out frames on a sheet.
+#: Most held-out frames on a sheet.
 MOST_FRAMES = 6
 
 
 def write_sheet(path: Path, avatar: TrainableAvatar, subject: Subject) -> None:
-    """Write a PNG with a row for each of some held-out frames, the frame on the left; without such frames, nothing.
+    """Write a PNG with up to `MOST_FRAMES` rows: a held-out frame, and the picture that `avatar` paints of it.
 
-    Raises BadInputError when it cannot be written.
+    Write nothing if `subject` has no held-out frames. Raises BadInputError when the file cannot be written.
     """
     paint, rows = float_painter(avatar.network, *(level.detach() for level in avatar.texture.levels())), []
     for number in subject.held_out[:: max(1, len(subject.held_out) // MOST_FRAMES)][:MOST_FRAMES]:
@@ -338,17 +351,20 @@ def write_sheet(path: Path, avatar: TrainableAvatar, subject: Subject) -> None:
             Image.fromarray(np.vstack(rows)).save(draft, format="png")
 
 
-# The error of an avatar on frames of a capture that training never read.
+# The error of an avatar on held-out frames of a capture.
 #
-# Rule: the files in the bundle are measured, run as in the pipeline; frames are taken whole, and nothing is random.
+# Rule: the files of the bundle are measured, run as in the pipeline. Frames are cropped to the whole person, and
+# nothing is random.
 
 RUNTIME = "ort"
 
 
 def frame_errors(bundle: Bundle, renderer: CaptureRenderer, numbers: Sequence[int], threads: int) -> list[ImageError]:
-    """Return the error of `bundle` on each of the frames `numbers` that shows the person.
+    """Return the errors of `bundle` on the frames `numbers`; frames that do not show the person are left out.
 
-    The truth is the frame and its mask. `threads`: threads of the runtime. Raises BadInputError, MissingPartError.
+    The ground truth is the frame with its mask. Raises BadInputError, MissingPartError.
+
+    `renderer`: renderer of the capture. `threads`: number of the runtime's threads.
     """
     paint = integer_painter(renderer, bundle, RUNTIME, threads)
     errors = []
@@ -362,9 +378,9 @@ def frame_errors(bundle: Bundle, renderer: CaptureRenderer, numbers: Sequence[in
 
 
 def error_facts(errors: Sequence[ImageError]) -> dict[str, Any]:
-    """Return the means of `errors` and how they were measured.
+    """Return the means of `errors`, and how they were measured.
 
-    Keys: `runtime`, `size`, `frames`, and those of an error.
+    Keys: `runtime`, `size` (tensor size), `frames` (number of frames), and the names of `MEANS` but `background`.
     """
     names = [name for name in MEANS if name != "background"]
     means = (
@@ -374,6 +390,6 @@ def error_facts(errors: Sequence[ImageError]) -> dict[str, Any]:
 
 
 def write_held_out_error(bundle: Bundle, facts: dict[str, Any]) -> None:
-    """Put `facts` about held-out frames into the provenance in the manifest of `bundle`."""
+    """Write `facts`, the error on held-out frames, into the provenance in the manifest of `bundle`."""
     provenance = bundle.manifest.provenance | {"held_out_error": facts}
     write_manifest(bundle.folder, bundle.manifest.model_copy(update={"provenance": provenance}))

@@ -514,7 +514,10 @@ def _places(network: UNet) -> Iterator[str]:
 
 
 def _modules_of(tensor: str) -> tuple[str, ...]:
-    """Return the places that store the exported `tensor`, named by the exporter as `/a/b.0/b.0.1/Conv_output_0`."""
+    """Return the names of the places of a `ByteGrid` that store the exported `tensor`.
+
+    `tensor`: name by the exporter, such as `/a/b.0/b.0.1/Conv_output_0`.
+    """
     if tensor in NAMED:
         return NAMED[tensor]
     name, operator = module_of(tensor), tensor.rpartition("/")[2]

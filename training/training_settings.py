@@ -1,6 +1,6 @@
-"""`training.toml`: everything that decides what a training makes, in one file that the bundle keeps.
+"""`training.toml`: everything that decides the result of a training, in one file that the bundle keeps.
 
-Rule: the file names no folders; the same file, capture and machine give the same avatar on one thread of a CPU.
+Rule: the file names no folders. On one thread of a CPU, the same file, capture and machine give the same avatar.
 """
 
 from __future__ import annotations
@@ -18,10 +18,9 @@ from trilane.files import read_text
 from trilane.scene.schema import LISTED, Table
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
 
-# Options of a training, in tables of `training.toml`: the optimiser, the batches, and what regularises the avatar.
+# Options of a training, in tables of `training.toml`: the optimiser, the batches, and regularisation.
 #
-# Rule: this needs no PyTorch, so that settings are read, and refused, where none is installed. The defaults change
-# nothing.
+# Rule: this module needs no PyTorch, so that settings can be checked without PyTorch.
 
 Repeats = Annotated[int, Field(ge=1, le=100)]
 
@@ -29,12 +28,12 @@ Repeats = Annotated[int, Field(ge=1, le=100)]
 class OptimiserOptions(Table):
     """Table `[optimiser]`.
 
-    `kind`: Adam (a decay of weights goes through its moments) or AdamW (it does not).
-    `momentum`, `texture_momentum`: Adam's first momentum, for network and texture; 0 is off.
-    `second_momentum`: Adam's second momentum, for both.
+    `kind`: `adam` (weight decay is part of the gradient) or `adamw` (weight decay is separate).
+    `momentum`, `texture_momentum`: Adam's β₁ for the network and for the texture; 0 is off.
+    `second_momentum`: Adam's β₂ for both.
     `clip_norm`: upper bound of the norm of all gradients; 0 is off.
-    `clip_value`: upper bound of each number of a gradient; 0 is off.
-    `batches_per_step`: number of batches whose mean gradient makes a step.
+    `clip_value`: upper bound of the absolute value of each element of a gradient; 0 is off.
+    `batches_per_step`: number of batches whose mean gradient is used for a step.
     """
 
     kind: Literal["adamw", "adam"] = "adamw"
@@ -49,12 +48,12 @@ class OptimiserOptions(Table):
 class BatchOptions(Table):
     """Table `[batches]`.
 
-    `sample_share`: share of the samples, drawn once, that is used.
+    `sample_share`: share of the samples that is used; they are chosen at random before training.
     `same_zoom`: whether the samples of a batch have about the same zoom.
-    `full_body_statistics`: whether batch statistics come from batches of whole bodies alone; other batches then use
-    them.
+    `full_body_statistics`: whether only batches of whole bodies update the statistics of batch norms. Other batches use
+    these statistics.
     `full_body_from`: share of the steps after which all samples show whole bodies.
-    `repeats`: number of times that an epoch has a sample of each band: far, full body, upper body, face, anywhere.
+    `repeats`: how often an epoch has a sample, by band: far, full body, upper body, face, anywhere.
     """
 
     sample_share: float = Field(default=1.0, gt=0, le=1)
@@ -65,11 +64,10 @@ class BatchOptions(Table):
 
 
 class RegularisationOptions(Table):
-    """Table `[regularisation]`: what is done to the avatar in each step.
+    """Table `[regularisation]`: random changes to the avatar in each step.
 
-    `texture_noise`, `input_noise`: standard deviation of Gaussian noise on every texel, and on every number of the
-    network's input.
-    `dropout`: probability that a channel is 0 after a level of encoder or decoder.
+    `texture_noise`, `input_noise`: standard deviations of Gaussian noise on texels, and on the network's input.
+    `dropout`: probability that a channel is set to 0 after a level of encoder or decoder.
     """
 
     texture_noise: float = Field(default=0.0, ge=0, le=1)
@@ -77,16 +75,11 @@ class RegularisationOptions(Table):
     dropout: float = Field(default=0.0, ge=0, lt=1)
 
 
-# Weights of the terms of the loss, by name.
-#
-# Rule: this needs no PyTorch, so that settings are read, and refused, where none is installed.
-
-
 class LossWeights(Table):
-    """Weight of each term of `objective.loss_terms`; 0 leaves it out. The defaults are the default avatar's.
+    """Weight of each term of the loss in `objective`; 0 leaves a term out. The default avatar has the default weights.
 
-    `perceptual` uses features of VGG-16 where their weights are given. Else it is one minus MS-SSIM, as `structure`
-    always is. `adversarial` and `features` (feature matching) bring discriminators.
+    `structure` is one minus MS-SSIM. `perceptual` is a distance of features of VGG-16 if their weights are given, else
+    one minus MS-SSIM too. `adversarial` and `features` (feature matching) need discriminators.
     """
 
     composite: float = Field(default=0.4, ge=0, le=1000)
@@ -108,16 +101,16 @@ class LossWeights(Table):
         return self.adversarial > 0 or self.features > 0
 
     def by_name(self) -> dict[str, float]:
-        """Return the weights as `objective.total_loss` takes them."""
+        """Return the weights by the names of their terms, as `objective.total_loss` takes them."""
         return {str(name): float(value) for name, value in self.model_dump().items()}
 
 
-# What is usual in a training whose settings do not say it: by its loss, by what it starts from, by its length.
+# Usual values: defaults of settings that depend on the loss, on the start and on the length of a training.
 #
-# Rule: usual values are values of `TrainingSettings` and nothing else, and all of them are written into the avatar's
+# Rule: usual values are values of `TrainingSettings` and nothing else. All of them are written into the avatar's
 # `training.toml`.
 
-#: Losses by name: the weights, and the settings that go with them unless a training sets others.
+#: Losses by name: the weights, and usual values of other settings.
 LOSSES: dict[str, dict[str, Any]] = {
     "default": {"loss": {}},
     "thesis": {
@@ -130,10 +123,10 @@ LOSSES: dict[str, dict[str, Any]] = {
         "optimiser": {"kind": "adam", "second_momentum": 0.999, "clip_norm": 0.0},
     },
 }
-#: Usual values with a network that is trained already, and with a new one.
+#: Usual values of a training that continues a trained network, and of one that begins with a new network.
 TRAINED: dict[str, Any] = {"small_until": 0.0, "freeze_norms_at": 0.3}
 NEW: dict[str, Any] = {"small_until": 0.12, "freeze_norms_at": 0.6}
-#: A training of a new network in fewer minutes than this takes cheap steps at a high rate
+#: A training of a new network in fewer minutes than this has cheap steps and high learning rates, by default
 #: (docs/decisions/avatar-training.md).
 SHORT_MINUTES = 5.0
 MOST_MINUTES = 100_000
@@ -141,9 +134,10 @@ SHORT: dict[str, Any] = {"batch": 2, "small_until": 0.8, "network_rate": 5e-3, "
 
 
 def with_usual(values: dict[str, Any], where: str | Path) -> dict[str, Any]:
-    """Return `values` with the usual values added; the name of a loss becomes its weights.
+    """Return `values` with usual values for missing keys. The name of a loss is replaced by its weights.
 
-    `where`: place of `values`, for messages. Raises BadInputError for a name that no loss has.
+    `values`: settings as in `training.toml`. `where`: source of `values`, for messages. Raises BadInputError for an
+    unknown name of a loss.
     """
     start, name = values.get("start", "default"), values.get("loss")
     usual = (NEW if start == "new" else TRAINED) | (_of_loss(name, where) if isinstance(name, str) else {})
@@ -165,13 +159,13 @@ def _is_short(values: dict[str, Any]) -> bool:
 
 
 def _minutes(minutes: float) -> float:
-    if not 0 < minutes <= MOST_MINUTES:  # not a number is no time either
+    if not 0 < minutes <= MOST_MINUTES:  # also refuses NaN
         raise UnexpectedValue(f"{minutes:g}", f"above 0, at most {MOST_MINUTES} minutes")
     return minutes
 
 
 def _over(usual: Any, value: Any) -> Any:
-    """Return `value`; in a table, keys that it lacks come from `usual`."""
+    """Return `value`. If both are tables, keys that `value` lacks are added from `usual`."""
     return usual | value if isinstance(usual, dict) and isinstance(value, dict) else value
 
 
@@ -181,32 +175,33 @@ HEAD = "# How this avatar was trained; `trilane avatar train --config training.t
 
 
 class TrainingSettings(Table):
-    """Everything that decides what one training makes. A share is a share of the steps, 0 to 1.
+    """Everything that decides the result of a training. A share means a share of the steps, 0 to 1.
 
-    `samples`: number of views of the person, drawn before training.
-    `minutes`: time of training; it becomes a number of `steps` by measurement where `steps` is absent.
-    `batch`: samples of a step.
+    `samples`: number of views of the person, rendered before training.
+    `minutes`: duration of training. If `steps` is absent, the number of steps follows from it and a measured step.
+    `steps`: number of steps.
+    `batch`: number of samples in a batch.
     `seed`: seed of all random numbers.
-    `threads`: threads of PyTorch, and processes that draw.
-    `device`: where PyTorch computes; auto is a GPU where there is one.
-    `precision`: floating-point format of the network while it is trained.
-    `look`: clothes of the default body, who is trained then; None for the person of a capture.
-    `start`: avatar whose network is trained further; new for random weights.
-    `texture`: avatar whose texture is trained further; new for the colours of the samples.
-    `width`: channels of a new network; 64 is full.
-    `network_rate`, `texture_rate`: peaks of the learning rates.
+    `threads`: number of PyTorch's threads, and of processes that render samples.
+    `device`: device of PyTorch; `auto` is a GPU if there is one, else the CPU.
+    `precision`: floating-point format of the network in training.
+    `look`: look of the default body, if that is trained; None to train the person of a capture.
+    `start`: avatar whose network is trained further; `new` begins with random weights.
+    `texture`: avatar whose texture is trained further; `new` begins with the colours of the samples.
+    `width`: width of the network; 64 is the full network.
+    `network_rate`, `texture_rate`: peak learning rates.
     `discriminator_rate`: constant learning rate of the discriminators.
-    `weight_decay`: decay of kernels and texture.
+    `weight_decay`: weight decay of kernels and texture.
     `small_until`: share up to which only half-size samples are used.
-    `freeze_norms_at`: share after which batch statistics stay.
-    `average_share`: time constant of the average that becomes the avatar, as a share of the steps so far.
-    `noise_steps`: noise on activations, in steps of a byte.
-    `masked_texture`: whether texels that a batch does not show keep their values and their momentum.
-    `stand_off`: whether the body is drawn with clothes and hair raised to where masks end.
-    `norm`: normalisation of a new network.
+    `freeze_norms_at`: share after which the statistics of batch norms stay fixed.
+    `average_share`: time constant of the moving average that becomes the avatar, as a share of the steps so far.
+    `noise_steps`: largest noise on activations, in steps of a byte.
+    `masked_texture`: whether texels that no sample of a batch shows keep their values and momenta.
+    `stand_off`: whether offsets of clothes and hair are measured, and the body is drawn with these offsets.
+    `norm`: normalisation of the network.
     `bytes_from`: share after which weights and activations are rounded to the bundle's bytes, in float32.
     `mip_levels`: number of smaller levels of the texture that are learnt with it.
-    `vgg`: SHA-256 of the VGG-16 weights of the perceptual loss.
+    `vgg`: SHA-256 of the file of VGG-16's weights for the perceptual loss.
     """
 
     schema_: Literal[1] = Field(default=1, alias="schema")
@@ -243,7 +238,7 @@ class TrainingSettings(Table):
 
 
 def read_settings(path: Path) -> TrainingSettings:
-    """Read the settings in the file `path`. Raises BadInputError."""
+    """Return the settings in the file `path`. Raises BadInputError."""
     try:
         values = tomllib.loads(read_text(path, EXPECTED))
     except tomllib.TOMLDecodeError as error:
@@ -252,9 +247,10 @@ def read_settings(path: Path) -> TrainingSettings:
 
 
 def parsed_settings(values: dict[str, Any], where: str | Path) -> TrainingSettings:
-    """Return the settings of `values`, where `loss` may be the name of a loss.
+    """Return the checked settings of `values`, with usual values for missing keys. Raises BadInputError.
 
-    `where`: place of `values`, for messages. Raises BadInputError.
+    `values`: settings as in `training.toml`; `loss` may also be the name of a loss. `where`: source of `values`, for
+    messages.
     """
     try:
         settings = TrainingSettings.model_validate(with_usual(values, where))
@@ -266,7 +262,7 @@ def parsed_settings(values: dict[str, Any], where: str | Path) -> TrainingSettin
     return settings
 
 
-#: Settings that exclude each other: key, test, expected value of the key, and another remedy.
+#: Settings that exclude each other: key to blame, function that finds the clash, expected value of the key, remedy.
 CLASHES: tuple[tuple[str, Callable[[TrainingSettings], bool], str, str], ...] = (
     ("norm", lambda s: s.start != "new" and s.norm != "batch", "batch of a trained network", 'or start = "new"'),
     (
@@ -285,7 +281,7 @@ CLASHES: tuple[tuple[str, Callable[[TrainingSettings], bool], str, str], ...] = 
 
 
 def settings_text(settings: TrainingSettings) -> str:
-    """Return the text of a settings file: every value, also where it is the default."""
+    """Return the text of a settings file with every value, defaults included."""
     values = settings.model_dump(by_alias=True, exclude_none=True)
     tables = {key: value for key, value in values.items() if isinstance(value, dict)}
     lines = [HEAD, *_lines({key: value for key, value in values.items() if key not in tables})]
@@ -299,7 +295,7 @@ def _lines(values: dict[str, Any]) -> list[str]:
 
 
 def _refused(details: dict[str, Any], where: str | Path) -> BadInputError:
-    """Turn one of the `errors()` of a ValidationError into a BadInputError."""
+    """Return the error for `details`, one of the `errors()` of a pydantic ValidationError."""
     place, keys = f"{where}: {'.'.join(map(str, details['loc']))}", details["loc"]
     if (unexpected := unexpected_in(details)) is not None:
         return BadInputError.at(place, unexpected)

@@ -44,7 +44,7 @@ class Steering(NamedTuple):
     """How the camera is turned about its target, and how much nearer it is.
 
     `azimuth_deg`, `elevation_deg`: turns about the target in degrees.
-    `zoom`: factor by which the camera is nearer.
+    `zoom`: number by which the camera's distance from the target is divided.
     """
 
     azimuth_deg: float = 0.0

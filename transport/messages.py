@@ -261,7 +261,7 @@ class JobPipe:
         return self._reads
 
     def send(self, message: Message) -> None:
-        """Send without waiting; does nothing when the other end is closed or its pipe is full.
+        """Send `message` without waiting. If the other end is closed or the pipe is full, drop `message`.
 
         The scheduler learns of such a unit from the end of its process or from a missed deadline.
         """
@@ -271,8 +271,8 @@ class JobPipe:
             return
 
     def receive(self) -> Message | None:
-        """Return the next message; None when the other end is closed. An end that does not wait also returns None if
-        no message has come.
+        """Return the next message; None when the other end is closed. An end that does not wait also returns None
+        if no message has come.
 
         Raises MessageError for bytes that are no message.
         """
@@ -328,7 +328,7 @@ class SocketFolder:
 
 
 def remove_abandoned(base: Path) -> None:
-    """Remove those of this user's socket folders in `base` whose process has ended: their locks are free."""
+    """Remove this user's abandoned socket folders in `base`. A folder is abandoned if nobody holds its lock."""
     for folder in base.glob(f"{PREFIX}*"):
         with contextlib.suppress(OSError):
             if folder.is_symlink() or folder.stat().st_uid != os.getuid():
@@ -354,7 +354,7 @@ class HeartbeatSocket:
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], linger_ms: int = 0) -> None:
         """Make a socket of `context`.
 
-        `linger_ms`: milliseconds after its closing in which the socket still tries to deliver sent heartbeats.
+        `linger_ms`: how long the socket tries to deliver sent heartbeats after it is closed, in milliseconds.
         """
         self.socket: zmq.Socket[bytes] = context.socket(zmq.PAIR)
         self.socket.setsockopt(zmq.LINGER, linger_ms)
@@ -376,7 +376,7 @@ class HeartbeatSocket:
         return self.socket.fileno()
 
     def send_heartbeat(self, message: Heartbeat) -> None:
-        """Send without waiting; does nothing when the other end has stopped reading."""
+        """Send `message` without waiting. If the other end has stopped reading, drop `message`."""
         with contextlib.suppress(zmq.Again):
             self.socket.send(pack(message), zmq.DONTWAIT)
 

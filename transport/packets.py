@@ -6,7 +6,7 @@ needs to know about a frame travels in the frame's packet; no stage asks another
 
 Each edge has one region of memory without a name (memfd), of a fixed size. The parent makes the regions and keeps their
 descriptors; child processes inherit the descriptors and map the regions. The kernel frees a region when the last
-process that has the region ends, by a crash too.
+process that has the region ends, even by a crash.
 """
 
 from __future__ import annotations
@@ -90,8 +90,8 @@ class RegionLayout:
 def create_region(name: str, layout: RegionLayout) -> int:
     """Return a descriptor of new, zeroed shared memory for `layout`. `name` appears in /proc/PID/maps and nowhere else.
 
-    Every page is reserved here. So with too little memory this function fails, not a later write, which would end the
-    process by a signal. Raises TrilaneError when there is too little memory.
+    All pages are reserved here: without memory for a page, a later write would end the process by a signal. Raises
+    TrilaneError when there is too little memory.
     """
     free = machine.here.free_bytes()
     if layout.total_bytes > free:

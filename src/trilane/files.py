@@ -333,7 +333,10 @@ def read_header(where: Path | str, file: IO[bytes]) -> tuple[tuple[int, ...], bo
 
 
 def _header(file: IO[bytes], version: tuple[int, int]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return what `read_header` returns, from the rest of a header of this `version`. Raises one of DAMAGED."""
+    """Return shape, whether the order is Fortran's, and dtype, from the rest of a header of this `version`.
+
+    Raises one of DAMAGED.
+    """
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # about headers that Python 2 wrote

@@ -1,19 +1,19 @@
-"""What Trilane asks of the machine: cores, processor, caches, counters, memory, packages, programs, folders, the date.
+"""Asks the machine for its facts: cores, processor, caches, counters, memory, packages, programs, folders, the date.
 
-Only this module asks, so a test can put another machine in place of `here`. Ruff refuses the calls below in every other
-file (`banned-api` in pyproject.toml). Two things are asked elsewhere, each in one place: OpenGL by
-`trilane.stages.gpu.opengl`, and clocks by the code that measures, because a clock is read in every job.
+Only this module asks the machine, so a test can put another machine in place of `here`. Ruff refuses the calls below in
+every other file (`banned-api` in pyproject.toml). There are two exceptions: `trilane.stages.gpu.opengl` asks OpenGL,
+and code that measures reads clocks, because a clock is read in every job.
 
 This module also decides whether a failure comes from a **lack of memory**. Rule: a shortage is reported only if a limit
 is below what a run takes, or if the kernel has ended a process for lack of memory. The needs of a run are measured
 (docs/limits.md); a larger scene, avatar or background takes more.
 
 This module also asks the kernel to **wake soon** a process that a message waits for; a refusal changes only the speed.
-Linux makes a woken thread wait until the time slice of the running thread ends, about 3 ms. It need not wait if it
-asks for a shorter slice (EEVDF since Linux 6.12; older kernels ignore the request). With another process busy on the
-same core, the measured 99th percentile of the wake-up went from 3.4 ms to 0.2 ms. This matters most for ZeroMQ's I/O
-threads. A unit that has sent a message begins its next job at once. The thread that carries the message then waits on
-the same core for the end of that job's slice: 1.6 ms between two units.
+Linux makes a woken thread wait until the time slice of the running thread ends, about 3 ms. A thread that has asked for
+a shorter slice need not wait (EEVDF since Linux 6.12; older kernels ignore the request). With another busy process on
+the same core, the request lowered the 99th percentile of the wake-up from 3.4 ms to 0.2 ms. This matters most for
+ZeroMQ's I/O threads. A unit that has sent a message begins its next job at once. Without the request, the thread that
+carries the message waits on the same core for the end of that job's slice: 1.6 ms between two units.
 """
 
 from __future__ import annotations
@@ -172,7 +172,7 @@ class Machine:
         return shutil.which(name, path=path if first is None else f"{first}{os.pathsep}{path}")
 
     def package_file(self, name: str) -> Path | None:
-        """Return the first file of a module or package, without importing it; None where it is not installed."""
+        """Return the file that importing `name` would run, without importing it; None if `name` is not installed."""
         found = importlib.util.find_spec(name)
         return None if found is None else Path(found.origin or "")
 
@@ -321,7 +321,7 @@ def awake(wanted: bool = True) -> Iterator[str]:
     """Keep idle cores of the whole machine awake inside the `with` block. Yield AWAKE, or `sleep: ` and the reason.
 
     A sleeping core takes 50 us and more to react to a message; a core that is kept awake takes power. Usually only root
-    may do this. The kernel undoes it when the process ends.
+    may keep cores awake. When the process ends, the kernel lets them sleep again.
     """
     if not wanted:
         yield "sleep: the performance profile asks for no haste"

@@ -163,7 +163,7 @@ class Options(BaseModel):
 
     @classmethod
     def value_of(cls, name: str, word: str) -> Any:
-        """Return the value that `word`, chosen on the dashboard, stands for in field `name`. Raises BadInputError."""
+        """Return the value of field `name` that the dashboard writes as `word`. Raises BadInputError."""
         field = cls.model_fields[name]
         try:
             return None if word == NOTHING else TypeAdapter(kind_of(field)).validate_python(word)

@@ -42,7 +42,7 @@ def that_end() -> list[signal.Signals]:
 
 @contextlib.contextmanager
 def interrupting() -> Iterator[None]:
-    """Let the other signals of `that_end` do what SIGINT does inside the `with` block: raise KeyboardInterrupt."""
+    """Make the signals of `that_end` raise KeyboardInterrupt inside the `with` block, as SIGINT does already."""
     before = {number: signal.signal(number, _raise) for number in that_end() if number != signal.SIGINT}
     try:
         yield

@@ -195,7 +195,7 @@ class _Opening:
         return picture
 
     def _fits(self, names: Sequence[str], body: Body) -> list[Fit]:
-        """Return the fits that could be read, and add the faults of the others. `names`: names of the frames."""
+        """Return the fits that can be read, and add a fault for each unreadable fit. `names`: names of the frames."""
         path, fits = self.folder / self.file.fits, []
         one = self._try(lambda: _fits_of_file(path, len(names))) if path.is_file() else None
         if not path.is_dir() and one is None:

@@ -204,7 +204,7 @@ NO_FLIP = (False, False)
 
 @dataclass(frozen=True)
 class Augmentation:
-    """The changes that make a sample of a frame.
+    """The geometric changes by which a frame becomes a sample.
 
     `centre` (x, y): point of the frame, in pixels, that moves to the middle of the target. `turn_rad`: clockwise turn
     about that point, radians. `scale` (x, y): target pixels per frame pixel along x and y, before the turn. `flip`
@@ -235,7 +235,7 @@ def moved(points: ArrayLike, by: F64) -> F64:
 
 
 def augmented_projection(projection: ArrayLike, by: F64, frame: Shape, target: Shape) -> F64:
-    """Return the projection (4,4) of a camera whose picture is that of `projection` after the map `by`.
+    """Return a projection (4,4) whose picture is the picture of `projection` (4,4), moved by the map `by`.
 
     Depth does not change, and only a flip reverses the winding of triangles.
 
@@ -248,7 +248,7 @@ def augmented_projection(projection: ArrayLike, by: F64, frame: Shape, target: S
 
 
 def map_between(before: ArrayLike, after: ArrayLike, frame: Shape, target: Shape) -> F64:
-    """Return the map (3,3) with which `augmented_projection` turns the projection `before` (4,4) into `after` (4,4).
+    """Return the map (3,3) by which `augmented_projection` makes the projection `after` (4,4) from `before` (4,4).
 
     `frame`, `target`: (height, width) of the pictures of `before` and of `after`.
     """
@@ -317,7 +317,8 @@ def _inverse(matrix: F64) -> F64:
 # probable.
 #
 # Rule: the probability of a vertex is its share of the surface's area. SMPL-X has about as many vertices in the head as
-# in the rest of the body. The thesis (section 3.3) therefore weights joints by the volume about them; areas are exact.
+# in the rest of the body. The thesis (section 3.3) therefore weights joints by the volume about them; here, shares of
+# the area give exactly equal probabilities.
 
 
 class VertexCentres:
@@ -403,7 +404,7 @@ def zoomed_view(
     rule: ViewRule,
     screen: Shape,
 ) -> F64 | None:
-    """Return a random map (3,3) from the frame's pixels to the screen's; None if its centre is outside the frame.
+    """Return a random map (3,3) from the frame's pixels to the screen's; None if the view's centre is off the frame.
 
     `band`: band of the view, a name of `BANDS` or `anywhere`. `posed`: body in the frame. `centres`: chooses the
     vertex at the view's centre. `screen`: (height, width).

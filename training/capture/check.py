@@ -209,9 +209,9 @@ class TexelCoverage:
 
 
 def require_fits(capture: Capture, frames: Sequence[CheckedFrame], sheet: object) -> None:
-    """Raise FaultyCaptureError when the median IoU is below `LEAST_IOU`. Its remedy tells the user to look at `sheet`.
+    """Raise FaultyCaptureError when the median IoU of `frames` is below `LEAST_IOU`.
 
-    `sheet`: file, or words for the pictures that show the fits.
+    `sheet`: file of the pictures that show the fits, or words for these pictures; the remedy names it.
     """
     median = float(np.median([frame.iou for frame in frames]))
     if median < LEAST_IOU:

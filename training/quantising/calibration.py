@@ -163,7 +163,8 @@ SHARING = (*MOVES, "Concat", "Add")
 ALIKE = {*SHARING, "Conv", "Relu", "Sigmoid", "Constant", "Identity"}
 #: Largest integer weight, by `reduce_range`; all weights are even.
 WEIGHT_TOP = {True: 64, False: 126}
-#: Least unit of a layer's integer sum, in steps of the layer's output, with which float32 represents every sum exactly.
+#: Least unit of a layer's integer sum, in steps of the layer's output. With a smaller unit, float32 could not represent
+#: every sum exactly.
 FINEST = 2.0**-16
 #: Greatest unit of a layer's integer sum, in steps of the layer's output. At ½, all odd sums would be half way between
 #: bytes; above ¼, HTP was seen to give another picture.
@@ -307,7 +308,10 @@ def _cut(name: str, data: Any, model: onnx.ModelProto) -> tuple[float, float]:
 
 
 def _step(low: float, high: float) -> float:
-    """Return the least power of two of which 256 steps cover the range from `low` to `high`, to within a step."""
+    """Return the step of a range: the least power of two so large that 256 steps from `low` reach `high`.
+
+    The last byte may be up to one step below `high`.
+    """
     step = 2.0 ** math.ceil(math.log2(max(high - low, 1e-9) / (BYTE + 1)))
     while high / step + _zero_point(low, step) > BYTE + 1:
         step *= 2

@@ -248,7 +248,7 @@ def session(model: onnx.ModelProto) -> Any:
 # quantiser.
 #
 # Rule: only two facts are taken from the integer network: the places where it rounds, and whether its steps are powers
-# of two. The range of a stored tensor is that of its float values on this input, and has 255 steps. The weights of an
+# of two. The range of a stored tensor covers its float values on this input, and has 255 steps. The weights of an
 # output channel have `LARGEST_WEIGHT` steps to either side of 0; biases are exact. If steps are powers of two, each is
 # `POWER_OF_TWO` times as wide. For a stored tensor, rounding up to a power of two costs at most that factor; for a
 # weight, using only even multiples costs that factor. The steps of the picture are 1/255.
@@ -296,8 +296,8 @@ def float_ranges(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> di
 class _FloatGraph(NoiseGraph):
     """Builds a float network that rounds nothing, and collects the names of the tensors that would be stored.
 
-    The integer network has no Relu: the lower end of the range before it clips as the Relu would. The Relus of `model`
-    are therefore added again.
+    The integer network has no Relu, because the range of a rectified tensor begins at 0. Without ranges, a Relu is
+    necessary; it is added where `model` has one.
     """
 
     def __init__(self, model: onnx.ModelProto, quantised: Quantised) -> None:
@@ -336,7 +336,10 @@ class _IdealGraph(NoiseGraph):
         return self.widened * low, self.widened * high, step
 
     def is_multiple(self, name: str, step: float) -> bool:
-        """Return whether tensor `name` only copies a stored tensor: joined and added tensors have their own steps."""
+        """Return whether all values of tensor `name` are already multiples of a stored tensor's step.
+
+        Only copies of a stored tensor are: joined and added tensors have their own steps.
+        """
         maker = self.makers.get(name)
         if maker is None or maker.op_type == "DequantizeLinear":
             return maker is not None
@@ -347,7 +350,7 @@ class _IdealGraph(NoiseGraph):
 #
 # Rule: both networks read the same input bytes, so the rounding of the input does not count as a layer's noise.
 
-#: Greatest SQNR that is reported: that of a layer without error is infinite, which JSON cannot express.
+#: Greatest SQNR that is reported. A layer without error has an infinite SQNR, which JSON cannot express.
 MAX_DB = 200.0
 
 

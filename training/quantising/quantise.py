@@ -200,7 +200,7 @@ def _check_weights(model: onnx.ModelProto) -> None:
 
 
 def _describe(model: onnx.ModelProto, keep_float: Sequence[str]) -> None:
-    """Remove what runtimes do not read: other operator sets than ONNX's, and old metadata. Add the layers in float."""
+    """Remove other operator sets than ONNX's, and all metadata. Then list the layers `keep_float` in the metadata."""
     for entry in [entry for entry in model.opset_import if entry.domain not in ("", "ai.onnx")]:
         model.opset_import.remove(entry)
     del model.metadata_props[:]
@@ -289,7 +289,7 @@ QUANTISED_OPERATORS = [
 
 @contextmanager
 def _no_axis_warnings() -> Iterator[None]:
-    """Suppress the quantiser's warning that vectors, such as those of norms, have no second axis. None is needed."""
+    """Suppress the quantiser's warning that a vector, such as a norm's scale, has no second axis. It needs none."""
 
     def other(record: logging.LogRecord) -> bool:
         return "is out-of-range for weight" not in record.getMessage()
@@ -375,7 +375,7 @@ def replace_ends_by_bytes(model: onnx.ModelProto) -> None:
 def _nhwc_to_real(inner: list[onnx.NodeProto], source: str, quantised: str) -> list[onnx.NodeProto]:
     """Return nodes that dequantise and transpose the input `source`.
 
-    The nodes of `inner` that dequantise `quantised` are removed, and the others read the new nodes' output.
+    The nodes of `inner` that dequantise the tensor `quantised` are removed; their readers read the new nodes' output.
     """
     readers = [node for node in inner if quantised in node.input]
     scale, zero_point = readers[0].input[1:3]
