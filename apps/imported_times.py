@@ -132,7 +132,7 @@ def _rounded(ms: float) -> float:
 def with_row(
     path: Path, read: Measurements, measurement: Measurement, network: str | None, asked: Mapping[str, str | None]
 ) -> tuple[str, list[str]]:
-    """Return the text of the table `path` with a new row, and lines that say the row and the sources of its values.
+    """Return the text of the table `path` with a new row, and lines about the row and the sources of its values.
 
     The row has the measurement's median or, without one, its mean. The table need not exist. `network`: the network
     that was measured. `asked`: values of the columns of OPTION_OF; for None, the measurement file decides or, if it is

@@ -32,7 +32,7 @@ Engine = Callable[[Sequence[Trial]], Generator[Record]]
 
 
 def whole_lines(text: bytes, where: str | Path) -> tuple[list[Record], int]:
-    """Return the records in the `text` of a `trials.jsonl`, and the number of its bytes up to the last record's end.
+    """Return the records of a `trials.jsonl` with the content `text`, and the length of `text` up to the last record.
 
     Text after the last line feed is left out, and so is a last line that is no record.
     Raises BadInputError, which names the line, for an earlier line that is no record. `where`: place for its message.

@@ -313,7 +313,7 @@ class RunLook(NamedTuple):
     figures: MomentFigures
 
     def as_json(self) -> dict[str, Any]:
-        """Return the fields of `MomentFigures` and the key `run`, the name, in a form for JSON."""
+        """Return the fields of `MomentFigures`, and `run`, the name of the run, in a form for JSON."""
         return {"run": self.name, **self.figures.as_json()}
 
 
@@ -357,7 +357,7 @@ class _Span(NamedTuple):
 
 
 class _UnitTime:
-    """Where the time of one unit goes from `begin_ns` on. Spans are kept for `window_ns`, sums for ever.
+    """Where the time of one unit goes from `begin_ns` on. It keeps sums of all time, and spans of the last `window_ns`.
 
     `account`: account of the ledger that is charged at the begin.
     """
