@@ -83,7 +83,7 @@ class Run:
     def jobs(self) -> NDArray[Any]:
         """All jobs in the order of their ends: a structured array of shape (jobs,) with the fields of docs/explain.md.
 
-        Times are int64, ns; words `str_`; metrics of the stages float64, NaN where a stage has none. Raises
+        Times are int64, ns; words `str_`; metrics of the stages float64, NaN if a stage has no such metric. Raises
         BadInputError.
         """
         figures = figure_names(self.folder)

@@ -102,7 +102,7 @@ def up_to(cause: Cause) -> Causes:
 
 
 def require_complete(causes: Iterable[Cause]) -> Causes:
-    """Return `causes` as a set. Raises ValueError if a cause is among them without the causes that it needs."""
+    """Return `causes` as a set. Raises ValueError if a cause is missing that another one needs."""
     found = frozenset(causes)
     for cause in found:
         if missing := needs(cause) - found:
@@ -246,7 +246,7 @@ class ReferenceMoment:
         self._made: dict[Hashable, Any] = {}
 
     def frame(self, causes: Causes) -> ReferenceFrame:
-        """Return the frame with `causes` on. Raises ValueError if a cause lacks a cause that it needs."""
+        """Return the frame with `causes` on. Raises ValueError if a cause is missing that another one needs."""
         made: ReferenceFrame = self._once(("frame", require_complete(causes)), lambda: self._frame(causes))
         return made
 

@@ -193,7 +193,7 @@ def _flat(value: Any) -> Iterable[Any]:
 
 
 def is_ended(record: Mapping[str, Any] | None) -> bool:
-    """Return whether a trial needs no other try: it is done, or it failed by itself. A lost trial needs one."""
+    """Return whether a trial is final: done, or failed by itself. A lost trial is not: it may be tried again."""
     return record is not None and record["status"] in ("done", "failed")
 
 

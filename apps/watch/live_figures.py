@@ -348,7 +348,7 @@ def _as_reported(figures: MomentFigures, folder: Path) -> MomentFigures:
 
 
 class _Span(NamedTuple):
-    """A span of a unit's time. Only `ns` of it count as `name`, one of `PARTS`, at unknown places in the span."""
+    """A span of a unit's time. `ns` nanoseconds of the span, at unknown places, count as `name`, one of `PARTS`."""
 
     begin_ns: int
     end_ns: int
