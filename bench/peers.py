@@ -32,7 +32,7 @@ ORT, OPENVINO, FP32 = "trilane ort", "trilane openvino", "onnxruntime fp32"
 APP = "benchmark_app"
 APP_STATS = "benchmark_report.json"
 APP_TIMEOUT_S = 600
-#: Ratio -> the peak of which it is a share, in words.
+#: Ratio that is a share of a peak -> this peak in words.
 PEAKS = {
     "openvino_of_roofline": "the best INT8 layer of the same runtimes, measured here (roofline.int8_gmac_s)",
     "openvino_of_instruction_peak": "the instruction set: documented multiply-accumulates a cycle x clock measured "

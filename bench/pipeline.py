@@ -172,9 +172,9 @@ def _run_round(checked: Checked, settings: list[Setting]) -> list[dict[str, Any]
 
 
 def _compare(runs: list[dict[str, Any]], after: dict[str, Any]) -> None:
-    """Add comparisons to the `runs` of a round: with its first, `sequential` run and the sequential run `after`.
+    """Add comparisons to the `runs` of a round. Each is compared with two sequential runs: the first one, and `after`.
 
-    The first run is compared with itself.
+    The first run is only compared with itself.
     """
     for place, row in enumerate(runs):
         beside = (runs[0], after if place else runs[0])

@@ -170,7 +170,7 @@ class _Scene:
         return {"speedup": median(ratios), "speedup_low": low, "speedup_high": high, **middle, "placements": said}
 
     def compare(self, pictures: int) -> tuple[dict[str, Any], list[tuple[int, U8]]]:
-        """Return the errors' keys of `measure`, over `pictures` frames, evenly spread, and (number, sheet) of each."""
+        """Compare `pictures` frames, evenly spread. Return errors by keys of `measure`, and (number, sheet) of each."""
         cast, total = Cast(self._checked), self._checked.config.scene.frames
         full = FullPictures(cast)
         first = AvatarFrames(self._checked)

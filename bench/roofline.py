@@ -128,7 +128,7 @@ def _best_ms(variants: dict[str, ProcessVariant]) -> dict[str, float]:
 
 
 def _memory_gb_s() -> float:
-    """Return the memory rate of one thread, 1e9 bytes a second: bytes read plus written by a copy beyond the caches."""
+    """Return the memory rate of one thread, 1e9 bytes a second, read plus written, by a copy larger than the caches."""
     source, target = np.ones(COPY_BYTES // 8), np.empty(COPY_BYTES // 8)
     best = float("inf")
     for _ in range(ROUNDS):

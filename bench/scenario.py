@@ -314,7 +314,7 @@ def _poisson(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
 
 
 def _all_at_once(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
-    """Ask all queries at once. A few queries before them show the rate, and so how many fill the time of `load`."""
+    """Ask all queries at once, as many as take the time of `load`. The rate of a few queries before shows how many."""
     few = queries_needed(load.percentile)
     queries.ask(requests, few)
     queries.wait()

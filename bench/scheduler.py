@@ -287,8 +287,8 @@ class LeanPipeline:
 
     SimPy only keeps the clock and the order of events; slots, held jobs and queues are plain numbers and lists. Times
     equal those of `SimpyPipeline` to the nanosecond, unless two events have the same time. The model only suits chains
-    whose frames stay in order: edges drop nothing. A unit takes its oldest frame, which waits at the last stage of the
-    unit with a waiting frame.
+    whose frames stay in order: edges drop nothing. Of a unit's stages with waiting frames, the last has the oldest
+    frame, which the unit takes.
     """
 
     def __init__(self, simpy: Any, graph: Graph, service: Service, frames: int, period_ns: int) -> None:

@@ -136,7 +136,7 @@ def is_sweep(name: str) -> bool:
 
 
 def compare_sweeps(base: str, other: str) -> SweepComparison:
-    """Compare the sweeps in two folders. Raises BadInputError if they have no common trial, or do no runs."""
+    """Compare the sweeps in two folders. Raises BadInputError without a common trial, or if trials are no runs."""
     first, second = (_configurations(Path(name)) for name in (base, other))
     found: list[_Found] = []
     left: dict[str, list[str]] = {"not_done": [], "base_alone": [], "other_alone": []}

@@ -220,7 +220,7 @@ def combined(pairs: Sequence[Difference]) -> Difference:
 def unsure(base: float, other: float, *, is_ratio: bool) -> Difference:
     """Return the difference of `other` from `base` with unknown uncertainty.
 
-    `is_ratio`: whether the change is a share of the base; not if a value is 0 or less.
+    `is_ratio`: whether the change is a share of the base. If a value is 0 or less, it is a plain difference.
     """
     is_ratio = is_ratio and min(base, other) > 0
     return _told((base, other), log(other / base) if is_ratio else other - base, None, is_ratio=is_ratio)
@@ -243,7 +243,7 @@ def _told(
     *,
     is_ratio: bool,
 ) -> Difference:
-    """Return the difference of two `values` with this effect (`Difference.effect`) and deviation, None if unknown."""
+    """Return the difference of two `values`. `effect`: see `Difference.effect`. `deviation`: None if unknown."""
     base, other = values
     if deviation is None:
         return Difference(base, other, _change(effect, is_ratio), None, None, None, is_ratio)

@@ -62,7 +62,7 @@ class RunFrames:
 
 
 def read_frames(path: Path) -> RunFrames:
-    """Read the frames of the journal at `path`. Raises BadInputError for no journal, or for less than two frames."""
+    """Read the frames of the journal at `path`. Raises BadInputError for no journal, or fewer than two frames."""
     frames = frames_of(read_journal(path))
     if frames is None:
         raise BadInputError(path, "fewer than two presented frames", "two or more", "run more frames")

@@ -256,7 +256,7 @@ def _camera_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
 
 
 def _drawn(skeleton: Skeleton, fov_deg: float, metres: float) -> Iterator[tuple[Posed, F64]]:
-    """Yield `DRAWN_POSES` random poses, each with a camera at `metres` from a joint: projection @ view (4, 4)."""
+    """Yield `DRAWN_POSES` random poses, each with projection @ view (4, 4) of a camera at `metres` from a joint."""
     rng = np.random.default_rng(round(1e3 * metres + fov_deg))
     for _ in range(DRAWN_POSES):
         posed = skeleton.pose(rng.normal(0, 0.6, (JOINTS, 3)))
@@ -479,7 +479,7 @@ def scene_cases() -> Iterator[HardNumber]:
 
 
 def _differing(checked: Checked, numbers: list[int]) -> int:
-    """Return how many bytes of the frames' tensors differ if stages draw all frames, or only this frame."""
+    """Return how many bytes of the frames' tensors depend on the frames that the same stages drew before."""
     used, found = DrawnTensors(checked), 0
     for number in numbers:
         after, fresh = used.tensors(number), DrawnTensors(checked).tensors(number)

@@ -259,7 +259,8 @@ def chain_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
 def walked(shaped: ShapedBody, pose: F64, root: F64) -> Wide:
     """Return the world transforms (55, 3, 4) of the joints in extended precision, joint by joint from the root.
 
-    `root` (3,): place of the root joint's origin, metres. body/joints.py doubles its step along the chain instead.
+    `root` (3,): translation of the root joint, metres. The tested body/joints.py goes along the chain in steps of
+    powers of two instead.
     """
     wide = np.longdouble
     found: Wide = np.zeros((len(shaped.joints), 3, 4), wide)

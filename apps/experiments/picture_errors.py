@@ -174,7 +174,7 @@ def iou(mask: Mask, reference: Mask) -> float:
 
 
 def _similarity(picture: F64, reference: F64) -> tuple[F64, F64]:
-    """Return the mean SSIM (3,) and its mean contrast-structure term (3,), by colour, over windows that fit."""
+    """Return, by colour, the mean SSIM (3,) and the mean contrast-structure term (3,), over windows in the picture."""
     from skimage.metrics import structural_similarity
 
     _, whole = structural_similarity(

@@ -50,7 +50,7 @@ HALF = 0.5
 
 
 class Cause(StrEnum):
-    """A cause of the difference between a run's picture and the reference, in the order of switching them on."""
+    """The causes of the difference between a run's picture and the reference, in the order of switching them on."""
 
     WEIGHTS = "skin weights"
     BLEND = "blend shapes"
@@ -102,7 +102,7 @@ def up_to(cause: Cause) -> Causes:
 
 
 def require_complete(causes: Iterable[Cause]) -> Causes:
-    """Return `causes` as a set. Raises ValueError if a cause is among them without the causes that it needs."""
+    """Return `causes` as a set. Raises ValueError if a cause is missing that another one needs."""
     found = frozenset(causes)
     for cause in found:
         if missing := needs(cause) - found:
@@ -158,7 +158,7 @@ class RunBody:
         return self._full[detail]
 
     def _blend(self, detail: Detail) -> F32 | None:
-        """Return the pose blend shapes. Without them in `detail`, the CPU unit has none, the GPU unit float16."""
+        """Return the pose blend shapes. If `detail` leaves them out, the CPU unit has none, the GPU unit float16."""
         if detail.pose_blend or self._body.posedirs is None:
             return self._body.posedirs
         return None if self._on_cpu else self._body.posedirs.astype(np.float16).astype(np.float32)
@@ -246,7 +246,7 @@ class ReferenceMoment:
         self._made: dict[Hashable, Any] = {}
 
     def frame(self, causes: Causes) -> ReferenceFrame:
-        """Return the frame with `causes` on. Raises ValueError if a cause lacks a cause that it needs."""
+        """Return the frame with `causes` on. Raises ValueError if a cause is missing that another one needs."""
         made: ReferenceFrame = self._once(("frame", require_complete(causes)), lambda: self._frame(causes))
         return made
 
@@ -309,7 +309,7 @@ class ReferenceMoment:
         return [(self.seen[int(row["avatar"])], Rect(*map(float, row["rect"])), _cell(row)) for row in visible]
 
     def _painted(self, causes: Causes) -> dict[int, F32]:
-        """Return, for each network in use, its picture (h,w,4) of the run's tensor. Avatars of a network share it."""
+        """Return, by number of the network, the picture (h,w,4) of the run's tensor with all avatars of the network."""
         avatars = {self._path.network_of(seen): self._path.avatars[seen.folder] for seen, _, _ in self._cells()}
         return {
             network: self._paint(avatar, self._tensor(network, avatar, causes), causes)

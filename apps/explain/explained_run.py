@@ -392,7 +392,7 @@ MOST_ENDS: Final = 1024  # frames whose ends are kept for each stage; far more t
 
 
 class Joins:
-    """For stages with several inputs: which input of a frame came last, and how long after the one before.
+    """For stages with several inputs: which input of a frame came last, and how long after the input before it.
 
     An input comes when the job that writes it ends. Inputs with `sync = "latest"` do not count: no job waits for them.
     """
@@ -419,7 +419,7 @@ class Joins:
                 del kept[next(iter(kept))]
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return, by stage and input, in how many jobs the input came last, and its mean time after the one before."""
+        """Return, by stage and input: in how many jobs this input came last, and its mean delay after the others."""
         return [
             {
                 "stage": stage,

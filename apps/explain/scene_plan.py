@@ -288,7 +288,7 @@ class _Bodies:
 
 
 def _image(checked: Checked) -> dict[str, Any]:
-    """Return the pixels of a planned tensor as a share of its network's own, and the loss of PSNR that this costs."""
+    """Return the size of a planned tensor, as a share of its network's own pixels, and the PSNR that this costs."""
     if not checked.config.scene.plans_tensor:
         return {"work": None, "psnr_loss_db": None, "source": "the scene fixes the tensor's size"}
     work = checked.config.works[0]

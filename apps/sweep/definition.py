@@ -42,7 +42,7 @@ KEYS: dict[str, tuple[type, str]] = {
 
 
 class SweepKind(StrEnum):
-    """How axes are combined. GRID: every combination; LIST: side by side, first with first; RANDOM: drawn by a seed."""
+    """How axes are combined. GRID: every combination; LIST: the n-th values of all axes; RANDOM: a sample of GRID."""
 
     GRID = "grid"
     LIST = "list"

@@ -186,7 +186,7 @@ def trust_in(ended: Record) -> Trust:
 
 
 def disturbance(ended: Record) -> tuple[bool, float]:
-    """Return a key by which less disturbed trials sort first: whether it is not trusted, share of other programs."""
+    """Return a sort key by which less disturbed trials come first: (not trusted, share of other programs)."""
     others = (ended["result"] or {}).get("other_programs")
     return not trust_in(ended).trusted, 1.0 if others is None else others
 
@@ -304,7 +304,7 @@ def at_once_on_ray(clock: TrialClock) -> int:
 
 @contextmanager
 def cluster(folder: Path) -> Iterator[Engine]:
-    """Connect to a Ray cluster, give its engine, and disconnect: the cluster at RAY_ADDRESS, or else of this machine.
+    """Give the engine of the Ray cluster at RAY_ADDRESS or, without it, on this machine. Disconnect afterwards.
 
     `folder`: folder of the sweep; machines of the cluster that see it keep their run folders there.
     Raises MissingPartError without Ray, BadInputError without a cluster.

@@ -32,7 +32,7 @@ Engine = Callable[[Sequence[Trial]], Generator[Record]]
 
 
 def whole_lines(text: bytes, where: str | Path) -> tuple[list[Record], int]:
-    """Return the records in the `text` of a `trials.jsonl`, and the number of its bytes up to the last record's end.
+    """Return the records of a `trials.jsonl` with the content `text`, and the length of `text` up to the last record.
 
     Text after the last line feed is left out, and so is a last line that is no record.
     Raises BadInputError, which names the line, for an earlier line that is no record. `where`: place for its message.
@@ -193,7 +193,7 @@ def _flat(value: Any) -> Iterable[Any]:
 
 
 def is_ended(record: Mapping[str, Any] | None) -> bool:
-    """Return whether a trial needs no other try: it is done, or it failed by itself. A lost trial needs one."""
+    """Return whether a trial is final: done, or failed by itself. A lost trial is not: it may be tried again."""
     return record is not None and record["status"] in ("done", "failed")
 
 

@@ -164,7 +164,7 @@ def _at(found: Any, path: Sequence[str]) -> float | None:
 
 
 class Space:
-    """The configurations of a grid, each a trial. Places, the index of its value on each axis, identify a trial."""
+    """The configurations of a grid, each a trial. Places identify a trial: axis -> index of the trial's value."""
 
     def __init__(self, definition: Definition, words: Callable[[Options], Sequence[str]]) -> None:
         """`words`: as for `trials_of`. Raises BadInputError for no grid, repeats, or a single configuration."""
@@ -273,7 +273,7 @@ class Search:
         return asked, trial
 
     def _untried(self) -> dict[str, int]:
-        """Return the places of an untried configuration: alternately the nearest to the best so far, and any."""
+        """Return the places of an untried configuration: in turn, the nearest to the best so far and a random one."""
         left = [
             self.space.places(number) for number, each in enumerate(self.space.trials) if each.id not in self._given
         ]

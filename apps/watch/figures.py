@@ -139,8 +139,8 @@ class MomentFigures:
     `verdict`: verdict on the run so far, with the keys of report.json and `lines` for people; null before the second
     presented frame.
     `frame_times`, `latencies`: times of the whole run.
-    `began_at`: UTC, ISO 8601; "" where the journal does not say.
-    `accuracy`: by avatar, as in report.json; empty where the journal does not say.
+    `began_at`: UTC, ISO 8601; "" if the journal has no such time.
+    `accuracy`: by avatar, as in report.json; empty if the journal has none.
     `sources`: source of the figures below each key, as in report.json.
     """
 
@@ -170,7 +170,7 @@ class MomentFigures:
     sources: Mapping[str, str]
 
     def as_json(self) -> dict[str, Any]:
-        """Return the same names and values in a form for JSON."""
+        """Return the fields by name, in a form for JSON."""
         return asdict(self)
 
 

@@ -41,7 +41,7 @@ class RunState(StrEnum):
 
 
 def without_journal(folder: Path) -> str:
-    """Return, in words, what is in place of the journal of `folder`, which has none."""
+    """Return, in words, why `folder` has no journal."""
     if (folder / NAME).is_symlink():
         return f"{NAME}, a link to a file that is not there"
     return f"no {NAME}" if folder.is_dir() else "no such folder"

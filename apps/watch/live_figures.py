@@ -313,7 +313,7 @@ class RunLook(NamedTuple):
     figures: MomentFigures
 
     def as_json(self) -> dict[str, Any]:
-        """Return the fields of `MomentFigures` and the key `run`, the name, in a form for JSON."""
+        """Return the fields of `MomentFigures`, and `run`, the name of the run, in a form for JSON."""
         return {"run": self.name, **self.figures.as_json()}
 
 
@@ -348,7 +348,7 @@ def _as_reported(figures: MomentFigures, folder: Path) -> MomentFigures:
 
 
 class _Span(NamedTuple):
-    """A span of a unit's time. Only `ns` of it count as `name`, one of `PARTS`, at unknown places in the span."""
+    """A span of a unit's time. `ns` nanoseconds of the span, at unknown places, count as `name`, one of `PARTS`."""
 
     begin_ns: int
     end_ns: int
@@ -357,7 +357,7 @@ class _Span(NamedTuple):
 
 
 class _UnitTime:
-    """Where the time of one unit goes from `begin_ns` on. Spans are kept for `window_ns`, sums for ever.
+    """Where the time of one unit goes from `begin_ns` on. It keeps sums of all time, and spans of the last `window_ns`.
 
     `account`: account of the ledger that is charged at the begin.
     """

@@ -135,7 +135,7 @@ class Box(NamedTuple):
         return Rect(self.left * across - 1, 1 - self.bottom * down, self.right * across - 1, 1 - self.top * down)
 
     def within(self, other: Box) -> Rect:
-        """Return the box in the normalised device coordinates of a picture with the pixels of `other`."""
+        """Return the box in normalised device coordinates in which `other` is the whole screen."""
         moved = Box(self.top - other.top, self.left - other.left, self.bottom - other.top, self.right - other.left)
         return moved.rect(other.shape)
 
@@ -178,7 +178,7 @@ def _grown(first: int, last: int, step: int) -> tuple[int, int]:
 
 
 def premultiplied(rgba: Floats) -> F64:
-    """Return `rgba` (h,w,4), sRGB with straight alpha in 0..1, as linear light times alpha, and alpha (h,w,4)."""
+    """Return linear light premultiplied with alpha, and alpha (h,w,4). `rgba` (h,w,4): sRGB, straight alpha, 0..1."""
     straight = np.asarray(rgba, np.float64)
     alpha = straight[..., 3:]
     return np.concatenate([to_light(straight[..., :3]) * alpha, alpha], axis=-1)
