@@ -374,8 +374,6 @@ def _alone(lock: Path) -> Iterator[None]:
 
 
 def _make(bundle: Bundle, recipe: _Recipe, folder: Path) -> None:
-    from trilane.avatars.network_file import reshaped
-
     chosen = np.arange(recipe.channels) % bundle.manifest.network.channels
     quantised = _quantised(bundle, recipe, chosen)
     network = reshaped(quantised.network, *bundle.read_network().shape[1:3])
@@ -397,7 +395,7 @@ def _remade_manifest(bundle: Bundle, recipe: _Recipe, network: Any, quantised: Q
     if not recipe.trained:
         provenance = {"weights": UNTRAINED, "made_from": own.name}
     changed = {
-        "name": f"{own.name}, {recipe}"[:100],
+        "name": f"{own.name}, {recipe}"[:NAME_LENGTH],
         "network": network_entry(network, own.network.encoder, own.network.norm, recipe.width),
         "provenance": provenance,
         "quantisation": facts,
