@@ -39,8 +39,6 @@ from trilane.units import COMPUTED, MEASURED, NO_FIGURES
 if TYPE_CHECKING:
     import pandas
 
-
-INTERRUPTED = 130
 #: Defaults of `run` that differ from the defaults of the command line.
 DEFAULTS = {"baseline_frames": 0}
 #: Options that `predict` accepts. The command line also has options that give several answers or write a file.
@@ -152,7 +150,9 @@ class RunFailedError(TrilaneError):
 
 def load_run(folder: str | Path) -> Run:
     """Load the run in `folder`. Raises BadInputError if `folder` does not exist or has no complete report."""
-    place = _place("load_run", folder)
+    if isinstance(folder, str) and not folder.strip():
+        raise BadInputError("load_run", *EMPTY_PATH)
+    place = Path(folder)
     if not place.is_dir():
         raise BadInputError(place, "no folder", "the folder of a run")
     return Run(place, read_report(place))
@@ -177,7 +177,7 @@ def run(
     early but left its folder, TrilaneError if no frame was presented. Raises KeyboardInterrupt after an interrupt, when
     the folder is complete.
     """
-    from trilane.apps.run.run_job import Hooks
+    from trilane.apps.run.run_job import INTERRUPTED, Hooks
     from trilane.pipeline.pipeline_file import is_pipeline_file
 
     parameters = inspect.signature(run).parameters
@@ -332,13 +332,6 @@ def _bound(function: Callable[..., Any], first: str | Path, options: Mapping[str
             meant = "".join(f"; {text}" for text in [did_you_mean(name, signature.parameters)] if text)
             raise TypeError(f"{command}() got an unexpected keyword argument {name!r}{meant}")
     return signature.bind(first, **named).arguments
-
-
-def _place(where: str, given: str | Path) -> Path:
-    """Return `given` as a path. Raises BadInputError at `where` for an empty string."""
-    if isinstance(given, str) and not given.strip():
-        raise BadInputError(where, *EMPTY_PATH)
-    return Path(given)
 
 
 def table(title: str, rows: Iterable[Row]) -> str:

@@ -64,8 +64,7 @@ def check(file: FileArgument, svg: SvgOption = None, profile: ProfileOption = No
         print(text, end="")
         return
     console = stdout_console()
-    for line in _head(document):
-        console.print(line, soft_wrap=True, markup=False)
+    console.print(_head(document), soft_wrap=True, markup=False)
     console.print(_stages(document))
     if document["streams"]:
         console.print(_streams(document))
@@ -90,7 +89,7 @@ def _checked(file: str, profile: str | None) -> tuple[dict[str, Any], str]:
     return check_file(Path(file)), ""
 
 
-def _head(document: Mapping[str, Any]) -> list[str]:
+def _head(document: Mapping[str, Any]) -> str:
     run = document["run"]
     source = "a source that is always ready"
     if "fps" in run:
@@ -98,7 +97,7 @@ def _head(document: Mapping[str, Any]) -> list[str]:
     elif "arrivals" in run:
         source = f"arrivals at {run['arrivals']['poisson']:g} a second"
     count = f"{len(document['stages'])} stages on {len(document['units'])} units"
-    return [f"{without_controls(document['file'])}: {count}, {source}, {run['policy']}"]
+    return f"{without_controls(document['file'])}: {count}, {source}, {run['policy']}"
 
 
 def _stages(document: Mapping[str, Any]) -> Table:

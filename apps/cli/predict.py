@@ -162,7 +162,7 @@ def predict_pipelines(options: PredictOptions, as_json: bool) -> None:
     from trilane.units import HOST
 
     scene = str(options.scene)
-    chip, variant = load_runnable(options.profile), _variant(options.policy or "", options.edge)
+    chip, variant = load_runnable(options.profile), _variant(options.policy, options.edge)
     if chip.name == HOST and options.precision is None:
         from trilane.apps.predict.this_machine import with_first
 
@@ -191,8 +191,8 @@ def _write_beside(
     write_predicted(named, {key: answer[key] for key in ("machine", "config")}, target)
 
 
-def _variant(policy: str, edge: str | None) -> Variant:
-    """Return policy and edge of the scenes. `policy`: "" if not given. Raises BadInputError for an unknown edge."""
+def _variant(policy: str | None, edge: str | None) -> Variant:
+    """Return policy and edge of the scenes; None means the usual one. Raises BadInputError for an unknown edge."""
     from trilane.hw_profiles.application import REFERENCE
     from trilane.hw_profiles.tenants import NEWEST
     from trilane.transport.slots import edge_rule

@@ -6,7 +6,6 @@ Rule: this module reads options and shows results; every figure comes from `tril
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -94,9 +93,7 @@ def quality(
     if by_cause:
         _refuse_other_comparisons(hard_cases, runtime or [])
         asked = {"avatar": avatar, "size": size, "runtime": runtime[0] if runtime else AUTO}
-        _show_by_cause(
-            scene, asked, BY_CAUSE_FRAMES if frames is None else frames, _CauseFiles(out, lpips_weights), as_json
-        )
+        _show_by_cause(scene, asked, BY_CAUSE_FRAMES if frames is None else frames, out, lpips_weights, as_json)
         return
     if hard_cases:
         _refuse_a_scene(scene, {"--avatar": avatar, "--size": size, "--frames": frames})
@@ -146,7 +143,8 @@ def _hard_cases(names: list[str], as_json: bool) -> bool:
     if as_json:
         print_json({"schema": 1, "hard_cases": rows})
     else:
-        marks = {source: f"[{number}]" for number, source in enumerate(dict.fromkeys(_sources(numbers)), start=1)}
+        sources = dict.fromkeys(row["source"] for row in numbers)
+        marks = {source: f"[{number}]" for number, source in enumerate(sources, start=1)}
         _print_rows([{**row, "from": marks[row["source"]]} for row in numbers], NUMBER_COLUMNS)
         for source, mark in marks.items():
             print_line(f"{mark} bound: {source}")
@@ -156,10 +154,6 @@ def _hard_cases(names: list[str], as_json: bool) -> bool:
     for row in failed:
         say(f"{row['name']}: {row['verdict']}")
     return not failed
-
-
-def _sources(rows: list[dict[str, Any]]) -> Iterator[str]:
-    return (row["source"] for row in rows)
 
 
 def _scene(scene: str, avatar: str | None, size: str | None, frames: int, names: list[str], as_json: bool) -> bool:
@@ -208,18 +202,13 @@ def _shown(value: Any) -> str:
     return f"{value:.3g}" if isinstance(value, float) else str(value)
 
 
-@dataclass(frozen=True)
-class _CauseFiles:
-    """Files of --by-cause, if given. `out`: folder for heat maps. `lpips_weights`: file with the weights of LPIPS."""
-
-    out: Path | None = None
-    lpips_weights: Path | None = None
-
-
-def _show_by_cause(scene: str, request: dict[str, Any], frames: int, files: _CauseFiles, as_json: bool) -> None:
+def _show_by_cause(
+    scene: str, request: dict[str, Any], frames: int, out: Path | None, lpips_weights: Path | None, as_json: bool
+) -> None:
     """Measure the error of a run's frames by cause, and print it. Raises BadInputError, MissingPartError.
 
-    `request`: options of the run by name. `frames`: number of frames.
+    `request`: options of the run by name. `frames`: number of frames. `out`: folder for heat maps, if any.
+    `lpips_weights`: file with the weights of LPIPS, if any.
     """
     from trilane.apps.experiments.error_by_cause import error_by_cause
     from trilane.apps.experiments.picture_errors import Lpips
@@ -227,7 +216,7 @@ def _show_by_cause(scene: str, request: dict[str, Any], frames: int, files: _Cau
     from trilane.stages.run_options import RunOptions
     from trilane.writing import write_folder
 
-    out, lpips = files.out, None if files.lpips_weights is None else Lpips(files.lpips_weights)
+    lpips = None if lpips_weights is None else Lpips(lpips_weights)
     checked = configure(RunOptions(scene=scene, **request), Path.cwd())
     machine = required_machine()
     if out is not None:

@@ -359,9 +359,9 @@ def _moved(kinds: Mapping[str, Moved]) -> tuple[str, str]:
     from trilane.apps.watch.live_figures import LEAST
 
     shown = {kind: moved.per_job / MIB for kind, moved in kinds.items() if kind != LEAST and moved.total}
-    least = f"{kinds[LEAST].per_job / MIB:.2f}" if LEAST in kinds else "–"
+    least = f"{kinds[LEAST].per_job / MIB:.2f}" if LEAST in kinds else DASH
     if not shown:
-        return "–", least
+        return DASH, least
     return f"{sum(shown.values()):.2f} ({', '.join(f'{kind} {value:.2f}' for kind, value in shown.items())})", least
 
 

@@ -16,13 +16,7 @@ from pydantic_core import from_json
 from trilane.arrays import Shape
 from trilane.errors import BadInputError
 from trilane.files import require_file
-from trilane.pipeline.run_metrics import (
-    Caps,
-    PolicyMetrics,
-    Record,
-    RunMetrics,
-    Temperature,
-)
+from trilane.pipeline.run_metrics import Caps, PolicyMetrics, Record, RunMetrics, Temperature
 
 SCHEMA = 1
 MAX_REPORT_BYTES = 64 << 20

@@ -67,8 +67,6 @@ SOURCES = {
     "video": MEASURED,
     "check": MEASURED,
 }
-#: Keys whose numbers are no figures, but settings, identifiers or facts about the machine.
-NO_FIGURES_UNDER = ("schema", "machine", "config", "options", "plan", "pids")
 
 
 def report_of(

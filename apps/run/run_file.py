@@ -21,7 +21,7 @@ from trilane.apps.run.report import write_report
 from trilane.apps.run.report_facts import made_facts, report_of
 from trilane.apps.run.run_files import VIDEO, join_folder, write_files
 from trilane.apps.run.run_folder import RunFolder, default_place
-from trilane.apps.run.run_job import ENDLESS, Hooks, RunOutcome, error_of, exit_code_of, sensors
+from trilane.apps.run.run_job import ENDLESS, INTERRUPTED, Hooks, RunOutcome, error_of, exit_code_of, sensors
 from trilane.errors import BadInputError, UnwrittenError
 from trilane.hw_profiles.graph_file import GraphFile, fed_inputs
 from trilane.hw_profiles.host import settings_of, usable_cores
@@ -435,7 +435,7 @@ def _run(asked: _Asked, folder: RunFolder, told: Hooks, starter: UnitStarter) ->
         report = report_of(result, config, machine=asked.machine, facts=known)
         write_report(report, folder.work / "report.json")
         place = folder.complete()
-    return RunOutcome(report, place, 130 if late.count else exit_code_of(result))
+    return RunOutcome(report, place, INTERRUPTED if late.count else exit_code_of(result))
 
 
 def _written(file: PipelineFile, work: Path, fps: float, result: RunResult) -> tuple[dict[str, Any], RunResult]:

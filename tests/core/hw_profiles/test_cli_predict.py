@@ -286,7 +286,7 @@ LIMIT = {
 
 
 def an_answer(**changes: Any) -> dict[str, Any]:
-    idle = {"starved": 0.101, "blocked": 0.202, "preempted": 0.003, "overhead": 0.044}
+    idle = {"starved": 0.101, "blocked": 0.202, "throttled": 0.0, "preempted": 0.003, "overhead": 0.044}
     return {
         "machine": {"title": "A Chip"},
         "config": {

@@ -18,11 +18,14 @@ from support.run_report import SHARE, SHOWN, make_report
 from trilane import machine
 from trilane.apps.run import report as report_module
 from trilane.apps.run.report import Report, read_report, write_report
-from trilane.apps.run.report_facts import NO_FIGURES_UNDER, sources_of
+from trilane.apps.run.report_facts import sources_of
 from trilane.apps.run.run_folder import RunFolder, default_place
 from trilane.errors import BadInputError, TrilaneError, UnwrittenError
 from trilane.units import COMPARED, COMPUTED, MEASURED
 from trilane.writing import WRITABLE, write_atomically
+
+#: Keys of a report whose numbers are no figures, but settings, identifiers or facts about the machine.
+NO_FIGURES_UNDER = ("schema", "machine", "config", "options", "plan", "pids")
 
 
 def test_a_folder_has_its_name_once_it_is_complete(tmp_path: Path) -> None:
