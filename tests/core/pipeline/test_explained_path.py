@@ -9,9 +9,10 @@ from itertools import pairwise
 
 import pytest
 
-from trilane.pipeline.critical_path import MARGIN, Budget, Paths, Piece, Sharing, parts
+from trilane.pipeline.critical_path import MARGIN, TAKEN, Budget, Paths, Piece, Sharing, parts
 from trilane.pipeline.journal import Record, Stepped, Stopped, Worked, journal_of
 from trilane.pipeline.timeline import ExplainedJob, Timeline
+from trilane.pipeline.unit_history import PREEMPTED
 from trilane.scheduler.events import Graph, JobDone, SchedulerStalled, Settings, chain
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.virtual import Simulation, simulate
@@ -236,6 +237,8 @@ def test_units_that_share_a_core_are_named_in_proportion_to_what_they_did() -> N
     sharing.add(pose)
     assert sharing.taken("cpu", 100, 200, 60) == {"infer": 40}
     assert sharing.taken("cpu", 120, 130, 10) == {"infer": 10}
+    waited = Piece(PREEMPTED, "pose", pose, 100, 160)  # of 60 ns that it lacked, half are asked about: 20 of 40 ns
+    assert parts(waited, 100, 130, sharing) == {(TAKEN, "infer"): 20, (PREEMPTED, "pose"): 10}
     row = sharing.close()["pose"]
     assert (row.jobs, row.service_ns, row.preempted_ns, row.of, row.other_ns) == (1, 100, 60, {"infer": 40}, 20)
 

@@ -6,6 +6,7 @@ import math
 import pickle
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -287,6 +288,16 @@ def test_what_follows_the_last_frame(loop: str, wrap: Wrap, note: str, at_five: 
     motion = played(loop=loop)
     assert (motion.wrap, motion.notes[-1]) == (wrap, note)
     assert motion.sample(5.0)[0][18, 0] == pytest.approx(at_five)
+
+
+@pytest.mark.parametrize(("metres", "note"), [
+    (0.04, "4.00 s, then loops"), (0.06, "4.00 s, then loops: the first frame is 0.06 m from the last"),
+])  # fmt: skip
+def test_a_jump_at_the_repeat_is_noted_from_five_centimetres_on(metres: float, note: str) -> None:
+    """The walk is 4 m long."""
+    walk = walking()
+    short = replace(walk, translation=walk.translation * metres / 4)
+    assert as_played(short, AvatarSpec(loop="repeat"), "here").notes[-1] == note
 
 
 @pytest.mark.parametrize(("keys", "sentence"), [

@@ -89,6 +89,13 @@ def test_the_bound_of_a_turn_at_three_angles() -> None:
     assert bounds[2] == pytest.approx(1.01 * 75 * U, rel=1e-12)
 
 
+def test_angles_near_half_a_turn_and_a_whole_one_are_what_they_are_called() -> None:
+    """sin(pi - d) = d and sin(pi + d) = sin(2 pi - d) = -d."""
+    names = ("pi - 1e-7", "pi + 1e-7", "2 pi - 1e-7")
+    assert [math.sin(hard_rotations.ANGLES[name]) for name in names] == pytest.approx([1e-7, -1e-7, -1e-7], rel=1e-6)
+    assert math.cos(hard_rotations.ANGLES["2 pi - 1e-7"]) == pytest.approx(1)
+
+
 @pytest.mark.usefixtures("few")
 def test_rotations_keep_their_bounds() -> None:
     cases = list(hard_rotations.rotation_cases())

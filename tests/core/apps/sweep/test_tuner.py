@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
+import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -185,13 +186,16 @@ def test_failed_trials_are_kept_and_the_search_goes_on(tmp_path: Path) -> None:
             tune(found, do, 40)
             return answer(found, store.done)
 
+    begun = time.monotonic()
     told = search()
+    most_s = time.monotonic() - begun
     failed = [row for row in told["trials"] if row["status"] == "failed"]
     assert failed and all((row["exit_code"], row["error"], row["keeps"]) == (2, "error: no a", None) for row in failed)
     assert told["best"]["options"]["word"] != "a"
     assert told["best"]["metrics"]["frame"] == min(row["metrics"]["frame"] for row in told["trials"] if row["metrics"])
     records, _ = whole_lines((tmp_path / "s" / "trials.jsonl").read_bytes(), "")
     assert len(records) == len(calls) == 40
+    assert sum(record["seconds"] for record in records) <= most_s + 40 * 0.0005  # each is rounded to a millisecond
     assert sum(record["status"] == "failed" for record in records) == len(failed)
     assert search() == told
     assert len(calls) == 40
