@@ -5,7 +5,8 @@
 **Tensor.** A network paints a body best at about the size that it has learnt, whatever the distance: much smaller it
 loses the face, much larger it paints ragged edges. So each avatar in view gets the pixels that its network was trained
 to paint. A body that has more pixels on the picture than in its tensor loses detail, so it gets up to `MOST_GROWTH`
-times the pixels (docs/decisions/planner.md has the figures).
+times the pixels. One so far off that its tensor would be denser than `MOST_DENSITY` gets fewer
+(docs/decisions/planner.md has the figures).
 
 Avatars of different networks have a tensor each, of one shape. The network that needs most sets the budgets of a frame,
 and the least dense tensor sets its density.
@@ -74,8 +75,8 @@ def work_of(
     return FrameWork.FULL
 
 
-#: Most tensor pixels for one pixel of the picture, along a side: more could not be seen.
-MOST_DENSITY = 4.0
+#: Most tensor pixels for one pixel of the picture, along a side: with more, the picture is no nearer to the truth.
+MOST_DENSITY = 2.25
 #: Least share of the best density at which a density is as good.
 AS_GOOD = 0.95
 #: Cost of a change in view, in pixels of so many frames; also the number of frames for which a smaller shape must do
