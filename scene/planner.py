@@ -5,7 +5,8 @@
 **Tensor.** A network paints a body best at about the size at which it was trained, whatever the distance. At a much
 smaller size it loses the face; at a much larger size it paints ragged edges. Therefore each visible avatar gets the
 number of pixels for which its network was trained. A body with more pixels on the picture than in its tensor loses
-detail. Such a body gets up to `MOST_GROWTH` times that number (docs/decisions/planner.md has the figures).
+detail. Such a body gets up to `MOST_GROWTH` times that number. A body so far away that its tensor would be denser than
+`MOST_DENSITY` gets fewer pixels (docs/decisions/planner.md has the figures).
 
 Avatars of different networks have separate tensors of one shape. The network that needs the most pixels sets a frame's
 budget, and the least dense tensor sets its density.
@@ -74,8 +75,8 @@ def work_of(
     return FrameWork.FULL
 
 
-#: Largest density, tensor pixels per picture pixel along a side: more detail would not be visible.
-MOST_DENSITY = 4.0
+#: Largest density, tensor pixels per picture pixel along a side: with more, the picture is no nearer to the truth.
+MOST_DENSITY = 2.25
 #: A density counts as good if it is at least this share of the best density.
 AS_GOOD = 0.95
 #: Cost of a visible change of shape, in pixels of this many frames; also the number of frames in which a smaller shape

@@ -365,7 +365,7 @@ def _why(group: Sequence[PlannedFrame]) -> str:
     if first.density is None:
         return "the scene fixes the tensor's size"
     if _most(group) >= MOST_DENSITY:
-        return f"{MOST_DENSITY:g} tensor pixels along a side of a pixel of the picture: more could not be seen"
+        return f"{MOST_DENSITY:g} tensor pixels along a side of a pixel of the picture: more make no better picture"
     return "the pixels that the network was trained to paint, in the shape that fits best of those that are ready"
 
 

@@ -210,8 +210,8 @@ def test_a_body_that_the_picture_shows_larger_gets_more(rect: Rect, expected: in
         # two of 100x300 beside each other, within 131,072 pixels, with a margin of 16 and a pixel each for rounding:
         # 448x288 at (288 - 18) / 200 = 1.35; 384x320 at (384 - 1) / 300 = 1.28; 480x256 at 1.19
         ([pixels(0, 0, 100, 300), pixels(200, 0, 100, 300)], (448, 288)),
-        # 8x20: four times as dense is 80x32, which 96x32 has room for; nothing larger is of use
-        ([pixels(0, 0, 8, 20)], (96, 32)),
+        # 8x20: 2.25 times as dense is 45x18, which 64x32 has room for; nothing larger is of use
+        ([pixels(0, 0, 8, 20)], (64, 32)),
     ],
 )
 def test_the_ideal_shape_by_hand(rects: list[Rect], expected: tuple[int, int]) -> None:
@@ -275,9 +275,11 @@ def test_of_shapes_with_as_many_pixels_the_held_one_stays_while_it_is_good() -> 
         assert held_for(pixels(0, 0, 100, 100), shapes, HeldShape(shape, None, 3)) == HeldShape(shape)
 
 
-def test_no_tensor_is_more_than_four_times_as_dense_as_the_picture() -> None:
+def test_no_tensor_is_denser_than_makes_a_better_picture() -> None:
+    """A body of 60x20 pixels has 135x45 of the tensor, so the ideal shape is 160x64, not one of the network's 256²."""
     plan = plan_tensor([pixels(0, 0, 10, 10)], OUTPUT, [SMALL], TWO, None)
-    assert plan.dense.density == MOST_DENSITY == 4.0
+    assert plan.dense.density == MOST_DENSITY == 2.25
+    assert ideal_shape([pixels(100, 100, 20, 60)], OUTPUT, OWN) == (160, 64)
 
 
 def test_no_room_for_all_is_an_error() -> None:
@@ -427,7 +429,7 @@ def test_no_other_way_through_the_good_shapes_costs_less(
     """All ways, one by one, each with its own cost: pixels, and ten own tensors for a change, less in motion."""
     looks = looks_at([None if one is None else pixels(one[2], 0, one[0], one[1]) for one in rects])
     fits = [
-        {shape: lay_out_at([look.rects[0]], OUTPUT, shape, 4.0) for shape in shapes} if look.rects else {}
+        {shape: lay_out_at([look.rects[0]], OUTPUT, shape, 2.25) for shape in shapes} if look.rects else {}
         for look in looks
     ]
     densities = [{shape: fit.density for shape, fit in each.items() if fit} for each in fits]

@@ -138,7 +138,7 @@ def test_a_phase_says_what_is_modelled_and_its_error(document: Any) -> None:
         assert avatar["modelled"] in [detail.name for detail in DETAILS[:-1]]
         assert 0 <= avatar["measured_px"] <= avatar["bound_px"] <= 2.0
         assert row["why"] == (
-            "4 tensor pixels along a side of a pixel of the picture: more could not be seen"
+            "2.25 tensor pixels along a side of a pixel of the picture: more make no better picture"
             if row["density"][1] == MOST_DENSITY
             else "the pixels that the network was trained to paint, in the shape that fits best of those that are ready"
         )
