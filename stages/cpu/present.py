@@ -33,8 +33,8 @@ from trilane.writing import REMOVED, require_name
 
 SEGMENTS = "segments"
 KEYFRAME_EVERY = 30
-#: One thread, no look-ahead and no reordering: every frame leaves the encoder before the next one comes. With a constant
-#: quantiser, the encoder does not first search a small copy of each frame for its rate (`docs/decisions/video-encoding.md`).
+#: One thread, no look-ahead and no reordering: every frame leaves the encoder before the next one comes. With a
+#: constant quantiser, no small copy of a frame is searched for its rate (`docs/decisions/video-encoding.md`).
 ENCODER_OPTIONS = {"preset": "ultrafast", "qp": "18", "tune": "zerolatency"}
 #: Every frame is a fragment of its own and goes to the file at once, so a killed writer loses the last one at most.
 FRAGMENTS = {"movflags": "empty_moov+default_base_moof+frag_every_frame", "flush_packets": "1"}
