@@ -33,8 +33,9 @@ from trilane.writing import REMOVED, require_name
 
 SEGMENTS = "segments"
 KEYFRAME_EVERY = 30
-#: One thread, no look-ahead and no reordering: every frame leaves the encoder before the next one comes.
-ENCODER_OPTIONS = {"preset": "ultrafast", "crf": "20", "tune": "zerolatency"}
+#: One thread, no look-ahead and no reordering: every frame leaves the encoder before the next one comes. With a
+#: constant quantiser, x264 does not search a small copy of each frame for its rate (docs/decisions/video-encoding.md).
+ENCODER_OPTIONS = {"preset": "ultrafast", "qp": "18", "tune": "zerolatency"}
 #: Every frame is a fragment of its own and is written at once, so that a killed writer loses at most the last frame.
 FRAGMENTS = {"movflags": "empty_moov+default_base_moof+frag_every_frame", "flush_packets": "1"}
 MS = 1e-6  # milliseconds in a nanosecond
