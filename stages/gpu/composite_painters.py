@@ -233,8 +233,8 @@ def spans(shown: Mask, margin: int) -> F32:
     return np.asarray(edges / (width, height, width, height), np.float32)
 
 
-# (joint, radius in metres at height 0, strength at height 0, at most 0.72 (`shadow.frag`), height in metres at which the
-# strength has fallen to 1/e)
+# (joint, radius in metres at height 0, strength at height 0, height in metres at which the strength has fallen to 1/e).
+# `shadow.frag` takes strengths up to 0.72.
 DISCS = (
     ("left_ankle", 0.15, 0.65, 0.18),
     ("right_ankle", 0.15, 0.65, 0.18),
