@@ -250,7 +250,7 @@ def controls_of_run(
 ) -> tuple[Control, ...]:
     """Return the controls of a scene's run with these `units`.
 
-    `choices`, `why_not`: fields of `Control` by the control's name, for the controls in OF_A_NEW_RUN.
+    `choices`, `why_not`: these fields of each control in OF_A_NEW_RUN, by the control's name.
     """
     camera = (
         Control("orbit", DRAG, True, min=-MOST_DRAG_DEG, max=MOST_DRAG_DEG),

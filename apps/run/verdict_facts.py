@@ -103,9 +103,9 @@ def _is_paced(document: Mapping[str, Any]) -> bool:
 
 
 def _lateness(document: Mapping[str, Any], *, is_paced: bool) -> Lateness | None:
-    """Return how many frames were not in time; None for a run in slow motion whose frames no fixed rate releases.
+    """Return how many frames were not in time; None for a run in slow motion that is not paced.
 
-    The misses of such a run are counted against another rate. `is_paced`: result of `_is_paced`.
+    Such a run counts its misses against another rate. `is_paced`: result of `_is_paced`.
     """
     frames, late = document["frames"], document["deadline_misses"]
     dropped = wanted_drops(frames["dropped"])
