@@ -103,7 +103,7 @@ class OwnRow(NamedTuple):
     silent: bool = False
 
 
-class Checked(NamedTuple):
+class CheckedRow(NamedTuple):
     """A row with two predictions and their 80 % intervals.
 
     `before_ms`, `before`: by the unchanged profile.
@@ -136,7 +136,7 @@ class Calibrated:
 
     data: Mapping[str, Any]
     numbers: Mapping[str, tuple[float, float]]
-    rows: tuple[Checked, ...]
+    rows: tuple[CheckedRow, ...]
 
     @property
     def notes(self) -> list[str]:
@@ -261,13 +261,13 @@ def calibrate_tables(data: Mapping[str, Any], path: Path, rows: Sequence[OwnRow]
     left_out = []
     for row in rows:
         others = with_numbers(data, _moved(profile, [each for each in rows if each.network != row.network]))
-        left_out.append(Checked(row, *_predicted(profile, row), *_predicted(parse_profile(others, path), row)))
+        left_out.append(CheckedRow(row, *_predicted(profile, row), *_predicted(parse_profile(others, path), row)))
     checked = tuple(each._replace(after=_scaled(each, error_scale(misses(left_out, each)))) for each in left_out)
     numbers = _moved(profile, rows) | _error_scales(profile, left_out)
     return Calibrated(with_numbers(data, numbers), numbers, checked)
 
 
-def misses(left_out: Sequence[Checked], of: Checked | UnitName) -> list[float]:
+def misses(left_out: Sequence[CheckedRow], of: CheckedRow | UnitName) -> list[float]:
     """Return the mean miss of each network: log(measured / predicted), in units of the stated error.
 
     The rows of one network count as one miss, because they have their error in common. If the unit has rows of only one
@@ -292,7 +292,7 @@ def error_scale(told: Sequence[float]) -> float:
     return min(scale * student_quantile(freedom, 0.8) / NORMAL_80, MOST_ERROR_SCALE)
 
 
-def _error_scales(profile: Profile, left_out: Sequence[Checked]) -> dict[str, tuple[float, float]]:
+def _error_scales(profile: Profile, left_out: Sequence[CheckedRow]) -> dict[str, tuple[float, float]]:
     """Return (value, spread) of each unit's `error_scale`, for units with rows; it multiplies the profile's own."""
     numbers = {}
     for unit in dict.fromkeys(each.row.unit for each in left_out):
@@ -303,7 +303,7 @@ def _error_scales(profile: Profile, left_out: Sequence[Checked]) -> dict[str, tu
     return numbers
 
 
-def _scaled(checked: Checked, scale: float) -> Interval:
+def _scaled(checked: CheckedRow, scale: float) -> Interval:
     factor = math.exp(NORMAL_80 * scale * spread_of(checked.after))
     return checked.after._replace(low_ms=checked.after_ms / factor, high_ms=checked.after_ms * factor)
 

@@ -34,7 +34,7 @@ NORMAL_OVER_MEDIAN = 1.4826  # standard deviation of a normal distribution, divi
 Keys = tuple[str, ...]
 
 
-class Measurement(NamedTuple):
+class TableCell(NamedTuple):
     """One cell of the table: its row, its column, and its value in milliseconds."""
 
     row: ConfigurationRow
@@ -97,7 +97,7 @@ class ProfileFit:
         return median(errors) if errors else 0.0
 
 
-def measurements(rows: Sequence[ConfigurationRow], step: Step) -> list[Measurement]:
+def measurements(rows: Sequence[ConfigurationRow], step: Step) -> list[TableCell]:
     """Return the measurements of `step` in `rows`; the frame time of an application is the middle of its range."""
     result = []
     for row in rows:
@@ -108,11 +108,11 @@ def measurements(rows: Sequence[ConfigurationRow], step: Step) -> list[Measureme
                 ends = row.range(column)
                 value = sum(ends) / 2 if ends else None
             if value is not None:
-                result.append(Measurement(row, column, value))
+                result.append(TableCell(row, column, value))
     return result
 
 
-def predicted_ms(profile: Profile, measured: Measurement) -> float:
+def predicted_ms(profile: Profile, measured: TableCell) -> float:
     """Return the time in ms that `profile` predicts for a measurement, under the performance profile MEASURED_UNDER."""
     corners, unit = corners_of(profile, MEASURED_UNDER), UNIT_OF_COLUMN[measured.column]
     network = reference_network(measured.row.spec)
@@ -176,7 +176,7 @@ def _from_residuals(residuals: Sequence[Residual], rows: Sequence[ConfigurationR
     return numbers
 
 
-def _solve(data: Mapping[str, Any], path: Path, step: Step, measured: Sequence[Measurement]) -> tuple[F64, F64]:
+def _solve(data: Mapping[str, Any], path: Path, step: Step, measured: Sequence[TableCell]) -> tuple[F64, F64]:
     """Return (factors on the priors of `step.free`, spread of each factor after the fit).
 
     `data`: tables of the profile with the priors.

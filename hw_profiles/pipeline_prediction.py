@@ -38,7 +38,7 @@ from trilane.pipeline.file_graph import (
 from trilane.pipeline.file_keys import OnnxStage, StageTime
 from trilane.pipeline.pipeline_file import PipelineFile
 from trilane.scheduler.events import Graph, Settings, Stop
-from trilane.scheduler.period_bound import Bound, period_bound
+from trilane.scheduler.period_bound import PeriodBound, period_bound
 from trilane.scheduler.virtual import Simulation, simulate
 from trilane.transport.slots import edge_rule
 from trilane.units import HOST, NS_PER_MS, UNITS, UnitName
@@ -107,7 +107,7 @@ def network_price(chip: Profile, graph: GraphFile, unit: UnitName, corners: Corn
     return StagePrice(mean, source, around.low_ms, around.high_ms, around.why, is_modelled=True)
 
 
-class Measured(NamedTuple):
+class MeasuredStages(NamedTuple):
     """Times of stages that a run of the file on this machine measured.
 
     `times`: time of a job by the stage's name.
@@ -120,10 +120,10 @@ class Measured(NamedTuple):
     chip: str
 
 
-NOTHING_MEASURED: Final = Measured({}, "", "")
+NOTHING_MEASURED: Final = MeasuredStages({}, "", "")
 
 
-def measured_price(file: PipelineFile, name: str, measured: Measured) -> StagePrice | None:
+def measured_price(file: PipelineFile, name: str, measured: MeasuredStages) -> StagePrice | None:
     """Return the time of a stage from a run on this machine; None if it was not measured, or has no scale.
 
     For another chip, the stage's `scale` multiplies the time.
@@ -137,7 +137,7 @@ def measured_price(file: PipelineFile, name: str, measured: Measured) -> StagePr
     return StagePrice(time, source, time.mean_ms / around, time.mean_ms * around, is_measured=True)
 
 
-def stages_without_time(file: PipelineFile, measured: Measured = NOTHING_MEASURED) -> list[str]:
+def stages_without_time(file: PipelineFile, measured: MeasuredStages = NOTHING_MEASURED) -> list[str]:
     """Return the names of the stages without a known time: no network, no measured time, and none in the file."""
     return [
         name
@@ -153,7 +153,7 @@ def prices_of(
     graphs: Mapping[str, GraphFile],
     chip_for: ChipFor,
     corners_of_chip: Callable[[Profile], Corners],
-    measured: Measured = NOTHING_MEASURED,
+    measured: MeasuredStages = NOTHING_MEASURED,
 ) -> dict[str, StagePrice]:
     """Return the time of every stage: from the file, from a measured run, or from its network.
 
@@ -178,7 +178,7 @@ def prices_of(
     return found
 
 
-def _without_a_time(file: PipelineFile, names: Sequence[str], measured: Measured) -> BadInputError:
+def _without_a_time(file: PipelineFile, names: Sequence[str], measured: MeasuredStages) -> BadInputError:
     """Return the error for stages without a time; its place is the first stage, and it names the others."""
     first = names[0]
     found = f"{file.stages[first].named_kind} without a time"
@@ -206,7 +206,7 @@ def factors_at(prices: Mapping[str, StagePrice], end: Ends) -> dict[str, float]:
     return found
 
 
-def bound_of(file: PipelineFile, prices: Mapping[str, StagePrice]) -> tuple[Graph, Bound]:
+def bound_of(file: PipelineFile, prices: Mapping[str, StagePrice]) -> tuple[Graph, PeriodBound]:
     """Return the scheduler's graph of a file and the bound on its period, from the mean times of its stages."""
     times = {name: each.mean_ns for name, each in prices.items()}
     graph = graph_of(file, edge_rules(file))

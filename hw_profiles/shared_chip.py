@@ -20,7 +20,7 @@ from trilane.hw_profiles.host_model import UNMEASURED
 from trilane.hw_profiles.pipeline_prediction import FED_FRAMES, Ends, over_ends, steady_ms
 from trilane.hw_profiles.rates import FrameInterval, holding, wanted_drops, without_interval
 from trilane.hw_profiles.schema import Corners, Profile, corners_of
-from trilane.hw_profiles.tenants import Pipeline
+from trilane.hw_profiles.tenants import SharingPipeline
 from trilane.scheduler.events import Stop
 from trilane.scheduler.shared_units import ONE, ROUND_ROBIN, Member, Runs, simulate_beside
 from trilane.scheduler.virtual import Simulation
@@ -56,7 +56,12 @@ class Together:
 
 
 def together(
-    profile: Profile, tenants: Sequence[Pipeline], corners: Corners, turns: str = ROUND_ROBIN, *, keep: bool = False
+    profile: Profile,
+    tenants: Sequence[SharingPipeline],
+    corners: Corners,
+    turns: str = ROUND_ROBIN,
+    *,
+    keep: bool = False,
 ) -> Together:
     """Return the settled state of `tenants` on the chip `profile`, with its units at `corners`.
 
@@ -74,14 +79,14 @@ def together(
     return Together(tuple(runs), costs.mean_ms, busy, tuple(shares))
 
 
-def alone_ms(profile: Profile, tenant: Pipeline, corners: Corners) -> Mapping[str, float]:
+def alone_ms(profile: Profile, tenant: SharingPipeline, corners: Corners) -> Mapping[str, float]:
     """Return the mean time in ms of a job by stage if only `tenant` runs, over its frames with a network."""
     return _Costs(profile, [tenant], corners).mean_ms[0]
 
 
 def _run(
     profile: Profile,
-    tenants: Sequence[Pipeline],
+    tenants: Sequence[SharingPipeline],
     costs: _Costs,
     seconds: float,
     turns: str,
@@ -104,7 +109,9 @@ def _run(
     return simulate_beside(members, turns=turns, divided=list(cores.values()), speed=costs.speed, keep=keep)
 
 
-def needed(profile: Profile, tenants: Sequence[Pipeline], number: int, corners: Corners, turns: str) -> FrameInterval:
+def needed(
+    profile: Profile, tenants: Sequence[SharingPipeline], number: int, corners: Corners, turns: str
+) -> FrameInterval:
     """Return the least frame time of tenant `number`: its source is always ready, the other tenants have their rates.
 
     For a single tenant, the result is the same as in its own prediction, because the run has the same length.
@@ -122,14 +129,14 @@ def needed(profile: Profile, tenants: Sequence[Pipeline], number: int, corners: 
     return over_ends(needs_ms)
 
 
-def _busy_s(run: Simulation, tenant: Pipeline, unit: str) -> float:
+def _busy_s(run: Simulation, tenant: SharingPipeline, unit: str) -> float:
     """Return the busy time in seconds of the chip's unit `unit` for a tenant."""
     rows = run.report["units"]
     own = [name for name, hardware in tenant.hardware.items() if hardware == unit and name in rows]
     return float(sum(rows[name]["busy"] for name in own) * run.report["duration_s"])
 
 
-def _seconds(tenants: Sequence[Pipeline], costs: _Costs) -> float:
+def _seconds(tenants: Sequence[SharingPipeline], costs: _Costs) -> float:
     """Return the length of the run in virtual seconds."""
     slowest = max(
         max(1 / tenant.fps, sum(means.values()) / 1e3) for tenant, means in zip(tenants, costs.mean_ms, strict=True)
@@ -147,7 +154,9 @@ class _Job(NamedTuple):
 class _Costs:
     """The times of the tenants' jobs on the chip, and the speed of jobs beside each other."""
 
-    def __init__(self, profile: Profile, tenants: Sequence[Pipeline], corners: Corners, end: Ends = "expected") -> None:
+    def __init__(
+        self, profile: Profile, tenants: Sequence[SharingPipeline], corners: Corners, end: Ends = "expected"
+    ) -> None:
         own = profile.memory.application_use_fraction.or_else(0.0)
         self._always = min(MOST_USE, own * sum(tenant.takes_memory for tenant in tenants))
         self._bytes_s = profile.memory.bandwidth_gb_s.or_else(10.0) * 1e9
@@ -185,7 +194,7 @@ class _Costs:
 
 def predict_beside(
     profile: Profile,
-    tenants: Sequence[Pipeline],
+    tenants: Sequence[SharingPipeline],
     performance_profile: str = SUSTAINED,
     minutes: float = 0.0,
     governor: str | None = None,
@@ -238,7 +247,12 @@ def _base_w(profile: Profile) -> float:
 
 
 def _rate(
-    profile: Profile, tenants: Sequence[Pipeline], number: int, corners: Corners, turns: str, frames: Mapping[str, Any]
+    profile: Profile,
+    tenants: Sequence[SharingPipeline],
+    number: int,
+    corners: Corners,
+    turns: str,
+    frames: Mapping[str, Any],
 ) -> dict[str, dict[str, Any]]:
     """Return the keys `needs_ms` and `rate` of tenant `number`; without an interval if the error is not known.
 
@@ -254,7 +268,7 @@ def _rate(
 
 def _row(
     profile: Profile,
-    tenants: Sequence[Pipeline],
+    tenants: Sequence[SharingPipeline],
     number: int,
     now: Together,
     corners: Corners,
@@ -307,12 +321,12 @@ def _settled_ms(moments: Sequence[Moment], at: Callable[[Corners], Together], nu
     return _mean([at(each.corners).runs[number].report["frame_time_ms"]["mean"] for each in last]) or None
 
 
-def _unit(unit: str, now: Together, tenants: Sequence[Pipeline]) -> dict[str, Any]:
+def _unit(unit: str, now: Together, tenants: Sequence[SharingPipeline]) -> dict[str, Any]:
     by_name = {tenant.name: row[unit] for tenant, row in zip(tenants, now.by_tenant, strict=True)}
     return {"busy": now.busy[unit], "idle": 1 - now.busy[unit], "by_pipeline": by_name}
 
 
-def _notes(profile: Profile, tenants: Sequence[Pipeline], turns: str) -> list[str]:
+def _notes(profile: Profile, tenants: Sequence[SharingPipeline], turns: str) -> list[str]:
     notes = [
         "frames are released from one instant on, each pipeline's at its own rate; response: from release to shown; "
         "a network's result is due when its next frame comes, any other frame three of its periods after its release"

@@ -85,7 +85,7 @@ class Jobs(Protocol):
         """Return the bytes that `network` moves in a job."""
 
 
-class Pipeline(Protocol):
+class SharingPipeline(Protocol):
     """A pipeline that shares a chip with others.
 
     `name`: name in reports.

@@ -191,7 +191,7 @@ def _ports(value: object) -> object:
 
 
 @dataclass(frozen=True)
-class StageInput:
+class PortInput:
     """What a port of a stage reads.
 
     `port`: name of the reading port; empty if the stage has one port.
@@ -232,7 +232,7 @@ class InputKeys(Keys):
         return self
 
 
-def read_input(port: str, value: object) -> StageInput:
+def read_input(port: str, value: object) -> PortInput:
     """Return one input from its value in the file. `port`: name of the reading port, or empty.
 
     Raises UnexpectedValue or pydantic's ValidationError.
@@ -247,7 +247,7 @@ def read_input(port: str, value: object) -> StageInput:
     stage, dot, from_port = keys.source.partition(".")
     if not stage or (dot and not from_port):
         raise UnexpectedValue(repr(keys.source), "a stage, or stage.port", "write both names, or the stage alone")
-    return StageInput(port, stage, from_port, keys.sync == "latest", keys.max_age_ms or 0.0)
+    return PortInput(port, stage, from_port, keys.sync == "latest", keys.max_age_ms or 0.0)
 
 
 def _inside(text: str) -> str:
@@ -439,7 +439,7 @@ class StageKeys(Keys):
     in_ports: ClassVar[Mapping[str, bool] | None] = None
 
     unit: str = Field(pattern=NAME, description="Unit that runs the stage; a name of your choice.")
-    inputs: tuple[StageInput, ...] = Field(
+    inputs: tuple[PortInput, ...] = Field(
         default=(), alias="in", description="Inputs of the stage: a stage, stage.port, or a table of ports."
     )
     every: int = Field(

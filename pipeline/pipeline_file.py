@@ -39,10 +39,10 @@ from trilane.pipeline.file_keys import (
     InputKeys,
     Keys,
     OnnxStage,
+    PortInput,
     PrepareBlock,
     PythonStage,
     RunKeys,
-    StageInput,
     StageKeys,
     StageTime,
     TimedStage,
@@ -123,11 +123,11 @@ class PipelineFile:
     @property
     def out_of_row(self) -> str:
         """The first stage that leaves out frames, or does not read only the stage before it; "" in a chain."""
-        before: tuple[StageInput, ...] = ()
+        before: tuple[PortInput, ...] = ()
         for name, stage in self.stages.items():
             if stage_inputs(stage) != before or stage.every != 1:
                 return name
-            before = (StageInput("", name),)
+            before = (PortInput("", name),)
         return ""
 
     @property
@@ -331,7 +331,7 @@ def time_of(measurement: Measurement) -> StageTime:
     return StageTime(mean=mean, sd=min(sd, MOST_SDS * mean))
 
 
-def _inputs(value: object, where: str) -> tuple[StageInput, ...]:
+def _inputs(value: object, where: str) -> tuple[PortInput, ...]:
     """Return the inputs of a stage from its key `in`: a stage, stage.port, or a table of ports."""
     ports = value if isinstance(value, dict) and not _is_input(value) else {"": value}
     if not ports:
@@ -408,7 +408,7 @@ def _in_order(stages: Mapping[str, StageKeys], path: Path) -> dict[str, StageKey
 
 def _check_sources(name: str, stage: StageKeys, stages: Mapping[str, StageKeys], path: Path) -> None:
     """Check that the stages and ports that a stage reads exist, and that it may read them as it does."""
-    synced: dict[str, StageInput] = {}
+    synced: dict[str, PortInput] = {}
     for each in stage.inputs:
         where = f"{path}: stages.{name}.in" + (f".{each.port}" if each.port else "")
         if each.stage not in stages:
@@ -591,6 +591,6 @@ def _with_value(tables: Mapping[str, Any], parts: Sequence[str], value: object) 
     return {**tables, parts[0]: _with_value(inner, parts[1:], value)}
 
 
-def stage_inputs(stage: StageKeys) -> tuple[StageInput, ...]:
+def stage_inputs(stage: StageKeys) -> tuple[PortInput, ...]:
     """Return one input for each stage that `stage` reads; several ports of a stage belong to one stream."""
     return tuple({each.stage: replace(each, port="", from_port="") for each in stage.inputs}.values())

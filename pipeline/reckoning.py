@@ -64,7 +64,7 @@ class Cost(NamedTuple):
         return batch_interval([a - b for a, b in zip(self.of_blocks, others, strict=True)])
 
 
-class Slowed(NamedTuple):
+class ReplayFindings(NamedTuple):
     """The results of the replays.
 
     `costs`: cost of slowing each stage by SLOWER.
@@ -153,7 +153,7 @@ class WhatIf:
         self._first_ns = end_ns
         self._presented = []
 
-    def close(self) -> Slowed | None:
+    def close(self) -> ReplayFindings | None:
         """Return what slowing each stage costs; None for fewer than two blocks, or a run that cannot be replayed."""
         if len(self._blocks) < 2:
             return None
@@ -169,7 +169,7 @@ class WhatIf:
         plain_ns = replays.pop("")
         costs = {name: _stage_cost(spans_ns[:count], plain_ns[:count]) for name, spans_ns in replays.items()}
         whole_ns = measured_ns / ((len(self._blocks) - 1) * LEAST_FRAMES)
-        return Slowed(costs, count * LEAST_FRAMES, sum(plain_ns) / len(plain_ns) / LEAST_FRAMES / whole_ns)
+        return ReplayFindings(costs, count * LEAST_FRAMES, sum(plain_ns) / len(plain_ns) / LEAST_FRAMES / whole_ns)
 
     def _replayed(self, frames: Sequence[Mapping[str, Need]], slowed: str, message_ns: int) -> list[int]:
         """Return the times in ns of each LEAST_FRAMES presented frames of a replay, except the first and the last.
@@ -319,7 +319,7 @@ class Reckoning:
         return Reckoned(budget, self.sharing.close(), {**self._efficiencies.close(), **bound})
 
 
-def _bound(budget: Budget, unit_of: Mapping[str, str], slowed: Slowed | None) -> dict[str, Any]:
+def _bound(budget: Budget, unit_of: Mapping[str, str], slowed: ReplayFindings | None) -> dict[str, Any]:
     """Return `bottleneck` and `bound` of a report; both are None if there is no path.
 
     The bound is the unit, and the stage, that costs most if it is slowed. If the replay cannot be trusted, it is the

@@ -15,8 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from trilane.pipeline.journal import Accounted, Counted, Record, Stepped, Stopped, Worked
-from trilane.pipeline.tracks import UNKNOWN, track_of
-from trilane.pipeline.tracks import Gone as GoneFrame
+from trilane.pipeline.tracks import UNKNOWN, GoneFrame, track_of
 from trilane.pipeline.unit_history import KEPT, Handed, IdleCutter, IdleSlice, Key, UnitHistory
 from trilane.scheduler.events import (
     Action,

@@ -33,7 +33,7 @@ SOURCE: Final = "source"
 UNKNOWN: Final = -1  # the number of a frame that is gone and cannot be told from others
 
 
-class Gone(NamedTuple):
+class GoneFrame(NamedTuple):
     """A frame that was lost or dropped. `frame`: its number, or UNKNOWN. `release_ns`: time of its release."""
 
     frame: int
@@ -74,13 +74,13 @@ class Track(Protocol):
     def give_back(self, job: Job) -> None:
         """Note that a job waits again because its unit died."""
 
-    def lose(self, frame: int, now_ns: int) -> Gone | None:
+    def lose(self, frame: int, now_ns: int) -> GoneFrame | None:
         """Note that a frame is lost; return it unless `lost_for` will return it."""
 
-    def lost_for(self, cause: str, now_ns: int) -> Gone | None:
+    def lost_for(self, cause: str, now_ns: int) -> GoneFrame | None:
         """Return the next frame that was lost for `cause`, a key of the report; None: `lose` returned it."""
 
-    def dropped_for(self, cause: str, now_ns: int) -> Gone:
+    def dropped_for(self, cause: str, now_ns: int) -> GoneFrame:
         """Return the next frame that was dropped for `cause`, a key of the report."""
 
     def waiting(self, stage: str) -> list[int]:
@@ -161,23 +161,23 @@ class ChainTrack:
         self._waiting[job.stage].append(job.frame)
         self._waiting[job.stage].sort()
 
-    def lose(self, frame: int, now_ns: int) -> Gone:
-        return Gone(frame, self._leave(frame, now_ns))
+    def lose(self, frame: int, now_ns: int) -> GoneFrame:
+        return GoneFrame(frame, self._leave(frame, now_ns))
 
-    def lost_for(self, _cause: str, _now_ns: int) -> Gone | None:
+    def lost_for(self, _cause: str, _now_ns: int) -> GoneFrame | None:
         return None
 
-    def dropped_for(self, cause: str, now_ns: int) -> Gone:
+    def dropped_for(self, cause: str, now_ns: int) -> GoneFrame:
         edge, _, kind = cause.rpartition(":")
         producer, _, consumer = edge.partition("->")
         if producer == SOURCE:
             queue = self._turned_away.get(kind) or self._source.queue
-            return Gone(*queue.popleft()) if queue else Gone(UNKNOWN, now_ns)
+            return GoneFrame(*queue.popleft()) if queue else GoneFrame(UNKNOWN, now_ns)
         is_bypass = (producer, consumer) == self._bypass
         for frame in self._waiting.get(consumer, ()):
             if self._frame(frame, now_ns).skips == is_bypass:
-                return Gone(frame, self._leave(frame, now_ns))
-        return Gone(UNKNOWN, now_ns)
+                return GoneFrame(frame, self._leave(frame, now_ns))
+        return GoneFrame(UNKNOWN, now_ns)
 
     def late(self, _unit: str) -> list[str]:
         """Return an empty list, because no stage of a chain has several inputs."""
@@ -219,7 +219,7 @@ class GraphTrack:
         self._core.ledger.left = self._left
         self._named = self._core.flow.stage_named
         self._heard_ns: dict[int, dict[int, int]] = {}  # by the frame's number and the stage's position
-        self._gone: dict[str, deque[Gone]] = {}
+        self._gone: dict[str, deque[GoneFrame]] = {}
         self._presented: dict[int, FrameLeft] = {}
 
     @property
@@ -233,7 +233,7 @@ class GraphTrack:
         for left in self._left:
             self._heard_ns.pop(left.frame, None)
             if left.cause:
-                self._gone.setdefault(left.cause, deque()).append(Gone(left.frame, left.release_ns))
+                self._gone.setdefault(left.cause, deque()).append(GoneFrame(left.frame, left.release_ns))
             else:
                 self._presented[left.frame] = left
 
@@ -281,14 +281,14 @@ class GraphTrack:
     def give_back(self, _job: Job) -> None:
         """Do nothing, because the second scheduler has taken the event."""
 
-    def lose(self, _frame: int, _now_ns: int) -> Gone | None:
+    def lose(self, _frame: int, _now_ns: int) -> GoneFrame | None:
         return None
 
-    def lost_for(self, cause: str, now_ns: int) -> Gone:
+    def lost_for(self, cause: str, now_ns: int) -> GoneFrame:
         found = self._gone.get(cause)
-        return found.popleft() if found else Gone(UNKNOWN, now_ns)
+        return found.popleft() if found else GoneFrame(UNKNOWN, now_ns)
 
-    def dropped_for(self, cause: str, now_ns: int) -> Gone:
+    def dropped_for(self, cause: str, now_ns: int) -> GoneFrame:
         return self.lost_for(cause, now_ns)
 
 

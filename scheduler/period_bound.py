@@ -35,7 +35,7 @@ NO_SHARES: Final[Mapping[str, Fraction]] = {}
 
 
 @dataclass(frozen=True)
-class Bound:
+class PeriodBound:
     """The least period of a graph.
 
     `period_ns`: least time between two frames of the source.
@@ -161,7 +161,7 @@ def period_bound(
     in_flight: int = 0,
     source_ns: int = 0,
     shares: Mapping[str, Fraction] = NO_SHARES,
-) -> Bound:
+) -> PeriodBound:
     """Return the least period of `graph`.
 
     `times_ns`: time of a job of each stage.
@@ -180,7 +180,7 @@ def _slots(graph: Graph) -> dict[str, int]:
 
 def _bound(
     waits: _Waits, slots: Mapping[str, int], source_ns: int = 0, shares: Mapping[str, Fraction] = NO_SHARES
-) -> Bound:
+) -> PeriodBound:
     best = max(_of_units(waits, shares), key=lambda bound: bound.period_ns)
     # Without arcs, the work of the units alone bounds the period.
     arcs = waits.arcs(slots) if waits.is_small and not shares else []
@@ -190,26 +190,26 @@ def _bound(
         best = _of_cycle(waits, cycle, ratio / waits.hyperperiod)
     if source_ns > best.period_ns:
         roots = tuple(name for index, name in enumerate(waits.names) if not waits.graph.inputs_of(index))
-        return Bound(Fraction(source_ns), roots, "rate")
+        return PeriodBound(Fraction(source_ns), roots, "rate")
     return best
 
 
-def _of_units(waits: _Waits, shares: Mapping[str, Fraction]) -> Iterator[Bound]:
+def _of_units(waits: _Waits, shares: Mapping[str, Fraction]) -> Iterator[PeriodBound]:
     """Yield for each unit the bound that its work for one frame sets."""
     for unit in waits.graph.units:
         names = tuple(stage.name for stage in waits.graph.stages if stage.unit == unit)
         each = {name: shares.get(name, 1) * Fraction(waits.times_ns[name], waits.periods[name]) for name in names}
         work = sum(each.values(), Fraction())
         busy = tuple(name for name, part in each.items() if part)
-        yield Bound(work, busy, f"unit {unit}" if work else "")
+        yield PeriodBound(work, busy, f"unit {unit}" if work else "")
 
 
-def _of_cycle(waits: _Waits, cycle: Sequence[_Arc], period_ns: Fraction) -> Bound:
+def _of_cycle(waits: _Waits, cycle: Sequence[_Arc], period_ns: Fraction) -> PeriodBound:
     places = {name: place for place, name in enumerate(waits.names)}
     stages = sorted({waits.stages[arc.job] for arc in cycle}, key=places.__getitem__)
     streams = tuple(dict.fromkeys(arc.stream for arc in cycle if arc.stream))
     limit = "in_flight" if any(arc.in_flight for arc in cycle) else "slots"
-    return Bound(period_ns, tuple(stages), limit, streams)
+    return PeriodBound(period_ns, tuple(stages), limit, streams)
 
 
 def _positive_cycle(jobs: int, arcs: Sequence[_Arc], ratio: Fraction) -> list[_Arc]:

@@ -26,10 +26,10 @@ from trilane.pipeline.file_keys import (
     EncodeBlock,
     OnnxStage,
     OverlayBlock,
+    PortInput,
     PortType,
     PrepareBlock,
     PythonStage,
-    StageInput,
     StageKeys,
     TimedStage,
     VideoBlock,
@@ -130,7 +130,7 @@ def _check_fixed(where: str, stage: OnnxStage, graph: onnx.GraphProto) -> None:
             raise BadInputError(f"{where}.shapes.{value.name}", found, f"{expected}, as the network fixes it", remedy)
 
 
-def _check_output(file: PipelineFile, name: str, each: StageInput, outputs: list[str]) -> None:
+def _check_output(file: PipelineFile, name: str, each: PortInput, outputs: list[str]) -> None:
     """Raise BadInputError if stage `name` reads a port that is none of a network's `outputs`. `each`: this input."""
     where = f"{file.path}: stages.{name}.in" + (f".{each.port}" if each.port else "")
     if each.from_port and each.from_port not in outputs:
@@ -199,7 +199,7 @@ def _written(
     return {}
 
 
-def source_type(each: StageInput, known: PortTypes) -> PortType | None:
+def source_type(each: PortInput, known: PortTypes) -> PortType | None:
     """Return the type of the port that an input reads; None if it is unknown. `known`: types of the known ports."""
     ports = known.get(each.stage, {})
     if each.from_port:
@@ -245,7 +245,7 @@ def _check_inputs(
             _check_network(where, found, each, networks[name])
 
 
-def _check_network(where: str, found: PortType, each: StageInput, network: GraphFile) -> None:
+def _check_network(where: str, found: PortType, each: PortInput, network: GraphFile) -> None:
     """Raise BadInputError unless the network's input has type `found`, or both are pictures.
 
     `each`: input of the stage that reads a port of this type.

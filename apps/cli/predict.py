@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
     from trilane.hw_profiles.application import Plan, Variant
     from trilane.hw_profiles.schema import Profile
-    from trilane.hw_profiles.tenants import Pipeline
+    from trilane.hw_profiles.tenants import SharingPipeline
 
 
 def predict_pipeline_file(options: PredictOptions, path: Path, as_json: bool) -> None:
@@ -179,7 +179,7 @@ def predict_pipelines(options: PredictOptions, as_json: bool) -> None:
 
 
 def _write_beside(
-    chip: Profile, found: Sequence[Pipeline], options: PredictOptions, answer: Mapping[str, Any], target: Path
+    chip: Profile, found: Sequence[SharingPipeline], options: PredictOptions, answer: Mapping[str, Any], target: Path
 ) -> None:
     """Write the simulated runs of the pipelines into one trace, the file `target`. `found`: pipelines on the chip."""
     from trilane.apps.explain.trace import write_predicted

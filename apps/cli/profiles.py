@@ -22,7 +22,7 @@ from trilane.files import read_text
 from trilane.writing import WRITABLE, write_bytes
 
 if TYPE_CHECKING:
-    from trilane.hw_profiles.calibrate import Calibrated, Checked
+    from trilane.hw_profiles.calibrate import Calibrated, CheckedRow
     from trilane.hw_profiles.fit import ProfileFit
 
 app = Commands(no_args_is_help=True, help="Hardware profiles.")
@@ -295,7 +295,7 @@ def _show_calibrated(result: Calibrated) -> None:
     console.print(numbers)
 
 
-def _cells(each: Checked) -> tuple[str, ...]:
+def _cells(each: CheckedRow) -> tuple[str, ...]:
     from rich.markup import escape
 
     predictions = (

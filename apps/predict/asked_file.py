@@ -18,7 +18,7 @@ from trilane.apps.run.verdict_facts import predicted_verdict
 from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import GraphFile
 from trilane.hw_profiles.network_time import Computes
-from trilane.hw_profiles.pipeline_prediction import Measured, predict_file, prices_of, stages_without_time
+from trilane.hw_profiles.pipeline_prediction import MeasuredStages, predict_file, prices_of, stages_without_time
 from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.pipeline.file_keys import MOST_SAMPLES, OnnxStage, StageTime
@@ -43,7 +43,7 @@ def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str],
     `say`: function that gets a message before an action that takes seconds. Raises BadInputError.
     """
     chips = _Chips(options, say)
-    measured, of_run = Measured({}, "", chips.name), None
+    measured, of_run = MeasuredStages({}, "", chips.name), None
     if options.measured:
         measured, of_run = _measured(options.measured, chips.name), _trust_in(options.measured)
     file = _with_share(read_pipeline(path), measured)
@@ -74,7 +74,7 @@ def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str],
     }
 
 
-def _clock(measured: Measured) -> list[str]:
+def _clock(measured: MeasuredStages) -> list[str]:
     """Return a list with a note on the part of a job that counts as its time; empty if no times are measured."""
     return [FROM_HAND_OVER if measured.chip == HOST else WITH_A_CORE] if measured.times else []
 
@@ -127,7 +127,7 @@ class _Chips:
         return self._known[key]
 
 
-def _measured(folder: Path, chip: str) -> Measured:
+def _measured(folder: Path, chip: str) -> MeasuredStages:
     """Return the times of a run's jobs by stage, to predict a run on `chip`. `folder`: run folder. `chip`: its name.
 
     On this machine, a job's time counts from the moment when the unit gets the job. A unit whose core is busy with
@@ -145,7 +145,7 @@ def _measured(folder: Path, chip: str) -> Measured:
             free_ns[job.unit] = job.end_ns
             samples.setdefault(job.stage, []).append((job.end_ns - from_ns) / NS_PER_MS)
     times = {name: StageTime(samples=tuple(each[:MOST_SAMPLES])) for name, each in samples.items()}
-    return Measured(times, str(folder), chip)
+    return MeasuredStages(times, str(folder), chip)
 
 
 def _trust_in(folder: Path) -> Trust:
@@ -153,7 +153,7 @@ def _trust_in(folder: Path) -> Trust:
     return trust_of(read_report(folder).as_json() if (folder / "report.json").exists() else {})
 
 
-def _with_share(file: PipelineFile, measured: Measured) -> PipelineFile:
+def _with_share(file: PipelineFile, measured: MeasuredStages) -> PipelineFile:
     """Return `file` with the measured share of frames that took the bypass, unless the file has a share or pattern."""
     if file.bypass is None or file.bypass[1].taken is not None:
         return file
@@ -170,7 +170,7 @@ def _answer(
     text: str,
     options: PredictOptions,
     chips: _Chips,
-    measured: Measured,
+    measured: MeasuredStages,
     of_run: Trust | None,
 ) -> dict[str, Any]:
     graphs = read_networks(file)

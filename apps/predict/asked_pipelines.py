@@ -23,7 +23,7 @@ from trilane.hw_profiles.network_time import Computes
 from trilane.hw_profiles.network_work import Network
 from trilane.hw_profiles.schema import Profile
 from trilane.hw_profiles.shared_chip import MOST_TENANTS, predict_beside
-from trilane.hw_profiles.tenants import NEWEST, SKIPS, FileTenant, Pipeline, Tenant
+from trilane.hw_profiles.tenants import NEWEST, SKIPS, FileTenant, SharingPipeline, Tenant
 from trilane.pipeline.pipeline_file import checked_tables, is_pipeline_file, read_pipeline
 from trilane.scene.planner import FrameWork
 from trilane.scene.schema import ENDING
@@ -98,7 +98,7 @@ def _unit(text: str, asked_for: str) -> UnitName:
     )
 
 
-def tenants(texts: Sequence[str], variant: Variant = NEWEST, precision: str | None = None) -> list[Pipeline]:
+def tenants(texts: Sequence[str], variant: Variant = NEWEST, precision: str | None = None) -> list[SharingPipeline]:
     """Return a pipeline for each of `texts`, in order. Raises BadInputError.
 
     `variant`: policy and edge of scenes. `precision`: int8, fp16 or fp32 for all networks, except stages of a pipeline
@@ -111,14 +111,14 @@ def tenants(texts: Sequence[str], variant: Variant = NEWEST, precision: str | No
     return [_tenant(each, name, variant, precision) for each, name in zip(read, names, strict=True)]
 
 
-def answer_of(chip: Profile, pipelines: Sequence[Pipeline], options: PredictOptions) -> dict[str, Any]:
+def answer_of(chip: Profile, pipelines: Sequence[SharingPipeline], options: PredictOptions) -> dict[str, Any]:
     """Return the document of a prediction for `pipelines` on one chip, with a verdict on each. Raises BadInputError."""
     answer = predict_beside(chip, pipelines, options.cap, options.minutes, options.governor, options.turns)
     rows = [row | {"verdict": predicted_verdict(answer | row).shown()} for row in answer["pipelines"]]
     return answer | {"pipelines": rows}
 
 
-def _tenant(each: AskedPipeline, name: str, variant: Variant, precision: str | None) -> Pipeline:
+def _tenant(each: AskedPipeline, name: str, variant: Variant, precision: str | None) -> SharingPipeline:
     if each.what.endswith(NETWORK_ENDING):
         return _bare(each, name, precision)
     return _of_file(each, name, precision) if each.is_file else avatar(each, name, variant, precision)

@@ -28,17 +28,16 @@ from trilane.hw_profiles.host import settings_of, usable_cores
 from trilane.machine import require_memory
 from trilane.pipeline import journal
 from trilane.pipeline.controls import Interrupts, RunControls
-from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
-from trilane.pipeline.description import StageInput as StreamInput
+from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, StageInput, UnitSettings
 from trilane.pipeline.file_graph import DEFAULT_FRAMES, bypass_of, edge_rules
 from trilane.pipeline.file_graph import settings_of as scheduler_settings
 from trilane.pipeline.file_keys import (
     BlockStage,
     EncodeBlock,
     OnnxStage,
+    PortInput,
     PortType,
     PythonStage,
-    StageInput,
     StageKeys,
     TimedStage,
     VideoBlock,
@@ -50,7 +49,7 @@ from trilane.pipeline.run import HANG_NS, run_pipeline
 from trilane.pipeline.stage import payload_bytes
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.placement import Place
-from trilane.stages.blocks.video import DEFAULT_FPS, Footage, footage
+from trilane.stages.blocks.video import DEFAULT_FPS, FoundPictures, footage
 from trilane.stages.dsp.runtime import resolve
 from trilane.stages.machine_facts import machine_facts
 from trilane.stages.run_options import RunOptions
@@ -123,7 +122,7 @@ def frames_of(file: PipelineFile) -> int:
     return min(counts, default=DEFAULT_FRAMES)
 
 
-def _footage_of(file: PipelineFile, stage: VideoBlock) -> Footage:
+def _footage_of(file: PipelineFile, stage: VideoBlock) -> FoundPictures:
     """Return facts about the video that `stage` reads. Raises BadInputError that names the stage's key `path`."""
     try:
         return footage(file.folder / stage.path)
@@ -223,7 +222,7 @@ def _stage(
 ) -> PipelineStage:
     stage = file.stages[name]
     streams = stage_inputs(stage)
-    inputs = tuple(StreamInput(stage=each.stage, latest=each.latest, max_age_ms=each.max_age_ms) for each in streams)
+    inputs = tuple(StageInput(stage=each.stage, latest=each.latest, max_age_ms=each.max_age_ms) for each in streams)
     place_of = {each.stage: place for place, each in enumerate(streams)}
     made = PipelineStage(name=name, unit=stage.unit, factory=_factory(stage), inputs=inputs, every=stage.every)
     settings = {
@@ -297,7 +296,7 @@ def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str
     return keys
 
 
-def _port(file: PipelineFile, name: str, each: StageInput, types: PortTypes) -> str:
+def _port(file: PipelineFile, name: str, each: PortInput, types: PortTypes) -> str:
     """Return the port that input `each` of stage `name` reads. Raises BadInputError if this is not clear."""
     ports = types[each.stage]
     if each.from_port or len(ports) == 1:

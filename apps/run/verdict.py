@@ -122,7 +122,7 @@ class Rate(NamedTuple):
     share: str = "95 %"
 
 
-class Lateness(NamedTuple):
+class LateFrames(NamedTuple):
     """How many frames were not in time.
 
     `due`: number of frames that had to be in time. `late`: how many of them were presented late. `dropped`, `lost`: how
@@ -140,7 +140,7 @@ class Lateness(NamedTuple):
         return self.late + self.dropped + self.lost
 
 
-class Bound(NamedTuple):
+class NamedBound(NamedTuple):
     """The bound of the frame time, as in the report's `bound`.
 
     `unit`: the unit, or a name in MEANINGS.
@@ -175,7 +175,7 @@ class Facts:
 
     rate: Rate | None
     target_fps: float
-    lateness: Lateness | None
+    lateness: LateFrames | None
     trust: Trust
     is_held_to_rate: bool = False
     failure: str = ""
@@ -183,7 +183,7 @@ class Facts:
     slow: tuple[str, float] | None = None
     latency_ms: float | None = None
     alone: tuple[float, float] | None = None
-    bound: Bound | None = None
+    bound: NamedBound | None = None
     idle: Mapping[str, tuple[float, Mapping[str, float]]] | None = None
     image: str = UNKNOWN
     tries: Sequence[str] = ()
@@ -268,7 +268,7 @@ def _too_late(facts: Facts) -> str:
     return f"{_late(found)} at {_number(facts.target_fps)} fps"
 
 
-def _late(found: Lateness) -> str:
+def _late(found: LateFrames) -> str:
     counts = {"dropped": found.dropped, "lost": found.lost, "replaced by newer ones": found.replaced}
     rest = "".join(f", {count} {what}" for what, count in counts.items() if count)
     return f"{found.late} of {found.due} frames late{rest}"
@@ -329,7 +329,7 @@ def _bound(facts: Facts) -> str:
     return "; ".join(parts)
 
 
-def _stages(bound: Bound, *, is_own: bool) -> str:
+def _stages(bound: NamedBound, *, is_own: bool) -> str:
     """Return the bound's stages with their ms, and a space at the end; "" if there are none.
 
     `is_own`: whether to return the stages of the bound's unit, or those of other units. Stages whose ms are rounded to

@@ -19,9 +19,9 @@ from trilane.apps.run.verdict import (
     SO_FAR,
     TARGET_FPS,
     UNKNOWN,
-    Bound,
     Facts,
-    Lateness,
+    LateFrames,
+    NamedBound,
     Rate,
     Trust,
     Verdict,
@@ -102,7 +102,7 @@ def _is_paced(document: Mapping[str, Any]) -> bool:
     return bool(run.get("fps") or run.get("arrivals") or (policy and policy.paced))
 
 
-def _lateness(document: Mapping[str, Any], *, is_paced: bool) -> Lateness | None:
+def _lateness(document: Mapping[str, Any], *, is_paced: bool) -> LateFrames | None:
     """Return how many frames were not in time; None for a run in slow motion that is not paced.
 
     Such a run counts its misses against another rate. `is_paced`: result of `_is_paced`.
@@ -111,13 +111,13 @@ def _lateness(document: Mapping[str, Any], *, is_paced: bool) -> Lateness | None
     dropped = wanted_drops(frames["dropped"])
     if is_paced:
         lost = frames.get("lost", 0)  # a prediction loses none
-        return Lateness(frames["presented"] + dropped + lost, late, dropped, lost)
+        return LateFrames(frames["presented"] + dropped + lost, late, dropped, lost)
     if (document.get("pace") or {}).get("slow_motion", 1.0) != 1.0:
         return None
-    return Lateness(frames["presented"] - 1, late, 0, frames["lost"], dropped)
+    return LateFrames(frames["presented"] - 1, late, 0, frames["lost"], dropped)
 
 
-def bound_of(document: Mapping[str, Any]) -> Bound | None:
+def bound_of(document: Mapping[str, Any]) -> NamedBound | None:
     """Return the bound that a report names, with each stage's ms on the critical path; None if there is no path."""
     bound = document.get("bound")
     if not bound:
@@ -130,7 +130,7 @@ def bound_of(document: Mapping[str, Any]) -> Bound | None:
     others = [name for name in sorted(of_unit, key=lambda each: -shares.get(each, 0.0)) if name not in first]
     named = [*first, *(name for name in others if shares.get(name, 0.0) >= LEAST_NAMED)]
     path = ((bound.get("path") or {}).get("unit") or {}).get("name", "")
-    return Bound(
+    return NamedBound(
         unit["name"],
         {name: shares[name] * frame_ms if frame_ms and name in shares else None for name in named},
         unit.get("share", 0.0),
@@ -174,7 +174,7 @@ def _validated(facts: Mapping[str, Any]) -> tuple[float, float | None]:
     return known, (facts.get("worst") or {}).get("psnr_db")
 
 
-def _tries(document: Mapping[str, Any], bound: Bound | None, target: float, folder: str) -> Iterator[str]:
+def _tries(document: Mapping[str, Any], bound: NamedBound | None, target: float, folder: str) -> Iterator[str]:
     """Yield proposals that follow from the run's figures, the most useful first. `target`: rate to hold, in fps."""
     others = document.get("other_programs")
     if others is not None and others > MOST_OTHERS:
@@ -190,7 +190,7 @@ def _tries(document: Mapping[str, Any], bound: Bound | None, target: float, fold
     yield f"trilane explain {folder or 'RUN'}"
 
 
-def _shorter(document: Mapping[str, Any], bound: Bound | None) -> Iterator[str]:
+def _shorter(document: Mapping[str, Any], bound: NamedBound | None) -> Iterator[str]:
     """Yield proposals to shorten the bound; none if the bound is no stage of a unit, such as the rate."""
     if document.get("policy") == "sequential" and len(document["units"]) > 1:
         yield "--policy pipelined: the units then work at once"
@@ -236,7 +236,7 @@ def predicted_verdict(answer: Mapping[str, Any], of_run: Trust | None = None) ->
     )
 
 
-def _predicted_lateness(answer: Mapping[str, Any]) -> Lateness | None:
+def _predicted_lateness(answer: Mapping[str, Any]) -> LateFrames | None:
     """Return how many frames of the simulated run were not in time; None if no rate released them.
 
     Random times and other pipelines can make frames late although the mean frame is fast enough.
@@ -282,7 +282,7 @@ def _is_held_by_display(answer: Mapping[str, Any]) -> bool:
     return bool(answer.get("display_capped")) and (rate is None or answer["fps"] < rate["fps"] * (1 - ROUNDED))
 
 
-def _predicted_bound(answer: Mapping[str, Any], frame_ms: float) -> Bound | None:
+def _predicted_bound(answer: Mapping[str, Any], frame_ms: float) -> NamedBound | None:
     """Return the unit whose stages take most of a frame's time, as the bound; None if no stage takes time.
 
     For a pipeline file, only the stages that determine the period count, unless its rate does. A network by itself is
@@ -291,7 +291,7 @@ def _predicted_bound(answer: Mapping[str, Any], frame_ms: float) -> Bound | None
     stages = answer.get("stages")
     if not stages:
         unit = answer.get("unit")
-        return unit and Bound(unit, {"network": frame_ms}, 1.0, of_unit=frozenset({"network"}))
+        return unit and NamedBound(unit, {"network": frame_ms}, 1.0, of_unit=frozenset({"network"}))
     cycle = [name for name in answer.get("cycle") or stages if name in stages]
     ms_of = {name: float(stages[name].get("alone_ms") or stages[name]["service_ms"]["mean"]) for name in stages}
     if answer.get("limit") == "rate":  # without the rate, the unit with the most work would determine the period
@@ -303,9 +303,11 @@ def _predicted_bound(answer: Mapping[str, Any], frame_ms: float) -> Bound | None
     if not by_unit[unit] or not frame_ms:
         return None
     if _is_held_by_display(answer):
-        return Bound(DISPLAY, {name: ms_of[name] for name in cycle if stages[name]["unit"] == unit}, 1.0)
+        return NamedBound(DISPLAY, {name: ms_of[name] for name in cycle if stages[name]["unit"] == unit}, 1.0)
     own = sorted((name for name in cycle if stages[name]["unit"] == unit), key=lambda name: -ms_of[name])
-    return Bound(unit, {name: ms_of[name] for name in own}, min(by_unit[unit] / frame_ms, 1.0), of_unit=frozenset(own))
+    return NamedBound(
+        unit, {name: ms_of[name] for name in own}, min(by_unit[unit] / frame_ms, 1.0), of_unit=frozenset(own)
+    )
 
 
 def _predicted_tries(answer: Mapping[str, Any], is_slow: bool) -> Iterator[str]:

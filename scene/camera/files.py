@@ -30,7 +30,7 @@ from trilane.scene.camera.pose_table import (
     ROW_ORDER,
     SAY_ORDER,
     SECONDS,
-    Clock,
+    TableClock,
     TableLayout,
     head_of,
     is_index,
@@ -477,7 +477,7 @@ def _skywards(turns: F64) -> float:
 
 
 #: Reader of each table format, called with a path and what the scene says about times.
-_TABLES: dict[str, Callable[[Path, Clock], RawCamera]] = {
+_TABLES: dict[str, Callable[[Path, TableClock], RawCamera]] = {
     "arkit": load_arkit,
     "euroc": load_euroc,
     "kitti": load_kitti,
@@ -504,7 +504,7 @@ def _read(kind: str, path: Path, spec: CameraSpec) -> RawCamera:
     Raises BadInputError, also when the scene states a unit of times for a file without times.
     """
     if kind in _TABLES:
-        return _TABLES[kind](path, Clock(spec.rate_hz, spec.time_unit))
+        return _TABLES[kind](path, TableClock(spec.rate_hz, spec.time_unit))
     if spec.time_unit != AUTO:
         found = f'camera.time_unit = "{spec.time_unit}" with a file that is no table of times'
         raise BadInputError(path, found, "a table, such as TUM's", "remove it, or set camera.rate_hz")

@@ -293,7 +293,7 @@ def _since_1970(time: float, unit: str) -> bool:
     return EARLIEST_S < time * TIME_UNITS[unit] < LATEST_S
 
 
-class Clock(NamedTuple):
+class TableClock(NamedTuple):
     """What the scene and the format say about a table's times.
 
     `rate_hz`: frames a second by the scene; None if the scene does not say.
@@ -305,7 +305,7 @@ class Clock(NamedTuple):
     unit: str = AUTO
     usual_hz: float = FILM_RATE_HZ
 
-    def stated(self, path: Path, unit: str) -> Clock:
+    def stated(self, path: Path, unit: str) -> TableClock:
         """Return this clock with the `unit` that column names state; the scene's own unit is kept.
 
         The scene may say that the times are frame numbers. Raises BadInputError when the scene states another unit than
@@ -330,7 +330,7 @@ class ColumnTimes(NamedTuple):
     rate: str
 
 
-def times_of(where: str | Path, column: NDArray[np.float64], clock: Clock) -> ColumnTimes:
+def times_of(where: str | Path, column: NDArray[np.float64], clock: TableClock) -> ColumnTimes:
     """Return the times in `column` (N,), or the times of its frame numbers.
 
     `where`: table, for messages. Raises BadInputError when several units are likely, or when no unit fits the steps.
@@ -433,7 +433,7 @@ class PoseTable:
 
 
 def read_pose_table(
-    path: Path, clock: Clock, usual: Sequence[str], expected: str, may_have_more: bool = False
+    path: Path, clock: TableClock, usual: Sequence[str], expected: str, may_have_more: bool = False
 ) -> PoseTable:
     """Return the poses of `path`.
 
@@ -487,7 +487,7 @@ class MatrixTable(NamedTuple):
     lengths: str = ""
 
 
-def read_matrix_table(path: Path, clock: Clock, expected: str) -> MatrixTable:
+def read_matrix_table(path: Path, clock: TableClock, expected: str) -> MatrixTable:
     """Return the poses of `path`: 3x4 matrices row by row, each of which may follow a time or a frame number.
 
     `clock`: what the scene says about the times. `expected`: expected content in words. Raises BadInputError with the

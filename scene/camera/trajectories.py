@@ -21,9 +21,9 @@ from trilane.scene.camera.pose_table import (
     FRAMES,
     MATRIX,
     USUAL,
-    Clock,
     MatrixTable,
     PoseTable,
+    TableClock,
     read_matrix_table,
     read_pose_table,
     read_table,
@@ -33,14 +33,14 @@ from trilane.scene.camera.recorded import AUTO, LENGTH_UNITS, OPENGL_FROM_OPTICA
 from trilane.scene.lens import Bent, Known, Lens, centred, checked_lens, distortion_note, measured_lens, of_opencv
 from trilane.scene.recordings import Detected
 
-ANY_CLOCK = Clock()
+ANY_CLOCK = TableClock()
 ARKIT_COLUMNS = 13
 ARKIT = "an ARKit log: time and the 12 numbers of a 3x4 matrix a line"
 #: Lens of an iPhone's main camera, 26 mm equivalent, on a 16:9 picture: 36 degrees high, 60 wide.
 PHONE = centred(1920, 1080, 540 / math.tan(math.radians(18.0)), Known.LONG)
 
 
-def load_arkit(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
+def load_arkit(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
     """Read an ARKit log: `time r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz` per line, camera to world, metres, Y up.
 
     The camera's axes are those of the sensor in landscape (x right, y up, looks along -Z). `clock`: what the scene says
@@ -77,7 +77,7 @@ KITTI_TIMES = "times.txt"
 GREY = of_opencv(1241.0, 376.0, 718.856, 718.856, 607.1928, 185.2157)
 
 
-def load_kitti(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
+def load_kitti(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
     """Read KITTI odometry poses: a 3x4 matrix per line, row by row, from the camera to the first camera's axes, metres.
 
     Axes are optical, so -Y is usually up. Some programs write a frame number or a time before each matrix. `clock`:
@@ -94,7 +94,7 @@ def load_kitti(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
     return RawCamera(times, turns, read.places, "-y", *lens, notes, read.table.place_of, detected, lengths=read.lengths)
 
 
-def _kitti_times(path: Path, read: MatrixTable, clock: Clock) -> tuple[F64, str]:
+def _kitti_times(path: Path, read: MatrixTable, clock: TableClock) -> tuple[F64, str]:
     """Return times (N,), seconds, of the poses, and their source: the file, `times.txt`, the scene or the usual rate.
 
     Raises BadInputError when `times.txt` has another number of times than there are poses.
@@ -112,7 +112,7 @@ def _kitti_times(path: Path, read: MatrixTable, clock: Clock) -> tuple[F64, str]
     return counted.since_s, f"{counted.rate.removeprefix(', ')}, as the file has no times"
 
 
-def _counted(path: Path, clock: Clock) -> Clock:
+def _counted(path: Path, clock: TableClock) -> TableClock:
     """Return the clock of poses without times: it counts frames.
 
     Raises BadInputError when the scene states a unit of times.
@@ -130,7 +130,7 @@ TUM = "a TUM trajectory: time, tx ty tz, qx qy qz qw a line"
 KINECT = centred(640, 480, 517.0)
 
 
-def load_tum(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
+def load_tum(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
     """Read a TUM RGB-D trajectory: `time tx ty tz qx qy qz qw` per line, camera to world, metres, seconds.
 
     Axes are optical. SLAM programs also write their maps in this format, some with times in nanoseconds. `clock`: what
@@ -170,7 +170,7 @@ CAM0 = of_opencv(752.0, 480.0, 458.654, 457.296, 367.215, 248.375)
 SENSOR_KEYS = {"data": 16, "resolution": 2, "intrinsics": 4, "distortion_coefficients": 4}
 
 
-def load_euroc(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
+def load_euroc(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
     """Read EuRoC MAV poses, `data.csv`: time in nanoseconds, position, quaternion `w, x, y, z`, then any other columns.
 
     The poses are those of the device's body. `cam0/sensor.yaml` next to the file's folder leads to the camera; without
@@ -246,7 +246,7 @@ STRAY = "a Stray Scanner odometry.csv: timestamp, frame, x, y, z, qx, qy, qz, qw
 VIDEO_PX, NEAR_PX = (1920.0, 1440.0), 100.0
 
 
-def load_stray(path: Path, clock: Clock = ANY_CLOCK) -> RawCamera:
+def load_stray(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
     """Read Stray Scanner's `odometry.csv`, or its folder: time, frame, position and quaternion of each frame.
 
     Axes are optical in ARKit's world, which is levelled, Y up, metres. Newer files have a lens for each frame, in

@@ -151,7 +151,7 @@ class _Fed(NamedTuple):
     preparation: Preparation | None
 
 
-class Network(PortedStage):
+class NetworkStage(PortedStage):
     """Runs one inference for each frame.
 
     Its keys are `onnx`, `runtime`, and `inputs`, the type of each input of the network by name, in the network's order.
@@ -202,8 +202,8 @@ class Network(PortedStage):
         return self._engine.bound(given, {name or self._engine.outputs[0]: array for name, array in outputs.items()})
 
 
-def build(settings: Mapping[str, Any], unit: UnitContext) -> Network:
+def build(settings: Mapping[str, Any], unit: UnitContext) -> NetworkStage:
     """Build the stage. Raises BadInputError, MissingPartError."""
     if has_device(settings["keys"]["runtime"]):
         unit.use_device(settings["keys"]["runtime"])
-    return Network(settings, RuntimeOptions(unit.settings.threads, unit.settings.spin))
+    return NetworkStage(settings, RuntimeOptions(unit.settings.threads, unit.settings.spin))

@@ -35,7 +35,7 @@ DEFAULT_FPS = 30.0
 EXPECTED = "a video or a folder of pictures"
 
 
-class Footage(NamedTuple):
+class FoundPictures(NamedTuple):
     """The facts of a video or a folder of pictures.
 
     `pictures`: number of pictures; 0 if it is not known.
@@ -46,18 +46,18 @@ class Footage(NamedTuple):
     fps: float | None
 
 
-def footage(path: Path) -> Footage:
+def footage(path: Path) -> FoundPictures:
     """Return the facts of a video file or a folder of pictures. Raises BadInputError."""
     if not path.exists():
         raise BadInputError(path, "no such file", EXPECTED, "put it there, or change `path`")
     if path.is_dir():
-        return Footage(len(picture_files(path)), None)
+        return FoundPictures(len(picture_files(path)), None)
     try:
         with av.open(str(path), metadata_errors="replace") as container:
             stream = video_stream(container, path)
             rate = stream.average_rate or stream.guessed_rate
             count = stream.frames or sum(packet.size > 0 for packet in container.demux(stream))
-            return Footage(count, float(rate) if rate else None)
+            return FoundPictures(count, float(rate) if rate else None)
     except (av.FFmpegError, OSError) as error:
         raise BadInputError(path, f"no readable video ({error})", EXPECTED, "convert it to .mp4") from None
 
@@ -71,7 +71,7 @@ def picture_files(folder: Path) -> list[Path]:
     return files
 
 
-class Video(PortedStage):
+class VideoStage(PortedStage):
     """Writes one picture for each frame. Raises BadInputError for a file that cannot be read."""
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
@@ -106,9 +106,9 @@ class Video(PortedStage):
         return np.asarray(ImageOps.fit(upright, self._shape[::-1], Image.Resampling.BILINEAR), np.uint8)
 
 
-def build_video(settings: Mapping[str, Any], unit: UnitContext) -> Video:  # noqa: ARG001 - a factory's signature
+def build_video(settings: Mapping[str, Any], unit: UnitContext) -> VideoStage:  # noqa: ARG001 - a factory's signature
     """Build the block. Raises BadInputError."""
-    return Video(settings)
+    return VideoStage(settings)
 
 
 class Encode(PortedStage):

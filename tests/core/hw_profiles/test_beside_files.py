@@ -20,7 +20,7 @@ from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
 from trilane.hw_profiles.schema import corners_of
 from trilane.hw_profiles.shared_chip import needed, predict_beside, together
-from trilane.hw_profiles.tenants import FileTenant, Pipeline, Tenant
+from trilane.hw_profiles.tenants import FileTenant, SharingPipeline, Tenant
 from trilane.units import SUSTAINED
 
 CHIP = load_profile("snapdragon-888")
@@ -71,7 +71,7 @@ other = { onnx = "add.onnx", unit = "dsp", in = "one" }
 ONE = '[run]\nfps = 0.5\n[stages]\ncamera = { unit = "isp", time_ms = 0 }\n'
 ONE += 'net = { onnx = "add.onnx", unit = "gpu", in = "camera" }\n'
 
-Asked = Callable[..., list[Pipeline]]
+Asked = Callable[..., list[SharingPipeline]]
 Command = Callable[..., tuple[str, str]]
 
 
@@ -81,7 +81,7 @@ def asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Asked:
     monkeypatch.chdir(tmp_path)
     onnx.save(additions(512), "add.onnx")
 
-    def read(*texts: str, precision: str | None = None) -> list[Pipeline]:
+    def read(*texts: str, precision: str | None = None) -> list[SharingPipeline]:
         for number, text in enumerate(texts):
             Path(f"file{number}.toml").write_text(text, encoding="utf-8")
         named = [f"file{number}.toml" if "\n" in text else text for number, text in enumerate(texts)]
@@ -95,7 +95,7 @@ def avatar() -> Tenant:
     return Tenant("avatar", "", (network,), (0,), 30.0)
 
 
-def reports(tenants: Sequence[Pipeline]) -> list[dict[str, Any]]:
+def reports(tenants: Sequence[SharingPipeline]) -> list[dict[str, Any]]:
     return [run.report for run in together(CHIP, tenants, CORNERS).runs]
 
 

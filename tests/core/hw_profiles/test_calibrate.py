@@ -22,7 +22,7 @@ from trilane.hw_profiles.calibrate import (
     NOISE,
     NU,
     Calibrated,
-    Checked,
+    CheckedRow,
     OwnRow,
     _derivatives,
     _EngineRow,
@@ -199,9 +199,9 @@ def around(low: float, high: float) -> Interval:
 
 def test_misses_are_those_of_other_rows_of_the_unit() -> None:
     """Twice as long as predicted, and the interval ends at twice the prediction: NORMAL_80 stated errors."""
-    two = Checked(row("resnet18", 4.0), 1.0, around(1, 1), 2.0, around(1, 4))
-    same = Checked(row("resnet18-128", 2.0), 1.0, around(1, 1), 2.0, around(1, 4))
-    lonely = Checked(row("resnet18", 9.0, unit="gpu"), 1.0, around(1, 1), 2.0, around(1, 4))
+    two = CheckedRow(row("resnet18", 4.0), 1.0, around(1, 1), 2.0, around(1, 4))
+    same = CheckedRow(row("resnet18-128", 2.0), 1.0, around(1, 1), 2.0, around(1, 4))
+    lonely = CheckedRow(row("resnet18", 9.0, unit="gpu"), 1.0, around(1, 1), 2.0, around(1, 4))
     left_out = [two, same, lonely]
     assert misses(left_out, "dsp") == pytest.approx([NORMAL_80, 0])
     assert misses(left_out, two) == [0]
@@ -306,9 +306,9 @@ def test_the_command_names_the_columns_of_this_format(header: str, tmp_path: Pat
     assert "network and ms, and maybe unit, precision, runtime" in err and "encoder" not in err
 
 
-def checked(place: str, ms: float, before_ms: float, silent: bool = False) -> Checked:
+def checked(place: str, ms: float, before_ms: float, silent: bool = False) -> CheckedRow:
     asked = row("resnet18", ms)._replace(place=place, silent=silent)
-    return Checked(asked, before_ms, around(1, 1), 1.0, around(1, 1))
+    return CheckedRow(asked, before_ms, around(1, 1), 1.0, around(1, 1))
 
 
 @pytest.mark.parametrize(
@@ -339,7 +339,7 @@ def test_rows_without_a_precision_are_named_where_the_network_is_of_floats(
         (rows, f"2 rows without a precision are {told}"),
         (rows[:2], f"1 row without a precision is {told}"),
     ):
-        notes = Calibrated({}, {}, tuple(Checked(each, 1, around(1, 1), 1, around(1, 1)) for each in silent)).notes
+        notes = Calibrated({}, {}, tuple(CheckedRow(each, 1, around(1, 1), 1, around(1, 1)) for each in silent)).notes
         assert notes == [said]
 
 

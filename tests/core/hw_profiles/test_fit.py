@@ -16,10 +16,10 @@ from trilane.hw_profiles import fit
 from trilane.hw_profiles.fit import (
     STEPS,
     UNIT_OF_COLUMN,
-    Measurement,
     ProfileFit,
     Residual,
     Step,
+    TableCell,
     as_toml,
     fit_profile,
     measurements,
@@ -42,8 +42,8 @@ def test_an_application_is_measured_in_the_middle_of_its_range() -> None:
     ]
     step = Step("all", ("bench_dsp_ms", "app_dsp_ms", "app_gpu_ms"), (), 0.1)
     assert measurements(rows, step) == [
-        Measurement(rows[0], "bench_dsp_ms", 5.0),
-        Measurement(rows[0], "app_dsp_ms", 23.0),
+        TableCell(rows[0], "bench_dsp_ms", 5.0),
+        TableCell(rows[0], "app_dsp_ms", 23.0),
     ]
 
 

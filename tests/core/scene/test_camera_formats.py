@@ -31,7 +31,7 @@ from support.camera_files import (
 from trilane.errors import BadInputError
 from trilane.scene.camera.colmap import MODELS, checked_camera
 from trilane.scene.camera.path import axes_towards
-from trilane.scene.camera.pose_table import Clock, read_pose_table
+from trilane.scene.camera.pose_table import TableClock, read_pose_table
 from trilane.scene.camera.recorded import LengthUnit, looked_at_from, metres_per_unit
 from trilane.scene.camera.trajectories import TUM_NAMES
 from trilane.scene.lens import Bent, Lens, distortion_note, largest_px
@@ -632,7 +632,7 @@ def test_fields_may_be_parted_by_semicolons_with_decimal_commas(tmp_path: Path) 
     for name, lines in {"points": rows, "commas": [row.replace(".", ",") for row in rows]}.items():
         file = tmp_path / f"{name}.csv"
         file.write_bytes("\r\n".join(["\ufeff" + head, *lines]).encode())
-        found.append(read_pose_table(file, Clock(None, "auto"), TUM_NAMES, "a table"))
+        found.append(read_pose_table(file, TableClock(None, "auto"), TUM_NAMES, "a table"))
     np.testing.assert_allclose(found[0].times_s, times, atol=1e-6)
     np.testing.assert_allclose(found[0].places, poses[:, :3], atol=1e-6)
     assert np.array_equal(found[0].places, found[1].places)
@@ -647,6 +647,6 @@ def test_times_in_a_column_of_places_are_refused(tmp_path: Path, column: int) ->
     file = tmp_path / "swapped.txt"
     np.savetxt(file, table, fmt="%.6f")
     with pytest.raises(BadInputError, match=f"in the place of {'xyz'[column - 1]} numbers that grow by equal steps"):
-        read_pose_table(file, Clock(None, "auto"), TUM_NAMES, "a table")
+        read_pose_table(file, TableClock(None, "auto"), TUM_NAMES, "a table")
     np.savetxt(file, np.column_stack([times, poses]), fmt="%.6f")
-    assert len(read_pose_table(file, Clock(None, "auto"), TUM_NAMES, "a table").times_s) == len(times)
+    assert len(read_pose_table(file, TableClock(None, "auto"), TUM_NAMES, "a table").times_s) == len(times)

@@ -17,7 +17,7 @@ from support.run_report import TIMES, make_report
 from trilane.apps.explain.explained_run import explain_run
 from trilane.apps.interface import load_run
 from trilane.apps.run.report import Report, read_report
-from trilane.apps.run.verdict import COMPUTED, SO_FAR, Bound, Facts, Lateness, Rate, Trust, judged, trust_of
+from trilane.apps.run.verdict import COMPUTED, SO_FAR, Facts, LateFrames, NamedBound, Rate, Trust, judged, trust_of
 from trilane.apps.run.verdict_facts import predicted_verdict, verdict_of
 from trilane.apps.watch.followed_run import FollowedRun
 from trilane.apps.watch.live_figures import looks
@@ -32,7 +32,7 @@ from trilane.scheduler.policy import run_settings
 from trilane.scheduler.virtual import simulate
 
 QUIET = Trust(True, ("quiet machine (other programs 0.4 %)",))
-FAST = Facts(Rate(96.0, 92.0, 102.0), 30.0, Lateness(299, 0), QUIET, frame_ms=10.4)
+FAST = Facts(Rate(96.0, 92.0, 102.0), 30.0, LateFrames(299, 0), QUIET, frame_ms=10.4)
 US = 1000
 
 
@@ -44,10 +44,10 @@ US = 1000
         ({"rate": Rate(29.5)}, False, "29.5 of 30 fps"),
         ({"rate": Rate(31.0, 29.0, 33.0)}, True, "the interval of the rate holds 30 fps, so another run may differ"),
         ({"rate": Rate(29.9), "is_held_to_rate": True}, True, "30 fps are held"),
-        ({"lateness": Lateness(300, 3)}, True, "30 fps are held"),  # 1 % of them
-        ({"lateness": Lateness(300, 4)}, False, "4 of 300 frames late at 30 fps"),
-        ({"lateness": Lateness(300, 1, 2, 1)}, False, "1 of 300 frames late, 2 dropped, 1 lost at 30 fps"),
-        ({"lateness": Lateness(34, 0, replaced=85)}, True, "30 fps are held"),  # the rate is of those that were shown
+        ({"lateness": LateFrames(300, 3)}, True, "30 fps are held"),  # 1 % of them
+        ({"lateness": LateFrames(300, 4)}, False, "4 of 300 frames late at 30 fps"),
+        ({"lateness": LateFrames(300, 1, 2, 1)}, False, "1 of 300 frames late, 2 dropped, 1 lost at 30 fps"),
+        ({"lateness": LateFrames(34, 0, replaced=85)}, True, "30 fps are held"),  # the rate is of those that were shown
         ({"failure": "gpu is gone"}, False, "the run failed: gpu is gone"),
         ({"rate": None, "lateness": None}, False, "the rate is not known: fewer than two frames were presented"),
         ({"target_fps": 60.0}, True, "60 fps are held"),
@@ -119,13 +119,13 @@ def test_what_the_display_holds_back_is_bound_by_it() -> None:
 
 
 def test_frames_that_gave_way_to_newer_ones_are_told_beside_the_rate() -> None:
-    found = judged(replace(FAST, lateness=Lateness(34, 0, replaced=85)))
+    found = judged(replace(FAST, lateness=LateFrames(34, 0, replaced=85)))
     assert "at 30 fps 0 of 34 frames late, 85 replaced by newer ones" in dict(found.lines())["PASS"]
 
 
 def test_a_rate_beside_another_one_says_which_it_is() -> None:
     """30.9 fps of a source at 30: what was shown, from the first frame on. 59 fps: what a prediction could have."""
-    paced = replace(FAST, rate=Rate(30.9), is_held_to_rate=True, lateness=Lateness(300, 1, 2))
+    paced = replace(FAST, rate=Rate(30.9), is_held_to_rate=True, lateness=LateFrames(300, 1, 2))
     computed = replace(FAST, rate=Rate(59.0), source=COMPUTED)
     said = {
         paced: "30.9 fps shown, asked for 30 fps: 1 of 300 frames late, 2 dropped",
@@ -138,7 +138,7 @@ def test_a_rate_beside_another_one_says_which_it_is() -> None:
 
 
 def test_stages_that_round_to_no_time_bound_nothing_that_is_told() -> None:
-    bound = Bound(
+    bound = NamedBound(
         "cpu", {"a": 3.0, "end": 0.004, "b": 0.006, "c": None}, 0.5, of_unit=frozenset({"a", "b", "c", "end"})
     )
     said = dict(judged(replace(FAST, bound=bound)).lines())["BOUND"]
