@@ -280,7 +280,7 @@ def random_pose(random: np.random.Generator) -> NDArray[np.float64]:
     return random.normal(0.0, 10 ** random.uniform(-2, 0.4), (JOINTS, 3))
 
 
-Texels = tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.intp], NDArray[np.float64]]
+Texels = tuple[NDArray[Any], NDArray[Any], NDArray[Any], NDArray[Any]]
 
 
 def worst_texels(level: MeshLevel, shaped: ShapedBody) -> Texels:
