@@ -172,7 +172,7 @@ def avatar(each: AskedPipeline, name: str, variant: Variant = NEWEST, precision:
         for shape, used, *_ in distinct
     }
     networks = tuple(by_kind[shape, used] for shape, used, *_ in distinct)
-    avatars, meshes = zip(*((count, drawn) for *_, count, drawn in distinct), strict=True)
+    avatars, meshes = tuple(one[2] for one in distinct), tuple(one[3] for one in distinct)
     frames = tuple(SKIPS if one is None else distinct.index(one) for one in seen)
     fps, unit, computes = each.fps or scene.fps, each.unit or INFER[1], Computes(precision=precision)
     return Tenant(
