@@ -184,6 +184,12 @@ def test_what_is_wrong_with_a_scene_is_one_sentence(case: int) -> None:
     assert str(raised.value) == f"here: {sentence}"
 
 
+def test_a_name_has_at_most_80_characters() -> None:
+    assert scene_from("here", {"name": "a" * 80}).name == "a" * 80
+    with pytest.raises(BadInputError, match="name"):
+        scene_from("here", {"name": "a" * 81})
+
+
 def test_avatars_are_named_by_their_places_and_keep_their_names() -> None:
     """Also when a scene is checked again, as it is after the options of the command line were laid over it."""
     scene = scene_from("here", {"avatars": [{}, {"name": "anna"}, {}]})
