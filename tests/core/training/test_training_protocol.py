@@ -29,7 +29,17 @@ def lines() -> Iterator[str]:
             for name in targets:
                 if isinstance(name, ast.Name) and name.id.isupper() and has_numbers_alone(statement.value):  # type: ignore[attr-defined]
                     yield f"{module}.{name.id} = {ast.unparse(statement.value)}"  # type: ignore[attr-defined]
-        yield from (f"{module}.{text}" for text in defaults(tree))
+        yield from (f"{module}.{text}" for text in (*fields(tree), *defaults(tree)))
+
+
+def fields(tree: ast.Module) -> Iterator[str]:
+    """`Table.key = number` of every key of a settings table whose default is a number or made of them."""
+    for table in tree.body:
+        for field in table.body if isinstance(table, ast.ClassDef) else []:
+            if isinstance(field, ast.AnnAssign) and isinstance(field.value, ast.Call):
+                for keyword in field.value.keywords:
+                    if keyword.arg == "default" and has_numbers_alone(keyword.value):
+                        yield f"{table.name}.{ast.unparse(field.target)} = {ast.unparse(keyword.value)}"
 
 
 def defaults(tree: ast.Module) -> Iterator[str]:
