@@ -170,7 +170,10 @@ class _Scene:
         return {"speedup": median(ratios), "speedup_low": low, "speedup_high": high, **middle, "placements": said}
 
     def compare(self, pictures: int) -> tuple[dict[str, Any], list[tuple[int, U8]]]:
-        """Compare `pictures` frames, evenly spread. Return errors by keys of `measure`, and (number, sheet) of each."""
+        """Compare both plans with the plan `full` and with the truth, in `pictures` evenly spread frames.
+
+        Return the keys of `measure` that the pictures give, and (number, contact sheet) of each frame.
+        """
         cast, total = Cast(self._checked), self._checked.config.scene.frames
         full = FullPictures(cast)
         first = AvatarFrames(self._checked)

@@ -341,7 +341,10 @@ def with_numbers(data: Mapping[str, Any], numbers: Mapping[str, tuple[float, flo
 
 
 class _EngineRow:
-    """A row on a tensor engine, as a function of the deviations of the six log rates."""
+    """A measured time on a tensor engine, and its prediction.
+
+    The prediction is a function of how far the logarithms of the engine's six rates are from those of the profile.
+    """
 
     def __init__(self, profile: Profile, row: OwnRow) -> None:
         chip = on_chip(profile, row)

@@ -296,7 +296,10 @@ class _Rows:
         self.row = np.repeat(np.arange(len(rows)), [len(table) for table, _ in tables])
 
     def predict(self, numbers: Numbers) -> tuple[F64, F64]:
-        """Return (time of each row in ms (rows,), share of each term in the growth of this time (rows, terms))."""
+        """Return (time of each row in ms (rows,), share of each term in this time (rows, terms)).
+
+        A share is the derivative of the time's logarithm by the logarithm of the term's cost. Those of a row sum to 1.
+        """
         seconds = np.exp(numbers.factors + numbers.rates[self.chip][:, RATE_OF_TERM])
         costs = self.table * seconds[self.row]
         joined, slopes = join(costs)

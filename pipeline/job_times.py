@@ -310,7 +310,7 @@ CLOSE_ON_EXEC: Final = 8
 HARDWARE: Final = 0
 
 
-class CounterReading(NamedTuple):
+class CountedEvent(NamedTuple):
     """An event to count.
 
     `name`: name of the count in the report.
@@ -335,7 +335,7 @@ class Reading(NamedTuple):
     running_ns: int
 
 
-KINDS: Final = (CounterReading("instructions", HARDWARE, 1), CounterReading("cache_misses", HARDWARE, 3))
+KINDS: Final = (CountedEvent("instructions", HARDWARE, 1), CountedEvent("cache_misses", HARDWARE, 3))
 
 
 class HardwareCounters:
@@ -344,7 +344,7 @@ class HardwareCounters:
     Raises OSError if none of them can be counted.
     """
 
-    def __init__(self, kinds: Sequence[CounterReading] = KINDS) -> None:
+    def __init__(self, kinds: Sequence[CountedEvent] = KINDS) -> None:
         self._files: dict[str, int] = {}
         self._before: dict[str, Reading] = {}
         refused: OSError | None = None
@@ -434,7 +434,7 @@ def availability() -> str:
         return f"absent: {_reason(error)}"
 
 
-def _open(kind: CounterReading) -> int:
+def _open(kind: CountedEvent) -> int:
     """Open a counter and return its file. Raises OSError."""
     flags = INHERIT | EXCLUDE_KERNEL | EXCLUDE_HYPERVISOR
     attributes = ATTR.pack(kind.kind, ATTR.size, kind.config, 0, 0, ENABLED_TIME | RUNNING_TIME, flags, 0, 0, 0)

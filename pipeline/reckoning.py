@@ -123,7 +123,7 @@ class WhatIf:
         self._handed_ns: list[int] = []
 
     def add(self, explained: ExplainedJob) -> None:
-        """Count a job; jobs come in the order of their ends."""
+        """Keep what a job needed, for the replays. Call it in the order of the jobs' ends."""
         if not self._is_known:
             return
         job = explained.job

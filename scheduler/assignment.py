@@ -188,18 +188,18 @@ class Choice:
 
 
 class _LateFrames:
-    """Drops waiting frames of a run.
+    """Drops waiting frames that are stale, or can no longer meet their deadline.
 
     `policy`: policy that says which frames are dropped.
     `flow`, `source`: frames in flight, and released frames that are not in flight yet.
-    `choice`: object that says whether a frame must be late.
+    `choice`: object that says whether a frame can still be in time.
     """
 
     def __init__(self, policy: Policy, flow: Flow, source: Source, choice: Choice) -> None:
         self._policy, self._flow, self._source, self._choice = policy, flow, source, choice
 
     def drop(self, stage: StageState, now_ns: int) -> None:
-        """Drop the frames that wait for the stage and are stale or must be late."""
+        """Drop the frames that wait for the stage and are stale or can no longer be in time."""
         edge = stage.input
         if edge is None:
             if not self._choice.is_full():

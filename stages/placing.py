@@ -226,7 +226,7 @@ def _made_from(checked: Checked, cores: Sequence[CpuCore], rule: Placement) -> l
 #: Number of rounds in which placements are tried. After TRY_S seconds no round starts, except the first LEAST_ROUNDS.
 ROUNDS, LEAST_ROUNDS, TRY_S = 6, 3, 5.0
 #: Largest share of the cores that other programs may use while placements are compared, and how long it is measured.
-MOST_OTHERS, LOOK_S = 0.1, 0.25
+QUIET_ENOUGH, LOOK_S = 0.1, 0.25
 PREDICTED = "the least predicted frame time"
 TRYING = "trying {} placements with frames of the scene (once for this avatar, scene and machine) ..."
 
@@ -294,5 +294,5 @@ def choice(
 
 
 def _refuse_when_busy(share: float) -> None:
-    if share > MOST_OTHERS:
+    if share > QUIET_ENOUGH:
         raise _BusyError(share)

@@ -268,9 +268,10 @@ def make_mesh_levels(shaped: ShapedBody) -> Iterator[MeshLevel]:
 
 
 def simplify_within(mesh: Corners, tolerance_m: float) -> tuple[I64, Pairs]:
-    """Return triangles (G,3) that move no point of the surface further than `tolerance_m`, and their pairs.
+    """Simplify `mesh`; return the triangles (G,3) that are left, and their pairs with the whole mesh.
 
-    If no round reaches `tolerance_m`, the round with the smallest largest distance is returned.
+    No pair is further apart than `tolerance_m`. If none of MOST_ROUNDS rounds keeps to it, the result is from the round
+    whose furthest pair is nearest.
     """
     locked = np.zeros(len(mesh.uv), bool)
     best: tuple[float, I64, Pairs] | None = None

@@ -363,11 +363,11 @@ class HeartbeatSocket:
         self.socket.setsockopt(zmq.RCVHWM, HIGH_WATER)
 
     def bind(self, endpoint: str) -> None:
-        """Receive the unit's heartbeats at `endpoint` (the scheduler's end)."""
+        """Bind the socket to `endpoint`, where the unit's heartbeats arrive from now on (the scheduler's end)."""
         self.socket.bind(endpoint)
 
     def connect(self, endpoint: str) -> None:
-        """Send heartbeats to `endpoint` (the unit's end)."""
+        """Connect the socket to `endpoint`, where heartbeats go from now on (the unit's end)."""
         self.socket.connect(endpoint)
 
     @property

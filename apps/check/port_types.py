@@ -155,7 +155,10 @@ def port_types(file: PipelineFile, networks: Mapping[str, GraphFile]) -> PortTyp
 
 
 def _check_bypass(file: PipelineFile, types: PortTypes) -> None:
-    """Raise BadInputError if the bypass begins at a stage without a port that the stage at its end needs."""
+    """Raise BadInputError if the stage where the bypass begins lacks a port that the stage where it ends reads.
+
+    A port of another type counts as lacking. A stage with Python or a set time, `busy` and `discard` need no port.
+    """
     if file.bypass is None:
         return
     begin, way = file.bypass

@@ -403,7 +403,7 @@ def _short_bound(figures: MomentFigures) -> str:
 
 
 def _short_error(figures: MomentFigures) -> str:
-    """Return the PSNR of each avatar in its worst band of zoom, as a text."""
+    """Return a text with the PSNR of each avatar at the distance where it is least, by the avatar's validation."""
     known = {
         name: min(facts["psnr_db_by_band"].values())
         for name, facts in figures.accuracy.items()

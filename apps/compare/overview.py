@@ -181,7 +181,10 @@ def _dict(value: Any) -> dict[str, Any]:
 
 
 def _video(folder: Path, name: Any) -> Path | None:
-    """Return the video in a trial's run folder; None if that folder is not inside the sweep's folder."""
+    """Return the path of the video in a trial's run folder; the file may not exist.
+
+    `folder`: the sweep's folder. `name`: name of the run folder; None is returned if it is no text or leads outside.
+    """
     if not isinstance(name, str):
         return None
     place = (folder / name).resolve()

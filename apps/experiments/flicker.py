@@ -1,4 +1,4 @@
-"""How much does the error change between successive frames? A person sees this change as flicker.
+"""Flicker: how much does the error change between successive frames?
 
 Rule: flicker of a pair of frames is the mean change of the error, |(P_t - G_t) - (P_t-1 - G_t-1)|, with P the picture
 and G its reference. Therefore neither the motion of the scene nor an error that stays in place is flicker. An error

@@ -196,9 +196,10 @@ class RunExplanation:
         }
 
     def _of_cores(self, frame_ms: float | None, efficiency: float | None) -> dict[str, Any] | None:
-        """Return the run's cores and, for a mean frame, the time that the cores had and the CPU time of all jobs.
+        """Return the run's cores, their time together in a mean frame (`had_ms`), and the CPU time of all jobs in it.
 
-        `frame_ms`: mean frame time. `efficiency`: machine efficiency. None if a part is unknown.
+        `frame_ms`: mean frame time. `efficiency`: machine efficiency. The result is None if one of them is None, or if
+        the cores of a unit are unknown.
         """
         cores = sorted({core for place in self._places.values() for core in place.cores})
         if frame_ms is None or efficiency is None or not cores or len(self._places) < len(self._begun.graph.units):
@@ -232,8 +233,9 @@ def explain_frame(folder: Path, number: int) -> dict[str, Any]:
     """Return what became of frame `number` of the run in `folder`, with a row for each of its jobs, as plain data.
 
     `outcome` is `presented`, `dropped`, `lost` or `under way`; `cause` is the key of the report that counts a dropped
-    or lost frame. `after_ms` and the jobs' `begin_ms` count from the frame's release. Raises BadInputError as
-    `explain_run` does, and for a frame that is not in the journal.
+    or lost frame. `after_ms`: time from the frame's release until it was presented, dropped or lost; None while it is
+    under way. The jobs' `begin_ms` count from the release too. Raises BadInputError as `explain_run` does, and for a
+    frame that is not in the journal.
     """
     begun, records = open_journal(folder)
     timeline = Timeline(begun.graph, begun.settings, waits=True)

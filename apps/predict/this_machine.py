@@ -82,9 +82,10 @@ def with_first(chip: Profile, text: str, say: Say) -> Profile:
 
 
 def with_file_in_application(chip: Profile, graph: GraphFile, shapes: Mapping[str, Sequence[int]], say: Say) -> Profile:
-    """Return `chip` with measured times of the default avatar's run, in which the file's network replaces the avatar's.
+    """Return `chip` with measured times of the default avatar's stages, and of the network in `graph` as its network.
 
-    The parameters are those of `with_file`.
+    A run of the default avatar and calls of the network are measured apart. If one fails, `chip` is returned unchanged.
+    `chip`, `graph`, `shapes`, `say`: as in `with_file`.
     """
     usual, _ = with_avatar(chip, DEFAULT, say)
     placed = usual.units[NETWORK].measured

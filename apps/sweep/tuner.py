@@ -191,9 +191,9 @@ class Space:
         return found
 
     def steps(self, one: Mapping[str, int], other: Mapping[str, int]) -> int:
-        """Return the distance between two trials, given by places, summed over the axes.
+        """Return the distance between the trials at places `one` and `other`: a sum over the axes.
 
-        It is the number of steps on an ordered axis. On any other axis it is 1 for different values.
+        An ordered axis adds the number of steps between the two values. Any other axis adds 1 if the values differ.
         """
         apart = {name: abs(one[name] - other[name]) for name in self.axes}
         return sum(steps if name in self.ordered else min(steps, 1) for name, steps in apart.items())

@@ -1,13 +1,13 @@
 """A video as a background: a thread decodes its frames in advance and converts them to sRGB.
 
-Each frame is shown at the time that the file gives it, whatever the rate of the run. The thread decodes at most AHEAD
-frames in advance.
+Each frame is shown at the time that the file gives it, whatever the rate of the run. At most AHEAD decoded frames wait;
+the thread and the reader hold one more each.
 
 A video of high dynamic range, PQ or HLG, is converted in three steps:
 
 - The published curves give its light.
-- The curve of ITU-R BT.2390 reduces light above what a common display shows. The largest of the three primaries
-  decides the reduction of all three, which keeps the hue.
+- The curve of ITU-R BT.2390 reduces bright light, so that the brightest becomes a display's white. The largest of the
+  three primaries decides the reduction of all three, which keeps the hue.
 - The light is converted to the primaries of sRGB.
 
 Sources: PQ, HLG and its system gamma are from ITU-R BT.2100-2; the reduction is from BT.2390-10, 5.4.1; reference white

@@ -35,7 +35,7 @@ def test_a_run_is_rehearsed_once_and_what_was_found_is_kept(
 ) -> None:
     """However busy the machine is; one round of the placements is enough."""
     monkeypatch.setattr(placing, "LEAST_FRAMES", 4)
-    for name, value in (("MOST_OTHERS", 9.0), ("ROUNDS", 1), ("LOOK_S", 0.0)):
+    for name, value in (("QUIET_ENOUGH", 9.0), ("ROUNDS", 1), ("LOOK_S", 0.0)):
         monkeypatch.setattr(placing, name, value)
     said: list[str] = []
     with UnitStarter(PRELOAD) as starter:

@@ -19,7 +19,7 @@ from trilane.pipeline.job_times import (
     ATTR,
     KINDS,
     ROW,
-    CounterReading,
+    CountedEvent,
     HardwareCounters,
     NoCounters,
     absence,
@@ -29,7 +29,7 @@ from trilane.pipeline.job_times import (
 )
 
 SOFTWARE, PAGE_FAULTS, MINOR_FAULTS = 1, 2, 5
-FAULTS = (CounterReading("faults", SOFTWARE, PAGE_FAULTS), CounterReading("minor", SOFTWARE, MINOR_FAULTS))
+FAULTS = (CountedEvent("faults", SOFTWARE, PAGE_FAULTS), CountedEvent("minor", SOFTWARE, MINOR_FAULTS))
 PAGES = 200
 
 
