@@ -35,12 +35,12 @@ MAX_SIDE = 2048
 
 
 def measure(sizes: tuple[int, ...] = (64, 128, 256, 512), repeats: int = 20) -> dict[str, Any]:
-    """The default avatar, standing, drawn into square tensors with every texture filter of the packed pass.
+    """Draw the standing default avatar into square tensors with every texture filter of the packed pass.
 
     `sizes`: sides of the tensors, pixels. `repeats`: timed draws of each filter.
-    Keys: `rows`, one per size and filter: `raster_ms` (median), `steps_mean` (mean difference of the body's bytes from
-    those of `linear`), `psnr_db` (of the painted picture; the network was trained with `linear`); `sources`; `driver`;
-    `config`.
+    Keys: `rows`, one per size and filter: `raster_ms` (median), `steps_mean` (mean absolute difference from the tensor
+    of `linear` over the body's pixels), `psnr_db` (of the network's picture against the truth; the network was trained
+    with `linear`); `sources`; `driver`; `config`.
 
     Raises BadInputError, MissingPartError.
     """

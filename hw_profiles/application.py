@@ -346,10 +346,10 @@ def _shares(
 
 
 def reference_frame_ms(profile: Profile, plan: Plan, corners: Corners) -> float:
-    """Return the mean frame time in ms of the variant `REFERENCE` without a run of the scheduler, for fitting.
+    """Return the mean frame time in ms of the variant `REFERENCE` without the scheduler; fits need it often.
 
-    With one slot between stages, raster, network and composite follow each other, so their times add up. A test
-    compares the result with the scheduler in virtual time.
+    With one slot between stages, raster, network and composite follow each other, so it is the sum of their times, but
+    at least the display's interval. A test compares the result with the scheduler in virtual time.
     """
     times = stage_times_ms(profile, plan, corners)
     chain = sum(ms for (name, _), ms in times.items() if name not in ("pose", "present"))

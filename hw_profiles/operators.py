@@ -437,7 +437,10 @@ def _clip(node: Any, shapes: Shapes) -> dict[str, float]:
 
 
 def _is_swish(node: Any, before: EngineLayer, names: _Graph) -> bool:
-    """Return whether `node` multiplies a tensor with its own sigmoid, which is `before`."""
+    """Return whether `node` multiplies a tensor with its own sigmoid, and nothing else reads that sigmoid.
+
+    `before`: layer of the sigmoid.
+    """
     if _kind(node) != "Mul" or before.kind != "Sigmoid":
         return False
     return set(names.given(node)) == {*before.reads, before.writes} and names.reads[before.writes] == 1

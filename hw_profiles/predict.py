@@ -131,7 +131,7 @@ def _shown_times(profile: Profile, fps: float | None, times: FrameInterval) -> F
 def predicted_run(
     profile: Profile, plan: Plan, performance_profile: str = SUSTAINED, wanted: Wanted = NOTHING
 ) -> Simulation:
-    """Return the run in virtual time, at constant temperature, from which `predict` takes its shares of time.
+    """Return the run in virtual time, at constant temperature, by which `predict` divides time into busy and idle.
 
     Parameters and errors are those of `predict`.
     """

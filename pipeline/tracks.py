@@ -238,13 +238,13 @@ class GraphTrack:
                 self._presented[left.frame] = left
 
     def start(self, _now_ns: int) -> None:
-        """Do nothing: the second scheduler knows."""
+        """Do nothing: the second scheduler has taken the event."""
 
     def advance(self, _now_ns: int) -> None:
-        """Do nothing: the second scheduler knows."""
+        """Do nothing: the second scheduler has taken the event."""
 
     def stop(self) -> None:
-        """Do nothing: the second scheduler knows."""
+        """Do nothing: the second scheduler has taken the event."""
 
     @property
     def left(self) -> int:

@@ -234,10 +234,10 @@ def _over_all(
 
 
 def _turned(path: CameraPath, stored: tuple[Stored, ...]) -> tuple[CameraPath, tuple[str, ...]]:
-    """Return `path` with the shape of each picture and its quarter turns for display, and notes.
+    """Return `path` with the shape of each picture and the quarter turns that make it agree with the camera; and notes.
 
-    The quarter turns make the pictures agree with the camera. `stored`: one picture for all samples of the path, or one
-    for each.
+    If the turns that the files state all agree, and the path is not held, no turns are set and those of the files hold.
+    `stored`: one picture for all samples of the path, or one for each.
     """
     lenses = path.optics.lenses
     turns = tuple(

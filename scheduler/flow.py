@@ -478,7 +478,7 @@ class Flow:
             self._give_back_all(stage, job)
 
     def _give_back_all(self, stage: StageState, job: Job) -> None:
-        """Let the job's frame wait in all lines in which it waited."""
+        """Put the job's frame back into every line from which the job took it."""
         for inlet in stage.inlets:
             if inlet.producer is None:
                 inlet.edge.give_back(job.frame)
@@ -520,7 +520,7 @@ class Flow:
         self._tell_bypass(state)
 
     def _forget(self, frame: int, state: FrameState) -> None:
-        """Take a frame that is gone out of all lines; in a chain it has left its only line already."""
+        """Remove a dropped or lost frame from all lines; in a chain, it has already left its only line."""
         if self.is_chain:
             return
         if state.jobs:

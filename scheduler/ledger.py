@@ -296,7 +296,7 @@ class Ledger:
 
     @property
     def shown_ns(self) -> dict[int, int]:
-        """The time of each presented frame by its number; only for a run that keeps all values."""
+        """The time of each presented frame by its number; empty for a run that keeps sketches in place of values."""
         return dict(zip(self.presented_frames, self.presented_ns, strict=True))
 
     @property

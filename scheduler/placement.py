@@ -452,10 +452,12 @@ def worth_trying(found: Sequence[Ranked], rule: Ranked) -> list[Ranked]:
 
 
 def typical(rounds: Sequence[Sequence[float]]) -> list[float]:
-    """Return the typical frame time of each placement, in the unit of `rounds`.
+    """Return a frame time for each placement, in the unit of `rounds`, that slow rounds do not distort.
 
-    `rounds`: frame times of all placements, for each round. Each time is divided by the median of its round, because a
-    slow second of the machine slows all placements alike. The results are scaled by the median of these medians.
+    Each time is divided by the median of its round, because a slow second of the machine slows all placements alike.
+    The result is the median of these ratios over the rounds, times the median of the rounds' medians.
+
+    `rounds`: frame times of all placements, for each round.
     """
     medians = [median(times) for times in rounds]
     relative = [[frame / middle for frame in times] for times, middle in zip(rounds, medians, strict=True)]

@@ -276,9 +276,9 @@ class BesideDriver:
 
     @staticmethod
     def _check(line: _Line, action: Action) -> None:
-        """Raise RuntimeError for an action before the finish that is no dispatch.
+        """Raise RuntimeError if a core that has not finished returns anything but a dispatch.
 
-        Only a unit that hangs causes such an action, and in virtual time every job ends.
+        It does so only for a unit that seems to hang. In virtual time every job ends, so `hang_ns` is too short then.
         """
         if not line.core.finished:
             raise RuntimeError(f"{action} of pipeline {line.number}: its hang_ns is shorter than a job takes")

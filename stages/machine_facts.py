@@ -51,7 +51,7 @@ def package_version(name: str) -> str | None:
 
 
 def versions_with(package: str) -> list[str]:
-    """Return the names and versions of all packages that times depend on. `package`: distribution of a runtime."""
+    """Return name and version of each package that measured times depend on, also of `package`, a runtime's."""
     return [f"{name} {package_version(name)}" for name in dict.fromkeys(("trilane", *PACKAGES, package))]
 
 

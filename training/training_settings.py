@@ -53,7 +53,7 @@ class BatchOptions(Table):
     `full_body_statistics`: whether only batches of whole bodies update the statistics of batch norms. Other batches use
     these statistics.
     `full_body_from`: share of the steps after which all samples show whole bodies.
-    `repeats`: how often an epoch has a sample, by band: far, full body, upper body, face, anywhere.
+    `repeats`: how many times each sample occurs in an epoch, by band: far, full body, upper body, face, anywhere.
     """
 
     sample_share: float = Field(default=1.0, gt=0, le=1)

@@ -326,7 +326,10 @@ def _material(source: Path | None, frames: Path | None, avatar: str | None) -> t
 
 
 def _write_layers(path: Path, model: Any, result: Any, frame: Any) -> Any:
-    """Measure the error of every layer on `frame`, write the rows to the file `path`, and return them."""
+    """Compare each layer of the quantised network with the float one on `frame`; write a row for each, return the rows.
+
+    `path`: JSON file to write. `model`: float network. `result`: its quantised network, as `quantise_on` returns it.
+    """
     from trilane.training.quantising.noise_model import layer_report
     from trilane.writing import write_bytes
 

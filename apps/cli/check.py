@@ -73,9 +73,9 @@ def check(file: FileArgument, svg: SvgOption = None, profile: ProfileOption = No
 
 
 def _checked(file: str, profile: str | None) -> tuple[dict[str, Any], str]:
-    """Return the document for `--json`, and a scene's pipeline as a file's text, "" for a pipeline file.
+    """Return the document for `--json`, and a scene's pipeline as the text of a pipeline file ("" for such a file).
 
-    `profile`: chip for the times of a scene. Raises BadInputError.
+    `profile`: chip for the times of a scene; not allowed with a pipeline file. Raises BadInputError, MissingPartError.
     """
     from trilane.apps.check.checked_file import check_file
     from trilane.apps.check.checked_scene import check_scene, is_scene

@@ -205,7 +205,7 @@ def _operator_table(answer: dict[str, Any]) -> Table:
 
 
 def show_answer(answer: dict[str, Any], as_json: bool) -> None:
-    """Print one prediction for the application. `answer`: document of `trilane predict --json`."""
+    """Print one prediction of the avatar's pipeline. `answer`: document of `trilane predict --json`."""
     if as_json:
         print_json(answer)
         return

@@ -135,9 +135,10 @@ def fit(
     networks: Annotated[Path | None, typer.Option(help="Folder of the networks; if none, the CSV's folder.")] = None,
     json: JsonOption = False,
 ) -> None:
-    """Fit a profile to measured rows; print residuals and the error for rows left out of the fit.
+    """Fit a profile to measured rows; print residuals and the error of each row by a fit without it.
 
-    Rows `network, ms` fit the numbers of a chip's profile; rows of the reference networks fit efficiencies.
+    A CSV with the columns `network, ms` fits the numbers of a chip's profile; one of the reference networks fits the
+    efficiencies of its units.
     """
     from trilane.hw_profiles.calibrate import calibrate, is_own_table, read_own_rows
     from trilane.hw_profiles.fit import as_toml, fit_profile

@@ -101,7 +101,10 @@ ABSENT: Final = {
 
 
 class Gate(NamedTuple):
-    """A limit of a metric. `limit`: a share, or dB. `text`: the limit in words, such as `slower=5%`."""
+    """How much worse than the base a run may be in one metric.
+
+    `name`: key of METRICS. `limit`: a share, or dB. `text`: the limit as its option writes it, such as `slower=5%`.
+    """
 
     name: str
     limit: float

@@ -275,10 +275,10 @@ def _late(found: LateFrames) -> str:
 
 
 def _held(facts: Facts) -> str:
-    """Return the rate and the frames in time, such as `96 fps (92 to 102), at 30 fps 0 of 299 frames late`.
+    """Return the rate and the late frames as a text, such as `96 fps (92 to 102), at 30 fps 0 of 299 frames late`.
 
-    If a fixed rate releases the frames, the text says what its first number is: the rate of shown frames. In a
-    prediction, this number is the rate with a source that always has a frame.
+    For a run that ended early, return the reason. If frames come at the target rate, the text calls its first number
+    the rate shown; in a prediction, it is the rate that a source which always has a frame would give.
     """
     if facts.failure:
         return f"the run ended early: {facts.failure}"

@@ -485,10 +485,9 @@ def turns_of_collars(tracks: Tracks, rest: Tracks, chest: F64, stands: NDArray[n
 
 
 def with_shoulders_on(across: F64, turns: dict[str, F64], rest: Tracks) -> dict[str, F64]:
-    """Return `turns` with chest and collars turned once more, by the least angle, so that the shoulders fit.
+    """Return `turns` with chest and collars turned by the least angle that lays the shoulder line along `across`.
 
-    `across` (T, 3): vector from the right to the left recorded shoulder, along which the avatar's shoulder line is
-    laid.
+    `across` (T, 3): vector from the right to the left recorded shoulder. `rest`: the avatar at rest.
     """
     ends = []
     for side in SIDES:

@@ -1,13 +1,14 @@
 """The user's own code as a stage: `python = "module:factory"` of a pipeline file; and the blocks `busy` and `discard`.
 
 `factory(settings)` is called once in the unit's process and returns a callable. The callable is called for each frame
-with an array for each input: a named port as a keyword argument, a single input without a name as the only argument. If
-there is no newest frame yet, the argument is None. The callable returns a dict of arrays by port, or the array of the
-only port. If it has a parameter `out`, it gets the arrays to fill, by port, and may return None.
+with an array for each input: a named port as a keyword argument, a single input without a name as the only argument.
+The argument of an input with `sync = "latest"` is None until its first frame is there. The callable returns a dict of
+arrays by port, or the array of the only port. If the callable has a parameter `out`, it gets the arrays to fill, by
+port, and may return None.
 
-If a bypass begins at the stage, the callable has an attribute `skips`, which is read after each frame: true sends the
-frame to the bypass. If it has a method `forget`, the method is called when the next frame must not rely on earlier
-frames (`SkippingStage.forget`).
+If a bypass begins at the stage, the callable may have an attribute `skips`, which is read after each frame: true sends
+the frame to the bypass. If the callable has a method `forget`, the method is called when the next frame must not rely
+on earlier frames (`SkippingStage.forget`).
 
 Rule: a returned array must have the type that the file states; nothing is cast or broadcast silently. An error says
 which stage, file and line it comes from.

@@ -70,12 +70,14 @@ def calls_of(
 ) -> Calls:
     """Return measured times of calls of the network in `path`, without the time in which they had no core.
 
+    Equal calls that were measured before come from a cache.
+
     `shapes`: shapes of inputs by name, in place of the file's shapes.
-    `runtime`: runtime of an integer network; other networks run in ONNX Runtime.
-    `counts`: numbers of threads to measure.
-    `cores`: numbers of cores; a call with n threads runs on the last n.
+    `runtime`: runtime of an avatar's integer network if `shapes` is empty; other networks run in ONNX Runtime.
+    `counts`: each count of threads to measure.
+    `cores`: ids of the cores to use; a call with n threads runs on the last n of them.
     `say`: function that is called before a measurement, which takes seconds.
-    `as_stage`: whether any network runs in `runtime`, like a stage of a pipeline file.
+    `as_stage`: whether the network is a stage of a pipeline file, which always runs in `runtime`.
 
     Raises BadInputError for a file that cannot be read, TrilaneError if the network cannot run.
     """
