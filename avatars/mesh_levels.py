@@ -14,8 +14,9 @@ distance is at most
     |d| + sum_b 2 sin(t_b / 2) |y_b or d - y_b|
 
 for any k. Between the places where the edges of the two meshes cross in the texture, both points are linear functions
-of the texel. The distance is thus largest where edges cross, or at a vertex that the level leaves out.
-`training/mesh_levels.py` evaluates the terms at these places, one row for each place. Pose blend shapes move a vertex
+of the texel. The distance is thus largest where edges cross, or at a vertex that lies in a triangle of the level
+without being its corner: left out, or in a fold of the level. `training/mesh_levels.py` evaluates the terms at these
+places, one row for each place. Pose blend shapes move a vertex
 by at most r_v = sum_b r_vb |R_b - I|, which adds sum |e_v| r_v. Rows are joined in groups: a group has the largest
 value of each term.
 

@@ -128,20 +128,21 @@ class Corners:
 
     def pairs(self, level: I64) -> Pairs:
         """Return the pairs at which the distance between the whole mesh and `level` (G,3) may be largest."""
+        # Kept corners too: where a level is folded over itself in UV, they may lie in triangles that lack them.
+        inside, is_inside = self._in_triangles(np.unique(self.triangles), level)
         left_out = np.setdiff1d(self.triangles, level)
-        inside, is_inside = self._in_triangles(left_out, level)
         edges, uses = _edges(level)
-        beside = np.union1d(left_out[~is_inside], np.intersect1d(self.border, left_out))
+        beside = np.union1d(np.setdiff1d(left_out, is_inside), np.intersect1d(self.border, left_out))
         seams, apart = self._at_seams(beside, edges[uses == 1])
         corners, shares = zip(inside, self._crossings(edges), seams, strict=True)
         return Pairs(np.concatenate(corners), np.concatenate(shares), float(apart.max(initial=0.0)))
 
-    def _in_triangles(self, left_out: I64, level: I64) -> tuple[tuple[I64, F64], Mask]:
-        """Return pairs of the corners `left_out` (M,) with the triangles of `level` that have the same texel.
+    def _in_triangles(self, corners: I64, level: I64) -> tuple[tuple[I64, F64], I64]:
+        """Return pairs of `corners` (M,) with the triangles of `level` that have the same texel, but lack the corner.
 
-        The second result (M,) says which of the corners have such a triangle. Pairs are (corners, shares) of `Pairs`.
+        The second result (K,) has the corners with such a triangle. Pairs are (corners, shares) of `Pairs`.
         """
-        point, (a, b, c) = self.uv[left_out], (self.uv[level[:, k]] for k in range(3))
+        point, (a, b, c) = self.uv[corners], (self.uv[level[:, k]] for k in range(3))
         box = np.stack([a, b, c])
         row, number = _neighbours((point, point), (box.min(axis=0), box.max(axis=0)))
         p, a, b, c = point[row], a[number], b[number], c[number]
@@ -150,13 +151,11 @@ class Corners:
             shares = (
                 np.stack([_cross(b - p, c - p), _cross(c - p, a - p), _cross(a - p, b - p)], axis=1) / area[:, None]
             )
-        holds = (shares >= -ON_EDGE).all(axis=1)
+        holds = (shares >= -ON_EDGE).all(axis=1) & (level[number] != corners[row][:, None]).all(axis=1)
         row, number, shares = row[holds], number[holds], shares[holds]
-        own = left_out[row][:, None]
+        own = corners[row][:, None]
         ones = np.ones((len(row), 1))
-        found = np.zeros(len(left_out), bool)
-        found[row] = True
-        return (np.hstack([own, own, level[number]]), np.hstack([-ones, 0 * ones, shares])), found
+        return (np.hstack([own, own, level[number]]), np.hstack([-ones, 0 * ones, shares])), np.unique(own)
 
     def _crossings(self, edges: I64) -> tuple[I64, F64]:
         """Return the pairs (corners, shares) where edges of the whole mesh and `edges` (E,2) of a level cross in UV."""

@@ -170,6 +170,13 @@ def test_a_vertex_that_is_left_out_moves_by_its_height() -> None:
     assert level.uv_error == 0.0
 
 
+def test_a_vertex_that_is_kept_moves_where_a_folded_level_shows_its_texel_twice() -> None:
+    """The raised middle is a corner of the level, but its texel also lies on the flat triangles, 0.1 below."""
+    shaped = body_of(CORNERS, FAN, CORNERS[:, :2])
+    level = level_of(shaped, np.vstack([FAN, FLAT]))
+    assert level.metres(at_rest(shaped)) == pytest.approx(0.1 + ROUNDING_M, abs=1e-7)
+
+
 def test_a_texture_that_slides_counts_as_much_as_a_surface_that_moves() -> None:
     """The middle lies in the plane but its texel does not lie in the middle: (0.75, 0.5) is 0.25 from (0.5, 0.5)."""
     flat = np.where([False, False, True], 0.0, CORNERS)
