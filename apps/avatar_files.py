@@ -53,7 +53,7 @@ from trilane.training.clothing import KEY as LOOK
 if TYPE_CHECKING:
     from trilane.training.quantising.quantise import Quantised
 
-#: Encoder and norm in the manifest if the operators of a new network differ from those of the replaced network.
+#: Encoder and norm in the manifest if the operators of a new network differ from the operators of the replaced network.
 OTHER = "other"
 #: Scale of a network's output. The picture is the output bytes as they are: alpha and colour in 0..1, zero point 0.
 PICTURE_SCALE = 1 / 255

@@ -328,7 +328,7 @@ def _unusual(scene: Mapping[str, Any]) -> Iterator[str]:
 def _error(document: Mapping[str, Any]) -> tuple[float | None, str, str]:
     """Return `psnr_db`, `error_source` and `error_of` of an entry.
 
-    The PSNR is the run's own if the run was checked, otherwise that of its worst avatar.
+    The PSNR is the run's own if the run was checked, otherwise the PSNR of its worst avatar.
     """
     check = _mapping(document, "check")
     if (own := _number(check.get("psnr_db"))) is not None:

@@ -387,7 +387,7 @@ class Tiles(Generic[Item]):
 
 
 class Lanes:
-    """Distributes overlapping slices over lanes, numbered from 0, so that those of a lane do not overlap.
+    """Distributes overlapping slices over lanes, numbered from 0, so that no slices in a lane overlap.
 
     `most`: largest number of lanes. If more slices overlap, the begin of the last one is cut.
     """
