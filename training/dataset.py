@@ -30,10 +30,11 @@ from trilane.training.sample_renderer import BAND_NAMES, PoseSource, Sample, Sam
 from trilane.training.training_settings import TrainingSettings
 
 One = TypeVar("One")
-#: Share of each band among the training samples.
-TRAINING_SHARE = {"far": 0.16, "full_body": 0.34, "upper_body": 0.22, "face": 0.16, "anywhere": 0.12}
-#: Share of each tensor size among the training samples: the default size, and half its side for avatars far away.
-SIZES = {"256": 0.85, "128": 0.15}
+#: Share of each band among the training samples. Far samples are the most, because their tensors have many sizes.
+TRAINING_SHARE = {"far": 0.30, "full_body": 0.30, "upper_body": 0.17, "face": 0.13, "anywhere": 0.10}
+#: Least and greatest density of a training sample's tensor: tensor pixels for one pixel of the picture, along a side.
+#: The least is that of the planner's smallest size (`planner.SIDES`), the greatest is `planner.MOST_DENSITY`.
+DENSITY = (0.5, 2.25)
 #: Tensor size of validation samples.
 VALIDATION_SIZE = "256"
 #: Number of samples in a part; a rendering process gets one part at a time.
@@ -70,8 +71,8 @@ class Planned(Protocol):
 class SampleSource(Protocol[One]):
     """A renderer that plans and renders samples. Each rendering process opens its own."""
 
-    def training_sample(self, seed: Sequence[int], band: str, size: str) -> One:
-        """Return the planned sample of `seed`, in the band named `band`, with a tensor of size `size`."""
+    def training_sample(self, seed: Sequence[int], band: str, density: float) -> One:
+        """Return the planned sample of `seed`, in the band named `band`, with about this `density` of its tensor."""
 
     def render(self, sample: One) -> tuple[F32, U8]:
         """Return the UV image (h,w,3) float32 (u, v, coverage) and the ground truth (h,w,4) uint8 of `sample`."""
@@ -88,19 +89,21 @@ def clothed_source(body: Path, name: str, offsets: F32 | None) -> SampleRenderer
 
 
 def plan_training(source: SampleSource[One], count: int, seed: int, track: Callable[[Any], Any] = iter) -> list[One]:
-    """Return `count` planned samples in random bands and tensor sizes.
+    """Return `count` planned samples in random bands, with tensors of random densities.
 
     `source`: renderer that plans each sample.
     `seed`: seed of all random numbers.
-    `track`: wraps the list of bands and sizes to show progress.
+    `track`: wraps the list of bands and densities to show progress.
     """
     rng = np.random.default_rng((seed, 0))
-    bands = rng.choice(list(TRAINING_SHARE), count, p=list(TRAINING_SHARE.values()))
-    sizes = rng.choice(list(SIZES), count, p=list(SIZES.values()))
-    return [
-        source.training_sample((seed, 1, number), str(band), str(size))
-        for number, (band, size) in enumerate(track(list(zip(bands, sizes, strict=True))))
-    ]
+    views = [random_kind(rng) for _ in range(count)]
+    return [source.training_sample((seed, 1, number), *view) for number, view in enumerate(track(views))]
+
+
+def random_kind(rng: np.random.Generator) -> tuple[str, float]:
+    """Return the band and the density of a random training sample."""
+    band = str(rng.choice(list(TRAINING_SHARE), p=list(TRAINING_SHARE.values())))
+    return band, float(np.exp(rng.uniform(*np.log(DENSITY))))
 
 
 def plan_validation(
@@ -185,7 +188,7 @@ FIELDS: dict[str, tuple[tuple[int, ...], type]] = {
 class ShapeGroup:
     """N rendered samples of one tensor shape, in arrays (N, H, W, ...) as in `FIELDS`.
 
-    `band`: index (N,) of each sample's band.
+    `band`: index (N,) of each sample's band. `person`: number of the person whom all samples show.
     """
 
     shape: Shape
@@ -193,6 +196,7 @@ class ShapeGroup:
     covered: NDArray[np.uint8]
     rgba: NDArray[np.uint8]
     band: NDArray[np.int8]
+    person: int = 0
 
     def __len__(self) -> int:
         return len(self.band)
@@ -213,13 +217,13 @@ def create_group(folder: Path, shape: Shape, bands: NDArray[np.int8]) -> ShapeGr
     return ShapeGroup(shape, band=bands, **arrays)
 
 
-def open_groups(folder: Path, writable: bool = False) -> list[ShapeGroup]:
-    """Return all groups of the data set in `folder`, sorted by tensor shape."""
+def open_groups(folder: Path, person: int = 0, writable: bool = False) -> list[ShapeGroup]:
+    """Return all groups of the data set in `folder`, which shows the person of number `person`, by tensor shape."""
     mode: Any = "r+" if writable else "r"
     groups = []
     for place in sorted(folder.iterdir(), key=lambda path: parse_shape(path.name)):
         arrays: dict[str, Any] = {name: np.load(place / f"{name}.npy", mmap_mode=mode) for name in FIELDS}
-        groups.append(ShapeGroup(parse_shape(place.name), band=np.load(place / "band.npy"), **arrays))
+        groups.append(ShapeGroup(parse_shape(place.name), band=np.load(place / "band.npy"), person=person, **arrays))
     return groups
 
 

@@ -18,15 +18,14 @@ import torch
 from numpy.typing import NDArray
 
 from trilane.arrays import F32, F64, Mask
-from trilane.avatars.bundle import Bundle, pack_levels, write_bundle
+from trilane.avatars.bundle import Bundle, load_bundle, pack_levels, write_bundle
 from trilane.avatars.manifest import Manifest, network_entry
 from trilane.avatars.network_file import reshaped
 from trilane.body.body import ShapedBody
-from trilane.training.dataset import SIZES, TRAINING_SHARE, U16, VALIDATION_SIZE, ShapeGroup, motion_poses
+from trilane.training.dataset import U16, VALIDATION_SIZE, ShapeGroup, motion_poses, random_kind
 from trilane.training.first_texture import fill_along_surface, grown, used_texels
 from trilane.training.network import export_onnx
 from trilane.training.quantising.quantise import ByteRanges, Quantised, byte_ranges, quantise
-from trilane.training.random_views import random_pose
 from trilane.training.sample_renderer import BAND_NAMES, Sample, SampleRenderer
 from trilane.training.subject import Person
 from trilane.training.surface import BodyArrays, body_arrays
@@ -63,7 +62,7 @@ class QuantisedAvatar:
 
 
 def byte_texture(
-    avatar: TrainableAvatar, shaped: ShapedBody, unseen: Mask | None = None
+    avatar: TrainableAvatar, shaped: ShapedBody, unseen: Mask | None = None, person: int = 0
 ) -> tuple[NDArray[np.int8], NDArray[np.float32], NDArray[np.int8] | None]:
     """Return the texture (S,S,C) int8, the scale (C,) of each channel, and the packed smaller levels or None.
 
@@ -71,9 +70,11 @@ def byte_texture(
 
     `unseen`: image of any side that marks texels of the body that were never trained. They are filled from trained
     texels.
+    `person`: number of the person in `avatar`.
     """
     body = body_arrays(shaped)
-    images = [_finished(level.detach()[0].permute(1, 2, 0).numpy(), unseen, body) for level in avatar.texture.levels()]
+    levels = avatar.levels(person)
+    images = [_finished(level.detach()[0].permute(1, 2, 0).numpy(), unseen, body) for level in levels]
     largest = np.max([np.abs(image).max(axis=(0, 1)) for image in images], axis=0)
     scale = np.maximum(largest, 1e-6) / INT8_MAX
     texture, *smaller = (np.round(image / scale).astype(np.int8) for image in images)
@@ -109,6 +110,12 @@ def integer_network(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int
     return replace(quantised, network=reshaped(quantised.network, *STORED_SHAPE))
 
 
+def kept_network(avatar: str) -> Quantised:
+    """Return the quantised network of the bundle `avatar`, a name or a folder, unchanged. Raises BadInputError."""
+    bundle = load_bundle(avatar)
+    return Quantised(bundle.read_network(), bundle.manifest.quantisation, {})
+
+
 def ranges_of(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> ByteRanges:
     """Return the byte ranges that `integer_network` would give the network's tensors, from the same arguments."""
     return byte_ranges(*_calibration(avatar, groups, seed, CALIBRATION_FRAMES), METHOD)
@@ -131,24 +138,23 @@ def write_float_network(folder: Path, avatar: TrainableAvatar, groups: list[Shap
 def _calibration(
     avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int, count: int
 ) -> tuple[onnx.ModelProto, list[NDArray[np.float32]]]:
-    """Return the float network of `avatar`, and at most `count` inputs (H, W, C) of the network's shape."""
-    group = max(groups, key=lambda group: (group.shape == CALIBRATION_SHAPE, len(group)))
-    chosen = np.random.default_rng(seed).permutation(len(group))[:count]
-    return export_onnx(avatar.network, *group.shape), _inputs(avatar, group, np.sort(chosen))
+    """Return the float network of `avatar`, and at most `count` inputs (H, W, C) of its shape, of all persons."""
+    shape = max(groups, key=lambda group: (group.shape == CALIBRATION_SHAPE, len(group))).shape
+    places = [(group, number) for group in groups if group.shape == shape for number in range(len(group))]
+    chosen = np.sort(np.random.default_rng(seed).permutation(len(places))[:count])
+    return export_onnx(avatar.network, *shape), [_input(avatar, *places[index]) for index in chosen]
 
 
 def quantise_avatar(
-    avatar: TrainableAvatar, shaped: ShapedBody, groups: list[ShapeGroup], seed: int, unseen: Mask | None = None
+    avatar: TrainableAvatar, network: Quantised, shaped: ShapedBody, unseen: Mask | None = None, person: int = 0
 ) -> QuantisedAvatar:
-    """Return the quantised network and texture of `avatar`.
+    """Return `network` with the quantised texture of `person`, a number, in `avatar`.
 
+    `network`: quantised network that paints all persons of `avatar`.
     `shaped`: body whose texels are stored.
-    `groups`: training samples, from which calibration frames are chosen.
-    `seed`: seed of that choice.
     `unseen`: texels of the body that were never trained, see `byte_texture`.
     """
-    texture, scale, levels = byte_texture(avatar, shaped, unseen)
-    network = integer_network(avatar, groups, seed)
+    texture, scale, levels = byte_texture(avatar, shaped, unseen, person)
     return QuantisedAvatar(network, texture, scale, avatar.network.norm, levels)
 
 
@@ -182,15 +188,13 @@ def write_avatar(
     write_bundle(folder, manifest, person.body, quantised.texture, network, scale, person.offsets, quantised.levels)
 
 
-def _inputs(avatar: TrainableAvatar, group: ShapeGroup, index: NDArray[np.int64]) -> list[NDArray[np.float32]]:
-    """Return the network's inputs (H, W, C) for the samples `index` (N,) of `group`."""
-    levels = [level.detach() for level in avatar.texture.levels()]
-    frames = []
-    for number in index:
-        uv = torch.from_numpy(group.uv[number].astype(np.float32) / U16)[None]
-        covered = torch.from_numpy(group.covered[number] > 0)[None]
-        frames.append(read_levels(levels, uv, covered)[0].permute(1, 2, 0).numpy())
-    return frames
+def _input(avatar: TrainableAvatar, group: ShapeGroup, number: int) -> NDArray[np.float32]:
+    """Return the network's input (H, W, C) for the sample `number` of `group`."""
+    uv = torch.from_numpy(group.uv[number].astype(np.float32) / U16)[None]
+    covered = torch.from_numpy(group.covered[number] > 0)[None]
+    levels = [level.detach() for level in avatar.levels(group.person)]
+    pixels: NDArray[np.float32] = read_levels(levels, uv, covered)[0].permute(1, 2, 0).numpy()
+    return pixels
 
 
 # Rounds an avatar to the bytes of its bundle during training, and keeps the rounded weights at the end.
@@ -239,12 +243,9 @@ def float_model(bundle: Bundle, weights: Path) -> onnx.ModelProto:
 def training_views(renderer: SampleRenderer, bundle: Bundle, views: int) -> list[F32]:
     """Return `views` inputs (H,W,C) of the network of `bundle`, in random poses, with bands as often as in training."""
     rng = np.random.default_rng((SEED, 0))
-    bands, sizes = list(TRAINING_SHARE), list(SIZES)
 
     def sample(number: int) -> Sample:
-        band = str(rng.choice(bands, p=list(TRAINING_SHARE.values())))
-        size = str(rng.choice(sizes, p=list(SIZES.values())))
-        return renderer.plan((SEED, 1, number), random_pose, band, size)
+        return renderer.training_sample((SEED, 1, number), *random_kind(rng))
 
     return list(_tensors(renderer, bundle, sample, views))
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import F64, Shape
+from trilane.arrays import F64, Shape, shape_buckets, shapes_within
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINT_INDEX, JOINTS, Posed
@@ -129,6 +129,8 @@ def _pitch(rng: np.random.Generator) -> float:
 
 #: Height in pixels of the picture that samples are cropped from.
 OUTPUT_ROWS = 480
+#: Sides of the training tensors: a tensor has at most the pixels of a square of one of these sides.
+TENSOR_SIDES = (64, 96, 128, 192, 256)
 
 
 @dataclass(frozen=True)
@@ -150,6 +152,21 @@ class Cropper:
     def __init__(self, shaped: ShapedBody, pose_blend: bool = False) -> None:
         """Prepare crops of `shaped`. `pose_blend`: whether the pose blend shapes of the body, if any, are drawn."""
         self._bounds = MeshBounds(shaped, standoff_m=CLOTHES_STANDOFF_M, pose_blend=pose_blend)
+
+    def crop_of(self, posed: Posed, view: View, size: str | float) -> Crop | None:
+        """Return the crop of a tensor of `size`: its size as `shape_buckets` takes it, or its density.
+
+        A density is the number of tensor pixels for one pixel of the picture, along a side. The tensor then has the
+        side of `TENSOR_SIDES` that comes nearest to it. `crop` has the other parameters.
+        """
+        if isinstance(size, str):
+            return self.crop(posed, view, shape_buckets(size))
+        asked = self.crop(posed, view, shapes_within(TENSOR_SIDES[-1] ** 2))
+        if asked is None:
+            return None
+        side = size * np.sqrt(asked.pixels)
+        nearest = min(TENSOR_SIDES, key=lambda each: abs(np.log(each / side)))
+        return self.crop(posed, view, shapes_within(nearest**2))
 
     def crop(self, posed: Posed, view: View, buckets: Sequence[Shape]) -> Crop | None:
         """Return the crop of the body in the pose `posed`, as seen from `view`; None if the body is not seen.

@@ -15,7 +15,7 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import F32, F64, U8, Floats, shape_buckets
+from trilane.arrays import F32, F64, U8, Floats
 from trilane.body.body import ShapedBody
 from trilane.body.joints import Skeleton
 from trilane.body.skinning import largest_weights
@@ -74,7 +74,7 @@ class SampleRenderer:
         self.surface = ClothedSurface(layers)
         self.clothed_body = ClothedBody(self.ctx, layers, landmarks, samples, look)
 
-    def plan(self, seed: Sequence[int], source: PoseSource, band: str, size: str) -> Sample:
+    def plan(self, seed: Sequence[int], source: PoseSource, band: str, size: str | float) -> Sample:
         """Return the planned sample of `seed`: a pose, and the first random view that is usable.
 
         A view is usable if enough of the body is on the screen and the near plane cuts nothing.
@@ -82,7 +82,7 @@ class SampleRenderer:
         `seed`: numbers that seed the random generator.
         `source`: function that returns a pose from the random generator.
         `band`: a name of BANDS, or `anywhere`.
-        `size`: tensor size, as `shape_buckets` takes it.
+        `size`: tensor size, as `shape_buckets` takes it, or density, as `Cropper.crop_of` takes it.
         """
         rng = np.random.default_rng(seed)
         pose = source(rng)
@@ -92,13 +92,13 @@ class SampleRenderer:
             view = random_view(rng, band, posed.joints)
             if not self.surface.is_clear_of(view, points):
                 continue
-            crop = self.cropper.crop(posed, view, shape_buckets(size))
+            crop = self.cropper.crop_of(posed, view, size)
             if crop is not None and crop.pixels >= LEAST_PIXELS:
                 return Sample(pose, view, crop, BAND_NAMES.index(band) if band in BANDS else ANYWHERE_BAND)
 
-    def training_sample(self, seed: Sequence[int], band: str, size: str) -> Sample:
+    def training_sample(self, seed: Sequence[int], band: str, density: float) -> Sample:
         """Return the planned sample of `seed` in a random pose, see `plan`."""
-        return self.plan(seed, random_pose, band, size)
+        return self.plan(seed, random_pose, band, density)
 
     def placed(self, sample: Sample) -> tuple[F64, Placement]:
         """Return the view matrix (4,4) of `sample`, and the placement of its body for the GPU unit's packed pass.

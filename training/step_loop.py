@@ -78,7 +78,8 @@ def steps(
             group["lr"] = peak * rate_share(share)  # kernels, the network's other weights, texture
         if state.avatar.grid is not None and share > settings.bytes_from:
             round_to_bytes(state.avatar, state.avatar.grid, groups, settings.seed)
-        terms = _step(state, stream, settings, frozen=share > settings.freeze_norms_at)
+        frozen = settings.keep_network or share > settings.freeze_norms_at
+        terms = _step(state, stream, settings, frozen)
         state.step += 1
         follow(state.average, state.avatar, 1 - 1 / max(1.0, settings.average_share * state.step))
         yield terms
@@ -93,8 +94,11 @@ def _step(state: TrainingState, stream: Iterator[Batch], settings: TrainingSetti
     state.optimiser.zero_grad(set_to_none=True)
     sums: dict[str, float] = {}
     for batch in islice(stream, options.batches_per_step):
-        set_mode(avatar, frozen or (settings.batches.full_body_statistics and not is_whole(batch)))
-        terms = add_gradients(avatar, load_batch(*batch, state.device), state.objective, 1 / options.batches_per_step)
+        set_mode(
+            avatar, frozen or settings.keep_network or (settings.batches.full_body_statistics and not is_whole(batch))
+        )
+        group, share = batch[0], 1 / options.batches_per_step
+        terms = add_gradients(avatar, load_batch(*batch, state.device), state.objective, share, group.person)
         sums = {name: sums.get(name, 0.0) + value / options.batches_per_step for name, value in terms.items()}
     clip_gradients(avatar, options)
     state.optimiser.step()
@@ -102,15 +106,20 @@ def _step(state: TrainingState, stream: Iterator[Batch], settings: TrainingSetti
 
 
 def add_gradients(
-    avatar: TrainableAvatar, batch: tuple[Tensor, Tensor, Tensor], objective: Objective, share: float = 1.0
+    avatar: TrainableAvatar,
+    batch: tuple[Tensor, Tensor, Tensor],
+    objective: Objective,
+    share: float = 1.0,
+    person: int = 0,
 ) -> dict[str, float]:
     """Add `share` times the gradient of `batch` to the gradients of `avatar`, and return the loss terms by name.
 
     `batch`: UV image, coverage and target, as `load_batch` returns them.
     `objective`: loss to minimise. Its discriminators learn from `batch` too.
+    `person`: number of the person whom `batch` shows.
     """
     uv, covered, target = batch
-    output = avatar(uv, covered)
+    output = avatar(uv, covered, person)
     terms = objective.terms(output, target)
     (share * objective.total(terms)).backward()
     return {name: float(term.detach()) for name, term in terms.items()} | objective.learn(output.detach(), target)
@@ -273,12 +282,12 @@ CLASSES: dict[tuple[str, bool], type[torch.optim.Optimizer]] = {
 def optimiser_of(avatar: TrainableAvatar, settings: TrainingSettings) -> torch.optim.Optimizer:
     """Return an optimiser with three groups: kernels, the network's other weights, and the texture.
 
-    The network's other weights have no weight decay.
+    The network's other weights have no weight decay. A network that is kept has no parameters in the groups.
     """
     options = settings.optimiser
-    kernels = [p for p in avatar.network.parameters() if p.ndim > 1]
-    others = [p for p in avatar.network.parameters() if p.ndim <= 1]
-    texture = list(avatar.texture.parameters())
+    kernels = [p for p in avatar.network.parameters() if p.ndim > 1 and p.requires_grad]
+    others = [p for p in avatar.network.parameters() if p.ndim <= 1 and p.requires_grad]
+    texture = list(avatar.textures.parameters())
     rows = (
         (kernels, settings.network_rate, settings.weight_decay, options.momentum),
         (others, settings.network_rate, 0.0, options.momentum),
@@ -406,5 +415,5 @@ def probe_loss(state: TrainingState, groups: list[ShapeGroup]) -> float:
         torch.manual_seed(0)
         for group in groups:
             uv, covered, target = load_batch(group, np.zeros(1, np.int64), state.device)
-            losses.append(float(judge.total(judge.terms(state.average(uv, covered), target))))
+            losses.append(float(judge.total(judge.terms(state.average(uv, covered, group.person), target))))
     return float(np.mean(losses))

@@ -1,4 +1,4 @@
-"""Trains an avatar of a capture or of the clothed default body: renders samples, trains, quantises and measures.
+"""Trains avatars of a capture or of clothed default bodies: renders samples, trains, quantises and measures.
 
 Rule: finished work is kept in the work folder and not repeated. Each part of the work reports its expected duration
 before it starts.
@@ -10,8 +10,8 @@ import json
 import math
 import shlex
 import time
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -19,11 +19,13 @@ import numpy as np
 import torch
 from PIL import Image
 
-from trilane.avatars.bundle import OFFSETS, Bundle, bundle_folder, load_bundle, write_manifest
+from trilane.arrays import F32
+from trilane.avatars.bundle import BUILT_IN, OFFSETS, Bundle, bundle_folder, load_bundle, write_manifest
 from trilane.avatars.manifest import sha256_of
 from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.training.capture.capture_samples import CaptureRenderer
+from trilane.training.clothing import KEY
 from trilane.training.dataset import (
     FIELDS,
     VALIDATION_SIZE,
@@ -35,7 +37,14 @@ from trilane.training.dataset import (
 )
 from trilane.training.first_texture import first_texture
 from trilane.training.image_error import MEANS, ImageError, image_error
-from trilane.training.make_bundle import keep_rounded_weights, quantise_avatar, write_avatar, write_float_network
+from trilane.training.make_bundle import (
+    integer_network,
+    keep_rounded_weights,
+    kept_network,
+    quantise_avatar,
+    write_avatar,
+    write_float_network,
+)
 from trilane.training.network import UNet
 from trilane.training.objective import Vgg16, read_vgg16
 from trilane.training.step_loop import (
@@ -83,8 +92,8 @@ class TrainingPlaces:
     """Folders and files of one training.
 
     `capture`: folder of the capture; None if the settings have a look. `out`: folder of the bundle. `work`: folder of
-    samples, state and sheets. `name`: name of the avatar. `vgg`: file of VGG-16's weights for the perceptual loss, or
-    None.
+    samples, state and sheets. `name`: name of the avatar. With several looks, `out` and `work` have a folder for each.
+    `vgg`: file of VGG-16's weights for the perceptual loss, or None.
     """
 
     capture: Path | None
@@ -92,6 +101,17 @@ class TrainingPlaces:
     work: Path
     name: str
     vgg: Path | None = None
+
+
+@dataclass(frozen=True)
+class Trained:
+    """One of the persons of a training.
+
+    `subject`: person. `places`: folders of the person alone, and the name of the person's avatar.
+    """
+
+    subject: Subject
+    places: TrainingPlaces
 
 
 class Listener(Protocol):
@@ -108,7 +128,7 @@ class Listener(Protocol):
 
 
 def train_avatar(places: TrainingPlaces, asked: TrainingSettings, listener: Listener) -> dict[str, Any]:
-    """Train as `asked`, write the bundle, and return facts about the training and the error on held-out frames.
+    """Train as `asked`, write the bundles, and return facts about the training and the error on held-out frames.
 
     An interrupted training continues from its last state.
     Raises BadInputError; FaultyCaptureError with all faults of the capture; MissingPartError without OpenGL.
@@ -120,53 +140,74 @@ def train_avatar(places: TrainingPlaces, asked: TrainingSettings, listener: List
     listener.say(f"trains on {device_words(chosen_device(settings.device), settings.threads)}")
     if settings.loss.perceptual:
         listener.say(f"perceptual loss: {'MS-SSIM' if vgg is None else f'features of VGG-16 in {places.vgg}'}")
-    subject = _subject(places, settings, listener)
-    places.work.mkdir(parents=True, exist_ok=True)
-    subject = _raised(subject, places, settings, listener)
-    _draw_samples(subject, places, settings, listener)
-    groups = open_groups(places.work / SAMPLES)
+    people = [_prepared(subject, own, settings, listener) for subject, own in _subjects(places, settings, listener)]
+    groups = _groups(people)
     torch.manual_seed(settings.seed)
-    avatar = _first_avatar(subject, places, settings)
-    settings = _with_steps(avatar, places, settings, vgg, listener)
+    avatar = _first_avatar(people, places, settings)
+    settings = _with_steps(avatar, groups, settings, vgg, listener)
     write_bytes(places.work / NAME, settings_text(settings).encode())
     state = first_state(avatar, settings, vgg)
     losses = {"before": _loss_before(state, places, groups)}
-    _train(state, subject, places, settings, listener)
+    _train(state, people, groups, places, settings, listener)
     losses["after"] = probe_loss(state, groups)
     state.average.cpu()
-    if settings.bytes_from < 1:
+    if settings.bytes_from < 1 and not settings.keep_network:
         keep_rounded_weights(state.average, groups, settings.seed)
     save_network(state.average, places.work / NETWORK)
     files = write_float_network(places.work, state.average, groups, settings.seed)
-    quantised = quantise_avatar(state.average, subject.shaped, groups, settings.seed, subject.unseen)
+    network = kept_network(settings.start) if settings.keep_network else None
+    network = network or integer_network(state.average, groups, settings.seed)
     made = {"samples": settings.samples, "steps": state.step, "batch": settings.batch, "seed": settings.seed}
-    provenance = made | {"texture_sides": list(SIDES)} | subject.facts
+    made |= {"network_of": settings.start} if settings.keep_network else {}
     capture = [] if places.capture is None else [places.capture.name]
     command = shlex.join(["trilane", "avatar", "train", *capture, "--config", NAME])
-    names = {"name": places.name, "training_command": command}
-    write_avatar(places.out, subject.person, quantised, settings.width, provenance, names)
-    write_bytes(places.out / NAME, settings_text(settings).encode())
     facts = {"avatar": str(places.out), "steps": state.step, "loss": losses}
-    facts |= {"held_out_error": _measure(places, subject, settings)} if subject.held_out else {}
-    if subject.truth is not None:
-        measure = ["trilane", "avatar", "validate", str(places.out), "--float-network", str(places.work / NETWORK)]
-        listener.say(f"measure it on views that it was not trained on: {shlex.join(measure)}")
-    sheets = str(places.work / SHEETS) if subject.held_out else None
+    for number, person in enumerate(people):
+        subject, own = person.subject, person.places
+        quantised = quantise_avatar(state.average, network, subject.shaped, subject.unseen, number)
+        provenance = made | {"texture_sides": list(SIDES)} | subject.facts
+        names = {"name": own.name, "training_command": command}
+        write_avatar(own.out, subject.person, quantised, settings.width, provenance, names)
+        write_bytes(own.out / NAME, settings_text(settings).encode())
+        facts |= {"held_out_error": _measure(own, subject, settings)} if subject.held_out else {}
+        if subject.truth is not None:
+            measure = ["trilane", "avatar", "validate", str(own.out), "--float-network", str(places.work / NETWORK)]
+            listener.say(f"measure it on views that it was not trained on: {shlex.join(measure)}")
+    sheets = str(places.work / SHEETS) if any(person.subject.held_out for person in people) else None
     return facts | files | {"sheets": sheets, "seconds": round(time.monotonic() - started, 1)}
 
 
-def _subject(places: TrainingPlaces, settings: TrainingSettings, listener: Listener) -> Subject:
-    """Return the person of the capture, or the default body in the look of the settings, as a subject.
+def _subjects(
+    places: TrainingPlaces, settings: TrainingSettings, listener: Listener
+) -> Iterator[tuple[Subject, TrainingPlaces]]:
+    """Yield the person of the capture, or the default body in each look of the settings, with the person's folders.
 
     Raises BadInputError if there are both a capture and a look, or neither.
     """
-    if places.capture is None:
-        if settings.look is None:
-            raise BadInputError("CAPTURE", "none", "the folder of a capture", "or settings (--config) with a `look`")
-        return clothed_subject(bundle_folder("default") / "body.npz", settings.threads, settings.look)
-    if settings.look is not None:
-        raise BadInputError("look", repr(settings.look), "none beside a capture, which has a person of its own")
-    return captured_subject(places.capture, settings.threads, listener.say)
+    if places.capture is not None:
+        if settings.looks:
+            raise BadInputError("look", repr(settings.look), "none beside a capture, which has a person of its own")
+        yield captured_subject(places.capture, settings.threads, listener.say), places
+        return
+    if not settings.looks:
+        raise BadInputError("CAPTURE", "none", "the folder of a capture", "or settings (--config) with a `look`")
+    body = bundle_folder("default") / "body.npz"
+    for look in settings.looks:
+        alone = len(settings.looks) == 1
+        own = places if alone else replace(places, out=places.out / look, work=places.work / look, name=look)
+        yield clothed_subject(body, settings.threads, look), own
+
+
+def _prepared(subject: Subject, places: TrainingPlaces, settings: TrainingSettings, listener: Listener) -> Trained:
+    """Return `subject` with its offsets, after its samples are drawn."""
+    places.work.mkdir(parents=True, exist_ok=True)
+    subject = _raised(subject, places, settings, listener)
+    _draw_samples(subject, places, settings, listener)
+    return Trained(subject, places)
+
+
+def _groups(people: Sequence[Trained]) -> list[ShapeGroup]:
+    return [group for number, one in enumerate(people) for group in open_groups(one.places.work / SAMPLES, number)]
 
 
 def with_vgg(asked: TrainingSettings, file: Path | None) -> TrainingSettings:
@@ -221,7 +262,7 @@ def _draw_samples(subject: Subject, places: TrainingPlaces, settings: TrainingSe
     """
     facts = places.work / SAMPLE_FACTS
     decides = ("samples", "seed", "stand_off")
-    who = {"look": settings.look} if places.capture is None else {"capture": str(places.capture.resolve())}
+    who = {"look": subject.facts[KEY]} if places.capture is None else {"capture": str(places.capture.resolve())}
     wanted = who | {key: getattr(settings, key) for key in decides}
     if facts.exists():
         present = json.loads(facts.read_text(encoding="utf-8"))
@@ -255,32 +296,43 @@ def _sample_cost(subject: Subject, samples: list[Planned], settings: TrainingSet
     )
 
 
-def _first_avatar(subject: Subject, places: TrainingPlaces, settings: TrainingSettings) -> TrainableAvatar:
+def _first_avatar(people: Sequence[Trained], places: TrainingPlaces, settings: TrainingSettings) -> TrainableAvatar:
     """Return the avatar that training starts from. If a state is on the disk, only the avatar's shapes matter."""
-    groups = open_groups(places.work / SAMPLES)
+    groups = _groups(people)
     network = UNet(norm=settings.norm, width=settings.width, channels=CHANNELS, input_skip=True)
-    if (places.work / STATE).exists():
-        texture = np.zeros((SIDES[0], SIDES[0], CHANNELS), np.float32)
-        return TrainableAvatar(NeuralTexture(texture, mip_levels=settings.mip_levels), network)
-    if settings.start == "default":
+    resumed = (places.work / STATE).exists()
+    if settings.keep_network:
+        network = network_of(load_bundle(settings.start), groups, settings.seed).requires_grad_(False)
+    elif settings.start == "default" and not resumed:
         network = load_network(network, DEFAULT_NETWORK)
-    elif settings.start != "new":
+    elif settings.start != "new" and not resumed:
         network = network_of(load_bundle(settings.start), groups, settings.seed)
-    if settings.texture == "new":
-        texture = first_texture(body_arrays(subject.shaped), groups, SIDES[0], CHANNELS)
-    else:
-        texture = load_bundle(settings.texture).read_texture()
-    return TrainableAvatar(NeuralTexture(texture, mip_levels=settings.mip_levels), network)
+    empty = np.zeros((SIDES[0], SIDES[0], CHANNELS), np.float32)
+    images = [empty if resumed else _first_image(person, number, settings) for number, person in enumerate(people)]
+    return TrainableAvatar(network, *(NeuralTexture(image, mip_levels=settings.mip_levels) for image in images))
+
+
+def _first_image(person: Trained, number: int, settings: TrainingSettings) -> F32:
+    """Return the texture (S,S,C) from which the training of `person`, whose number is `number`, starts."""
+    name = person.subject.facts.get(KEY) if settings.texture == "look" else settings.texture
+    if name in BUILT_IN:
+        return load_bundle(str(name)).read_texture()
+    groups = open_groups(person.places.work / SAMPLES, number)
+    return first_texture(body_arrays(person.subject.shaped), groups, SIDES[0], CHANNELS)
 
 
 def _with_steps(
-    avatar: TrainableAvatar, places: TrainingPlaces, settings: TrainingSettings, vgg: Vgg16 | None, listener: Listener
+    avatar: TrainableAvatar,
+    groups: list[ShapeGroup],
+    settings: TrainingSettings,
+    vgg: Vgg16 | None,
+    listener: Listener,
 ) -> TrainingSettings:
     """Return `settings` with a number of steps, and report the expected duration.
 
     If the settings have no number of steps, as many steps are chosen as fit into `minutes`.
     """
-    seconds = step_seconds(avatar, open_groups(places.work / SAMPLES), settings, vgg)
+    seconds = step_seconds(avatar, groups, settings, vgg)
     count = settings.steps or max(LEAST_STEPS, int(60 * settings.minutes / seconds))
     memory = memory_words(chosen_device(settings.device))
     per_step = f"{seconds:.2f} s a step as just measured"
@@ -289,7 +341,12 @@ def _with_steps(
 
 
 def _train(
-    state: TrainingState, subject: Subject, places: TrainingPlaces, settings: TrainingSettings, listener: Listener
+    state: TrainingState,
+    people: Sequence[Trained],
+    groups: list[ShapeGroup],
+    places: TrainingPlaces,
+    settings: TrainingSettings,
+    listener: Listener,
 ) -> None:
     """Do all remaining steps. At intervals, write a sheet, and write the state to the disk."""
     path, count = places.work / STATE, settings.steps or LEAST_STEPS
@@ -298,11 +355,11 @@ def _train(
         listener.say(f"goes on after step {state.step} of {count}")
     weights, saved = settings.loss.by_name(), time.monotonic()
     every = max(SHEET_STEPS, math.ceil(count / SHEET_COUNT))
-    for terms in steps(state, open_groups(places.work / SAMPLES), settings, count):
+    for terms in steps(state, groups, settings, count):
         loss = sum(weights.get(name, 0.0) * value for name, value in terms.items())
         listener.trained(state.step, count, terms, loss)
         if state.step % every == 0 or state.step == count:
-            write_sheet(places.work / SHEETS / f"step-{state.step:07}.png", state.average, subject)
+            write_sheet(places.work / SHEETS / f"step-{state.step:07}.png", state.average, people[0].subject)
         if time.monotonic() - saved > SAVE_S:
             save_state(state, path)
             saved = time.monotonic()
@@ -339,7 +396,7 @@ def write_sheet(path: Path, avatar: TrainableAvatar, subject: Subject) -> None:
 
     Write nothing if `subject` has no held-out frames. Raises BadInputError when the file cannot be written.
     """
-    paint, rows = float_painter(avatar.network, *(level.detach() for level in avatar.texture.levels())), []
+    paint, rows = float_painter(avatar.network, *(level.detach() for level in avatar.levels(0))), []
     for number in subject.held_out[:: max(1, len(subject.held_out) // MOST_FRAMES)][:MOST_FRAMES]:
         sample = subject.frames.whole_sample(number, VALIDATION_SIZE) if subject.frames is not None else None
         if sample is not None and subject.frames is not None:

@@ -41,8 +41,9 @@ INPUT_STEPS = 127
 
 
 class TrainableAvatar(nn.Module):
-    """A neural texture and the network that reads it.
+    """One or several neural textures, one for each person, and the network that reads them.
 
+    `textures`: texture of each person, by the person's number.
     `texture_noise`, `input_noise`: standard deviations of the Gaussian noise on texels and on the network's input.
     `grid`: byte grid that rounds weights and activations while it is active, or None.
     """
@@ -50,15 +51,24 @@ class TrainableAvatar(nn.Module):
     #: With "bfloat16", PyTorch's autocast computes the network in that format; weights, texture and loss stay float32.
     precision: Precision = "float32"
 
-    def __init__(self, texture: NeuralTexture, network: UNet) -> None:
+    def __init__(self, network: UNet, *textures: NeuralTexture) -> None:
         super().__init__()
-        self.texture, self.network = texture, network
+        self.textures, self.network = nn.ModuleList(textures), network
         self.texture_noise = self.input_noise = 0.0
         self.grid: ByteGrid | None = None
 
-    def forward(self, uv: Tensor, covered: Tensor) -> Tensor:
-        """Return pictures (N,4,H,W) in 0..1 for `uv` (N,H,W,2) in 0..1 and `covered` (N,H,W) bool."""
-        levels = [self._noisy(level, self.texture_noise) for level in self.texture.levels()]
+    def levels(self, person: int) -> list[Tensor]:
+        """Return the texture of `person`, a number, and its smaller levels, as `read_levels` takes them."""
+        texture = self.textures[person]
+        assert isinstance(texture, NeuralTexture)
+        return texture.levels()
+
+    def forward(self, uv: Tensor, covered: Tensor, person: int = 0) -> Tensor:
+        """Return pictures (N,4,H,W), RGBA in 0..1, of the person whose number is `person`.
+
+        `uv`: (N,H,W,2) in 0..1. `covered`: (N,H,W) bool.
+        """
+        levels = [self._noisy(level, self.texture_noise) for level in self.levels(person)]
         x = read_levels(levels, uv, covered)
         x = self._noisy(x, self.input_noise)
         rounded = torch.round(x * INPUT_STEPS) / INPUT_STEPS

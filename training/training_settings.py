@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from annotated_types import Len
 from pydantic import AfterValidator, Field, ValidationError
 
 from trilane.errors import BadInputError, did_you_mean
@@ -22,6 +23,8 @@ from trilane.unexpected_value import UnexpectedValue, unexpected_in
 #
 # Rule: this module needs no PyTorch, so that settings can be checked without PyTorch.
 
+#: Name of a bundled avatar, or `new`.
+BundledName = Literal["default", "hiker", "new"]
 Repeats = Annotated[int, Field(ge=1, le=100)]
 
 
@@ -185,9 +188,12 @@ class TrainingSettings(Table):
     `threads`: number of PyTorch's threads, and of processes that render samples.
     `device`: device of PyTorch; `auto` is a GPU if there is one, else the CPU.
     `precision`: floating-point format of the network in training.
-    `look`: look of the default body, if that is trained; None to train the person of a capture.
+    `look`: look of the default body, if that is trained; None to train the person of a capture. A list of looks trains
+    one network for all of them, with a texture for each.
     `start`: avatar whose network is trained further; `new` begins with random weights.
-    `texture`: avatar whose texture is trained further; `new` begins with the colours of the samples.
+    `keep_network`: whether the network of `start` stays as it is, so that only textures are trained.
+    `texture`: avatar whose texture is trained further; `new` begins with the colours of the samples. `look` is the
+    avatar that has the name of the look, or `new` if no bundled avatar has it.
     `width`: width of the network; 64 is the full network.
     `network_rate`, `texture_rate`: peak learning rates.
     `discriminator_rate`: constant learning rate of the discriminators.
@@ -213,9 +219,10 @@ class TrainingSettings(Table):
     threads: int = Field(default=1, ge=1, le=256)
     device: Literal["auto", "cpu", "cuda"] = "auto"
     precision: Literal["float32", "bfloat16"] = "float32"
-    look: str | None = None
-    start: Literal["default", "hiker", "new"] = "default"
-    texture: Literal["default", "hiker", "new"] = "new"
+    look: str | Annotated[tuple[str, ...], LISTED, Len(2, 16)] | None = None
+    start: BundledName = "default"
+    keep_network: bool = False
+    texture: BundledName | Literal["look"] = "new"
     width: int = Field(default=16, ge=4, le=64)
     network_rate: float = Field(default=1.5e-3, gt=0, le=1)
     texture_rate: float = Field(default=4e-4, gt=0, le=1)
@@ -235,6 +242,11 @@ class TrainingSettings(Table):
     optimiser: OptimiserOptions = OptimiserOptions()
     batches: BatchOptions = BatchOptions()
     regularisation: RegularisationOptions = RegularisationOptions()
+
+    @property
+    def looks(self) -> tuple[str, ...]:
+        """The names of the looks; none for a capture."""
+        return (self.look,) if isinstance(self.look, str) else self.look or ()
 
 
 def read_settings(path: Path) -> TrainingSettings:
@@ -265,6 +277,8 @@ def parsed_settings(values: dict[str, Any], where: str | Path) -> TrainingSettin
 #: Settings that exclude each other: key to blame, function that finds the clash, expected value of the key, remedy.
 CLASHES: tuple[tuple[str, Callable[[TrainingSettings], bool], str, str], ...] = (
     ("norm", lambda s: s.start != "new" and s.norm != "batch", "batch of a trained network", 'or start = "new"'),
+    ("keep_network", lambda s: s.keep_network and s.start == "new", "false with random weights", "or another start"),
+    ("look", lambda s: len(set(s.looks)) < len(s.looks), "each look once", ""),
     (
         "bytes_from",
         lambda s: s.bytes_from < 1 and s.norm in ("instance", "group"),

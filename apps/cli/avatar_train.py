@@ -34,6 +34,7 @@ Examples:
   trilane avatar train my-capture --out mine --minutes 600
   trilane avatar train my-capture --out smoke --minutes 1 --samples 200
   trilane avatar train my-capture --out again --config mine/training.toml
+  trilane avatar train my-capture --out mine --network default
   trilane avatar train --out further --config avatars/default/training.toml
 """
 #: Package index with PyTorch's builds for the CPU. The default index has the builds for NVIDIA GPUs.
@@ -81,6 +82,10 @@ def train(
     start: Annotated[
         str, typer.Option(help="Network to train further, of avatar default or hiker; new: random weights.")
     ] = "default",
+    network: Annotated[
+        str | None,
+        typer.Option(help="Avatar whose network is kept as it is: only a texture is trained. Replaces --start."),
+    ] = None,
     width: Annotated[int, typer.Option(help="Width of a new network; 64 is full.")] = 16,
     loss: Annotated[
         str, typer.Option(help="default: the default avatar's loss; thesis: L1, Dice, perceptual, GAN.")
@@ -105,6 +110,10 @@ def train(
         for name, value in (usual | {"width": width, "loss": loss, "device": device}).items()
         if name in given(ctx)
     }
+    if network is not None:
+        if "start" in options:
+            raise BadInputError("--network", network, "none beside --start", "one of both")
+        options |= {"start": network, "keep_network": True}
     values = read_settings(config).model_dump(by_alias=True, exclude_none=True) if config is not None else {}
     asked = parsed_settings(values | options, "options" if config is None else config)
     if asked.start != "new" and asked.width != DEFAULT_WIDTH:

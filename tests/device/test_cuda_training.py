@@ -29,7 +29,7 @@ def test_one_step_is_the_cpus(cuda: Any, loss: str) -> None:
     torch.backends.cuda.matmul.allow_tf32 = torch.backends.cudnn.allow_tf32 = False
     random = np.random.default_rng(0)
     start = random.uniform(-0.5, 0.5, (64, 64, 4)).astype(np.float32)
-    avatar = TrainableAvatar(NeuralTexture(start, sides=(64, 32)), UNet(width=4, channels=4))
+    avatar = TrainableAvatar(UNet(width=4, channels=4), NeuralTexture(start, sides=(64, 32)))
     batch = (
         torch.from_numpy(random.uniform(0, 1, (2, 64, 64, 2)).astype(np.float32)),
         torch.from_numpy(random.uniform(0, 1, (2, 64, 64)) > 0.5),

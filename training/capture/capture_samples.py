@@ -71,15 +71,15 @@ class CaptureRenderer:
         self._projection, self._lens = capture.file.camera.projection(), capture.file.camera.lens
         self._kept: OrderedDict[int, U8] = OrderedDict()
 
-    def training_sample(self, seed: Sequence[int], band: str, size: str) -> CaptureSample:
+    def training_sample(self, seed: Sequence[int], band: str, density: float) -> CaptureSample:
         """Return the planned sample of `seed`: the first random view with enough of the body on the screen.
 
-        `band`: a name of BANDS, or `anywhere`. `size`: tensor size, as `shape_buckets` takes it.
+        `band`: a name of BANDS, or `anywhere`. `density`: density of the tensor, as `Cropper.crop_of` takes it.
         Raises BadInputError when `TRIES` random views have too little of the body.
         """
         rng = np.random.default_rng(seed)
         for _ in range(TRIES):
-            sample = self._drawn(rng, band, size)
+            sample = self._drawn(rng, band, density)
             if sample is not None:
                 return sample
         found = f"no view of band {band} in {TRIES} draws"
@@ -101,7 +101,7 @@ class CaptureRenderer:
         placement = Placement(pose.joints, crop.projection, (0, 0, *crop.shape), pose.feature)
         return self.capture.views[sample.picture], placement
 
-    def _drawn(self, rng: np.random.Generator, band: str, size: str) -> CaptureSample | None:
+    def _drawn(self, rng: np.random.Generator, band: str, density: float) -> CaptureSample | None:
         number = self._numbers[int(rng.integers(len(self._numbers)))]
         view, screen = self.capture.views[number], screen_shape(rng)
         posed = self._raster.posed(self.capture.fits[number])
@@ -111,7 +111,7 @@ class CaptureRenderer:
             return None
         upright, mirrored = unmirrored(by, screen)
         projection = augmented_projection(self._projection, upright, camera.shape, screen)
-        crop = self._cropper.crop(posed, View(view, projection, screen[1] / screen[0]), shape_buckets(size))
+        crop = self._cropper.crop_of(posed, View(view, projection, screen[1] / screen[0]), density)
         if crop is None or crop.pixels < LEAST_PIXELS:
             return None
         whole = map_between(self._projection, crop.projection, camera.shape, crop.shape)

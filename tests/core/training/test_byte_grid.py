@@ -148,7 +148,7 @@ def test_what_was_trained_rounded_keeps_its_rounded_weights(monkeypatch: pytest.
         make_bundle, "ranges_of", lambda one, *_: byte_ranges(export_onnx(one.network, *SHAPE), frames())
     )
     made, texture = network(), NeuralTexture(np.zeros((32, 32, CHANNELS), np.float32), (32,))
-    make_bundle.keep_rounded_weights(TrainableAvatar(texture, made), [], 1)
+    make_bundle.keep_rounded_weights(TrainableAvatar(made, texture), [], 1)
     before, after = (quantise(export_onnx(one, *SHAPE), frames()).network for one in (network(), made))
     grid = grid_of(made)
     for name, weight in grid.weights(made).items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from types import SimpleNamespace
@@ -9,11 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.stats import kstest
 
+from trilane.scene.crop import Rect
 from trilane.training import dataset, sample_renderer
 from trilane.training.clothing import HIKER
-from trilane.training.dataset import open_groups
-from trilane.training.random_views import Crop
+from trilane.training.dataset import DENSITY, TRAINING_SHARE, open_groups, random_kind
+from trilane.training.random_views import OUTPUT_ROWS, Crop, Cropper, View
 from trilane.training.sample_renderer import Sample, SampleRenderer
 
 SHAPES = ((32, 64), (64, 32))
@@ -91,6 +94,37 @@ def test_samples_of_a_frame_follow_each_other(monkeypatch: pytest.MonkeyPatch, t
     assert group.rgba[:, 3, 3, 1].tolist() == [3, 12, 9, 0, 6] and group.band.tolist() == [3, 2, 4, 0, 1]
 
 
+@pytest.mark.parametrize(
+    ("rows", "density", "side"),
+    [
+        (64, 1.0, 64),
+        (64, 2.0, 128),
+        (64, 2.25, 128),
+        (100, 0.5, 64),
+        (100, 1.75, 192),
+        (480, 0.5, 256),
+        (480, 2.0, 256),
+    ],
+)
+def test_a_tensor_has_the_size_that_its_density_asks_for(rows: int, density: float, side: int) -> None:
+    """A square body that is `rows` pixels high on the picture: the tensor's side is the nearest, as a factor."""
+    cropper, side_ndc = object.__new__(Cropper), 2 * rows / OUTPUT_ROWS
+    rect = Rect(-side_ndc / 2, -side_ndc / 2, side_ndc / 2, side_ndc / 2)
+    cropper._bounds = SimpleNamespace(rect=lambda *_: rect)  # type: ignore[assignment]
+    crop = cropper.crop_of(None, View(np.eye(4), np.eye(4), 1.0), density)  # type: ignore[arg-type]
+    assert crop is not None and crop.shape == (side, side) and crop.pixels == pytest.approx(rows**2)
+
+
+def test_every_size_of_tensor_is_trained_and_small_ones_show_far_bodies() -> None:
+    """Random kinds have the shares of the table, and densities whose logarithm is uniform between the two ends."""
+    rng = np.random.default_rng(4)
+    kinds = [random_kind(rng) for _ in range(4000)]
+    shares = Counter(band for band, _ in kinds)
+    assert {band: round(count / 4000, 1) for band, count in shares.items()} == pytest.approx(TRAINING_SHARE, abs=0.05)
+    low, high = np.log(DENSITY)
+    assert kstest(np.log([density for _, density in kinds]), "uniform", (low, high - low)).pvalue > 1e-3
+
+
 @pytest.mark.parametrize(("band", "index"), [("far", 0), ("face", 3), ("anywhere", 4)])
 def test_a_view_is_taken_when_it_is_clear_and_shows_enough(
     monkeypatch: pytest.MonkeyPatch, band: str, index: int
@@ -102,18 +136,17 @@ def test_a_view_is_taken_when_it_is_clear_and_shows_enough(
         asked.append((words, rng.random()))
         return len(asked)
 
-    def crop(posed: Any, view: int, buckets: Any) -> Crop | None:
-        assert (posed, buckets) == (body, "buckets of 192")
+    def crop_of(posed: Any, view: int, size: Any) -> Crop | None:
+        assert (posed, size) == (body, "192")
         return None if view == 2 else Crop((32, 32), np.eye(4), {3: 199.0, 4: 200.0}[view])
 
     body = SimpleNamespace(joints="joints")
     monkeypatch.setattr(sample_renderer, "random_view", random_view)
-    monkeypatch.setattr(sample_renderer, "shape_buckets", lambda size: f"buckets of {size}")
     renderer = object.__new__(SampleRenderer)
     pose = np.ones((55, 3))
     vars(renderer).update(
         skeleton=SimpleNamespace(pose=lambda found: body if found is pose else None),
-        cropper=SimpleNamespace(crop=crop),
+        cropper=SimpleNamespace(crop_of=crop_of),
         surface=SimpleNamespace(
             posed=lambda posed: "points" if posed is body else None,
             is_clear_of=lambda view, points: points == "points" and view != 1,

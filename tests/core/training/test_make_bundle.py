@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -27,7 +28,7 @@ CHANNELS = 3
 
 def avatar(texture: np.ndarray) -> TrainableAvatar:
     torch.manual_seed(2)
-    return TrainableAvatar(NeuralTexture(texture, (64, 32)), UNet(width=4, channels=CHANNELS, input_skip=True))
+    return TrainableAvatar(UNet(width=4, channels=CHANNELS, input_skip=True), NeuralTexture(texture, (64, 32)))
 
 
 def noise(seed: int) -> np.ndarray:
@@ -112,7 +113,7 @@ def test_the_float_network_and_its_inputs_are_written(monkeypatch, groups, tmp_p
     made.network.eval()
     names = make_bundle.write_float_network(tmp_path, made, groups, 9)
     assert names == {"float_network": str(tmp_path / "network.onnx"), "frames": str(tmp_path / "frames.npy")}
-    frames, image = np.load(tmp_path / "frames.npy"), made.texture.image().detach()[0].permute(1, 2, 0).numpy()
+    frames, image = np.load(tmp_path / "frames.npy"), made.textures[0].image().detach()[0].permute(1, 2, 0).numpy()
     assert (frames.shape, frames.dtype) == ((3, 64, 32, CHANNELS), np.float16)
     chosen, group = sorted(np.random.default_rng(9).permutation(7)[:3]), groups[1]
     for frame, number in zip(frames, chosen, strict=True):
@@ -137,19 +138,32 @@ def test_the_network_is_calibrated_on_chosen_samples_of_one_shape(monkeypatch, g
     monkeypatch.setattr(make_bundle, "quantise", quantise)
     monkeypatch.setattr(make_bundle, "export_onnx", lambda network, *shape: (network, shape))
     monkeypatch.setattr(make_bundle, "reshaped", lambda network, *shape: (network.name, shape))
-    monkeypatch.setattr(make_bundle, "byte_texture", lambda *words: (words, "scale", None))
     made = avatar(noise(1))
-    found = make_bundle.quantise_avatar(made, "shaped", groups, 9, "unseen")
-    assert found.network == Quantised(("made", (256, 256)), {"a": 1}, {})
-    assert (found.texture, found.scale) == ((made, "shaped", "unseen"), "scale")
+    assert make_bundle.integer_network(made, groups, 9) == Quantised(("made", (256, 256)), {"a": 1}, {})
     ((model, frames, method),) = asked
     assert model == (made.network, (64, 32)) and method == "minmax"
     chosen = sorted(np.random.default_rng(9).permutation(7)[:4])
-    image = made.texture.image().detach()[0].permute(1, 2, 0).numpy()
+    image = made.textures[0].image().detach()[0].permute(1, 2, 0).numpy()
     for frame, number in zip(frames, chosen, strict=True):
         group = groups[1]
         wanted = read_by_hand(image, group.uv[number] / 65535) * (group.covered[number] == 1)[..., None]
         assert frame.shape == (64, 32, CHANNELS)
+        np.testing.assert_allclose(frame, wanted, atol=1e-4)
+
+
+def test_the_network_of_several_people_is_calibrated_on_all_of_them(monkeypatch, groups):
+    """The second person's samples are read from the second texture."""
+    monkeypatch.setattr(make_bundle, "CALIBRATION_SHAPE", (64, 32))
+    torch.manual_seed(2)
+    network, images = UNet(width=4, channels=CHANNELS, input_skip=True), (noise(1), noise(2))
+    made = TrainableAvatar(network, *(NeuralTexture(image, (64, 32)) for image in images))
+    both = [groups[1], replace(groups[1], person=1)]
+    _, frames = make_bundle._calibration(made, both, 9, 14)
+    assert len(frames) == 14
+    for number, frame in enumerate(frames):
+        image = made.levels(number // 7)[0].detach()[0].permute(1, 2, 0).numpy()
+        wanted = read_by_hand(image, groups[1].uv[number % 7] / 65535)
+        wanted = wanted * (groups[1].covered[number % 7] == 1)[..., None]
         np.testing.assert_allclose(frame, wanted, atol=1e-4)
 
 
@@ -193,7 +207,7 @@ def test_a_painter_in_floats_reads_the_texture_and_rounds_the_picture(tmp_path):
     made = avatar(noise(4)).eval()
     uv = np.random.default_rng(0).uniform(0, 1, (32, 64, 3)).astype(np.float32)
     uv[:, 40:, 2] = 0
-    image = made.texture.image().detach()
+    image = made.textures[0].image().detach()
     x = read_by_hand(image[0].permute(1, 2, 0).numpy(), uv[..., :2]) * (uv[..., 2:] > 0)
     with torch.no_grad():
         output = made.network(torch.from_numpy(x.transpose(2, 0, 1)[None].astype(np.float32)))

@@ -129,7 +129,7 @@ CHANNELS = 4
 def avatar():
     torch.manual_seed(0)
     start = np.random.default_rng(1).uniform(-0.5, 0.5, (64, 64, CHANNELS)).astype(np.float32)
-    return TrainableAvatar(NeuralTexture(start, sides=(64, 32)), UNet(width=8, channels=CHANNELS))
+    return TrainableAvatar(UNet(width=8, channels=CHANNELS), NeuralTexture(start, sides=(64, 32)))
 
 
 def test_the_network_alone_comes_back_in_half_precision(tmp_path):

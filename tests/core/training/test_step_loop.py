@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -57,7 +58,7 @@ def settings(**others: Any) -> TrainingSettings:
 def avatar(width: int = 4) -> TrainableAvatar:
     torch.manual_seed(0)
     start = np.random.default_rng(1).uniform(-0.5, 0.5, (64, 64, 4)).astype(np.float32)
-    return TrainableAvatar(NeuralTexture(start, sides=(64, 32)), UNet(width=width, channels=4))
+    return TrainableAvatar(UNet(width=width, channels=4), NeuralTexture(start, sides=(64, 32)))
 
 
 @pytest.fixture(autouse=True)
@@ -99,6 +100,41 @@ def bits(state: TrainingState) -> dict[str, bytes]:
     return {name: value.detach().contiguous().numpy().tobytes() for name, value in state.tensors().items()}
 
 
+def of_two(network_seed: int = 0) -> TrainableAvatar:
+    """Two persons with textures of their own and one network."""
+    torch.manual_seed(network_seed)
+    rng = np.random.default_rng(1)
+    images = [rng.uniform(-0.5, 0.5, (64, 64, 4)).astype(np.float32) for _ in range(2)]
+    return TrainableAvatar(UNet(width=4, channels=4), *(NeuralTexture(image, sides=(64, 32)) for image in images))
+
+
+def test_a_persons_samples_train_the_network_and_only_the_persons_texture(groups: list[ShapeGroup]) -> None:
+    asked, made = settings(weight_decay=0.0), of_two()
+    before = {name: value.clone() for name, value in made.state_dict().items()}
+    state = first_state(made, asked)
+    go(state, [replace(group, person=1) for group in groups], asked, 3)
+    after = made.state_dict()
+    changed = {name for name in before if not torch.equal(before[name], after[name])}
+    assert not any(name.startswith("textures.0") for name in changed)
+    assert any(name.startswith("textures.1") for name in changed) and any("network" in name for name in changed)
+    uv, covered, _ = load_batch(groups[0], np.array([0]))
+    made.eval()
+    alone = TrainableAvatar(made.network, made.textures[1])  # type: ignore[arg-type]
+    assert torch.equal(made(uv, covered, 1), alone.eval()(uv, covered))
+    assert not torch.equal(made(uv, covered, 0), made(uv, covered, 1))
+
+
+def test_a_network_that_is_kept_stays_the_same_to_the_bit(groups: list[ShapeGroup]) -> None:
+    """Its weights and the statistics of its norms; the texture is trained all the same."""
+    asked = settings(start="default", keep_network=True, weight_decay=0.1)
+    made = avatar()
+    made.network.requires_grad_(False)
+    before = {name: value.clone() for name, value in made.state_dict().items()}
+    go(first_state(made, asked), groups, asked, 3)
+    changed = {name for name, value in made.state_dict().items() if not torch.equal(before[name], value)}
+    assert changed and all(name.startswith("textures.0") for name in changed)
+
+
 def test_a_batch_is_in_shares(groups: list[ShapeGroup]) -> None:
     group = groups[0]
     uv, covered, target = load_batch(group, np.array([3, 1]))
@@ -120,7 +156,7 @@ def trained_again(made: TrainableAvatar, groups: list[ShapeGroup]) -> list[dict[
     ]
     kernels = [p for p in made.network.parameters() if p.ndim > 1]
     vectors = [p for p in made.network.parameters() if p.ndim == 1]
-    parts = ((kernels, 1.5e-3, 1e-3), (vectors, 1.5e-3, 0.0), (list(made.texture.parameters()), 4e-4, 1e-3))
+    parts = ((kernels, 1.5e-3, 1e-3), (vectors, 1.5e-3, 0.0), (list(made.textures.parameters()), 4e-4, 1e-3))
     optimisers = [torch.optim.AdamW(ps, lr=1.0, betas=(0.9, 0.99), weight_decay=decay) for ps, _, decay in parts]
     found = []
     for step in range(COUNT):
@@ -220,8 +256,8 @@ def test_the_network_is_computed_in_the_precision_that_is_asked_for(groups: list
 
 def test_a_masked_texture_is_kept_where_no_sample_shows_it(groups: list[ShapeGroup]) -> None:
     """Plain AdamW lets it decay; the coarser scale is seen everywhere."""
-    begun = avatar().texture.scales[0].detach()
-    plain, masked = (trained(groups, 3, masked_texture=each).avatar.texture.scales[0] for each in (False, True))
+    begun = avatar().textures[0].scales[0].detach()
+    plain, masked = (trained(groups, 3, masked_texture=each).avatar.textures[0].scales[0] for each in (False, True))
     assert bool((plain != begun).all()) and 0.05 < float((masked == begun).float().mean()) < 0.95
 
 

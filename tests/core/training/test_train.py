@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -62,8 +64,8 @@ def log(monkeypatch: pytest.MonkeyPatch) -> Any:
     def render(_: Any) -> Any:
         asked.append("render")
 
-    def sample(seed: Any, band: str, size: str) -> Any:
-        return SimpleNamespace(crop=crop, seed=seed, band=band, size=size)
+    def sample(seed: Any, band: str, density: float) -> Any:
+        return SimpleNamespace(crop=crop, seed=seed, band=band, density=density)
 
     renderer = SimpleNamespace(training_sample=sample, render=render)
     person = Person(Path("body.npz"))
@@ -97,7 +99,8 @@ def log(monkeypatch: pytest.MonkeyPatch) -> Any:
     part(command, "body_arrays", lambda shaped: f"arrays of {shaped}")
     part(command, "first_texture", lambda *_: np.full((64, 64, 16), 0.25, np.float32))
     part(command, "write_sheet", lambda path, *_: asked.append(path.name))
-    part(command, "quantise_avatar", lambda avatar, *words: (weights_of(avatar), words[0], words[2]))
+    part(command, "integer_network", lambda avatar, *_: weights_of(avatar))
+    part(command, "quantise_avatar", lambda _, *words: (words[0], words[1], words[3]))
     part(command, "write_float_network", lambda folder, _, groups, seed: {"frames": (folder, len(groups), seed)})
     part(command, "write_avatar", lambda *words: (words[0].mkdir(exist_ok=True), asked.append(words)))
     part(command, "load_bundle", lambda folder: f"bundle of {folder.name}")
@@ -183,6 +186,35 @@ def test_steps_are_counted_for_the_minutes(log: list[Any], tmp_path: Path, monke
 def test_one_person_is_trained(capture: Path | None, look: str | None, said: str, tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=said):
         train_avatar(TrainingPlaces(capture, tmp_path / "mine", tmp_path / "work", "mine"), settings(look=look), Told())
+
+
+def test_several_looks_are_painted_by_one_network(
+    log: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each has a folder of its own for samples and bundle, and a texture that only its own samples train."""
+
+    def clothed(_: Path, threads: int, look: str) -> Subject:
+        subject = command.captured_subject(Path(look), threads, lambda _: None)
+        return replace(subject, shaped=look, facts={"look": look}, held_out=(), opener=partial(subject.opener, look))  # type: ignore[arg-type]
+
+    def drawn(_: Any, samples: Any, folder: Path, *__: Any) -> None:
+        grey = 60 if folder.parent.name == "hiker" else 200
+        group = create_group(folder, SHAPE, np.zeros(len(samples), np.int8))
+        group.covered[:, 4:24, 6:28] = 1
+        group.rgba[:, 4:26, 5:28] = (grey, grey, grey, 255)
+
+    monkeypatch.setattr(command, "clothed_subject", clothed)
+    monkeypatch.setattr(command, "write_dataset", drawn)
+    there = TrainingPlaces(None, tmp_path / "both", tmp_path / "work", "both")
+    there.out.mkdir()
+    train_avatar(there, settings(look=["default", "hiker"], texture="new"), Told())
+    written = [words for words in log if isinstance(words, tuple) and isinstance(words[0], Path) and len(words) > 3]
+    assert [words[0] for words in written] == [tmp_path / "both" / name for name in ("default", "hiker")]
+    (one, *_), (other, *_) = (words[2] for words in written)
+    assert one == other, "the same network"
+    assert [words[2][1:] for words in written] == [("default", 0), ("hiker", 1)]
+    for name in ("default", "hiker"):
+        assert json.loads((tmp_path / "work" / name / "samples.json").read_text())["look"] == name
 
 
 @pytest.mark.parametrize("name", ["default", "hiker"])

@@ -40,7 +40,7 @@ from trilane.training.trainable_avatar import (  # noqa: E402
 def avatar() -> TrainableAvatar:
     torch.manual_seed(0)
     start = np.random.default_rng(1).uniform(-0.5, 0.5, (64, 64, 4)).astype(np.float32)
-    return TrainableAvatar(NeuralTexture(start, sides=(64, 32)), UNet(width=8, channels=4))
+    return TrainableAvatar(UNet(width=8, channels=4), NeuralTexture(start, sides=(64, 32)))
 
 
 @pytest.fixture
@@ -218,7 +218,7 @@ def test_the_networks_input_is_rounded_and_its_gradient_is_not():
     made(uv, torch.ones(1, 32, 32, dtype=torch.bool)).sum().backward()
     steps = seen[0].detach() * 127
     assert torch.allclose(steps, steps.round(), atol=1e-4) and steps.abs().max() > 10
-    assert float(made.texture.scales[0].grad.abs().max()) > 0
+    assert float(made.textures[0].scales[0].grad.abs().max()) > 0
 
 
 def test_repeats_show_samples_of_a_band_more_often():

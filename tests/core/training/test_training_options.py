@@ -92,7 +92,7 @@ def settings(**others: Any) -> TrainingSettings:
 def avatar(norm: str = "batch", mip_levels: int = 0) -> TrainableAvatar:
     torch.manual_seed(0)
     start = np.random.default_rng(1).uniform(-0.5, 0.5, (64, 64, 4)).astype(np.float32)
-    return TrainableAvatar(NeuralTexture(start, (64, 32), mip_levels), UNet(norm=norm, width=4, channels=4))
+    return TrainableAvatar(UNet(norm=norm, width=4, channels=4), NeuralTexture(start, (64, 32), mip_levels))
 
 
 @pytest.fixture(autouse=True)
@@ -135,10 +135,10 @@ def bits(state: TrainingState) -> dict[str, bytes]:
 
 
 def test_each_option_changes_the_training(groups: list[ShapeGroup]) -> None:
-    usual = bits(trained(groups, 1, settings()))["average.texture.scales.0"]
-    assert bits(trained(groups, 1, settings()))["average.texture.scales.0"] == usual
+    usual = bits(trained(groups, 1, settings()))["average.textures.0.scales.0"]
+    assert bits(trained(groups, 1, settings()))["average.textures.0.scales.0"] == usual
     for name, change in CHANGES.items():
-        assert bits(trained(groups, 1, settings(**change)))["average.texture.scales.0"] != usual, name
+        assert bits(trained(groups, 1, settings(**change)))["average.textures.0.scales.0"] != usual, name
 
 
 @pytest.mark.parametrize("change", MANY)
@@ -234,7 +234,7 @@ def test_the_optimiser_is_its_formula(kind: Any, masked: bool, momentum: float, 
     rows = (
         (made.network.colour[3].weight, network | {"decay": 0.1}),
         (made.network.colour[3].bias, network | {"decay": 0.0}),
-        (made.texture.scales[1], {"rate": 0.03, "decay": 0.1, "beta": texture_momentum, "masked": masked}),
+        (made.textures[0].scales[1], {"rate": 0.03, "decay": 0.1, "beta": texture_momentum, "masked": masked}),
     )
     wanted = []
     gradients = [
@@ -380,7 +380,7 @@ class Same(torch.nn.Module):  # type: ignore[misc]
 
 def test_noise_is_on_texels_or_on_the_whole_input_and_in_training_alone() -> None:
     """65,536 numbers of one deviation: theirs is known to 0.3 %, so 2 % are seven times that."""
-    made = TrainableAvatar(NeuralTexture(np.zeros((64, 64, 4), np.float32), sides=(64,)), UNet(width=4, channels=4))
+    made = TrainableAvatar(UNet(width=4, channels=4), NeuralTexture(np.zeros((64, 64, 4), np.float32), sides=(64,)))
     made.network = Same()
     middles = (np.arange(64) + 0.5) / 64
     uv = torch.from_numpy(np.stack(np.meshgrid(middles, middles), axis=-1)[None].repeat(4, 0).astype(np.float32))

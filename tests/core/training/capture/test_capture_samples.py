@@ -149,7 +149,7 @@ def test_the_picture_lies_on_the_uv_image_in_every_view(capture: Capture) -> Non
     renderer = CaptureRenderer(capture, range(8), WIDE)
     mirrored, bands = Counter[bool](), ("far", "full_body", "upper_body", "face", "anywhere")
     for number in range(15):
-        sample = renderer.training_sample((5, number), bands[number % 5], "256")
+        sample = renderer.training_sample((5, number), bands[number % 5], 1.0)
         uv, rgba = renderer.render(sample)
         drawn, alpha = uv[..., 2] > 0, rgba[..., 3]
         assert drawn.shape == alpha.shape == sample.crop.shape and sample.band == number % 5
@@ -173,7 +173,7 @@ def test_where_the_frame_ends_the_body_ends_as_well(capture: Capture) -> None:
     renderer = CaptureRenderer(replace(capture, fits=aside), range(8), replace(WIDE, flip_share=0.0))
     beyond = 0
     for number in range(6):
-        sample = renderer.training_sample((2, number), "full_body", "128")
+        sample = renderer.training_sample((2, number), "full_body", 1.0)
         uv, _ = renderer.render(sample)
         raster = renderer._raster.uv(
             aside[sample.picture], capture.views[sample.picture], sample.crop.projection, sample.crop.shape
@@ -186,15 +186,15 @@ def test_where_the_frame_ends_the_body_ends_as_well(capture: Capture) -> None:
 
 def test_a_sample_depends_on_its_seed_alone(capture: Capture) -> None:
     first, second = CaptureRenderer(capture, range(8), WIDE), CaptureRenderer(capture, range(8), WIDE)
-    one, other = first.training_sample((1, 2), "far", "128"), first.training_sample((1, 3), "far", "128")
-    again = second.training_sample((1, 2), "far", "128")
+    one, other = first.training_sample((1, 2), "far", "128"), first.training_sample((1, 3), "far", 1.0)
+    again = second.training_sample((1, 2), "far", 1.0)
     assert np.array_equal(one.by, again.by) and one.picture == again.picture and not np.array_equal(one.by, other.by)
     assert all(np.array_equal(a, b) for a, b in zip(first.render(one), second.render(again), strict=True))
 
 
 def test_only_the_frames_that_are_given_are_shown(capture: Capture) -> None:
     renderer = CaptureRenderer(capture, (2, 5), WIDE)
-    samples = [renderer.training_sample((9, number), "anywhere", "128") for number in range(20)]
+    samples = [renderer.training_sample((9, number), "anywhere", 1.0) for number in range(20)]
     assert {sample.picture for sample in samples} == {2, 5} and {sample.band for sample in samples} == {ANYWHERE_BAND}
 
 
@@ -234,7 +234,7 @@ def test_the_person_of_a_capture(capture: Capture, monkeypatch: pytest.MonkeyPat
     assert found.person.betas == pytest.approx([0.35] * 10) and found.person.body == capture.body_file
     assert np.array_equal(found.shaped.vertices, capture.shaped.vertices) and found.truth is None
     sent: Any = pickle.loads(pickle.dumps(found.source))()  # noqa: S301 - as the pool sends it
-    asked = found.renderer.training_sample((4,), "far", "128")
+    asked = found.renderer.training_sample((4,), "far", 1.0)
     assert asked.picture in (0, 1)
     assert all(np.array_equal(a, b) for a, b in zip(sent.render(asked), found.renderer.render(asked), strict=True))
     assert isinstance(found.renderer, CaptureRenderer) and not isinstance(sent, SimpleNamespace)
