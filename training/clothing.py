@@ -13,16 +13,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from trilane.arrays import F64
 from trilane.body.joints import JOINT_INDEX
 from trilane.errors import BadInputError
+from trilane.training.stitched import Stitched, long_hair, long_hair_weights, shoe, skirt, skirt_weights
 from trilane.training.surface import BodyArrays, Smoother, obscurance, shell, smoothstep, vertex_areas, vertex_normals
 
 #: Key of the look's name in an avatar's provenance.
 KEY = "look"
 DEFAULT_NAME = "default"
 Triple = tuple[float, float, float]
+#: Numbers of a look that `paint.frag` reads as they are.
+NUMBERS = ("fringe", "ear_ring", "sleeve_end", "leg_kept", "sock_end")
 
 
 @dataclass(frozen=True)
@@ -34,7 +38,8 @@ class Look:
     `fringe`: raggedness of the hairline, 0 to 1. `whorl`: direction from the middle of the head to the place where
     strands begin. `ear_ring`: relative size of the gap in the hair around an ear. `sleeve_end`: place along the arm
     where sleeves end: 0 is the shoulder, 1 the elbow. `legs_end`: a joint, and the height above it where trouser legs
-    end, metres. `sock_end`: height above the ankle where socks end, metres.
+    end, metres. `leg_kept`: length of the leg's skin that is drawn inside of them, metres. `sock_end`: height above the
+    ankle where socks end, metres.
     """
 
     betas: tuple[float, ...]
@@ -46,6 +51,7 @@ class Look:
     ear_ring: float
     sleeve_end: float
     legs_end: tuple[str, float]
+    leg_kept: float
     sock_end: float
 
     def definitions(self, landmarks: Landmarks) -> dict[str, str]:
@@ -56,7 +62,7 @@ class Look:
         joint, over = self.legs_end
         end = landmarks.joints[JOINT_INDEX[joint], 1] - landmarks.joints[ANKLES[1], 1] + over
         triples = {**self.colours, "HAIRLINE": self.hairline, "WHORL": self.whorl}
-        numbers = {name.upper(): getattr(self, name) for name in ("fringe", "ear_ring", "sleeve_end", "sock_end")}
+        numbers = {name.upper(): getattr(self, name) for name in NUMBERS}
         return {
             **{name: f"vec3({', '.join(map(repr, triple))})" for name, triple in triples.items()},
             **{name: f"({float(number)!r})" for name, number in (numbers | {"LEGS_END": end}).items()},
@@ -90,6 +96,7 @@ DEFAULT = Look(
     ear_ring=1.0,
     sleeve_end=0.60,
     legs_end=("left_ankle", 0.020),
+    leg_kept=0.09,
     sock_end=-1.0,
 )
 
@@ -120,11 +127,43 @@ HIKER = Look(
     ear_ring=0.01,
     sleeve_end=1.80,
     legs_end=("left_knee", 0.055),
+    leg_kept=0.09,
     sock_end=0.13,
 )
 
+DANCER = Look(
+    betas=(0.9, 0.9, 1.6, 0.6, 1.2, 0.3),
+    garments=("blouse", "skirt", "cap", "long hair"),
+    colours=MappingProxyType(
+        {
+            "SKIN": (0.95, 0.79, 0.70),
+            "BLUSH": (0.92, 0.56, 0.50),
+            "LIP": (0.80, 0.36, 0.36),
+            "BROW": (0.42, 0.20, 0.10),
+            "IRIS": (0.30, 0.46, 0.24),
+            "SHIRT": (0.42, 0.56, 0.26),
+            "TRIM": (0.92, 0.88, 0.74),
+            "TROUSERS": (0.42, 0.17, 0.36),
+            "STITCH": (0.80, 0.60, 0.70),
+            "HAIR": (0.50, 0.20, 0.08),
+            "STRANDS": (0.76, 0.38, 0.16),
+            "SHOE": (0.16, 0.14, 0.18),
+            "RUBBER": (0.52, 0.46, 0.44),
+            "SOCK": (0.90, 0.90, 0.88),
+        }
+    ),
+    hairline=(0.040, -0.085, -0.105),
+    fringe=0.4,
+    whorl=(-0.10, 0.96, -0.20),
+    ear_ring=0.01,
+    sleeve_end=0.42,
+    legs_end=("left_knee", 0.020),
+    leg_kept=0.22,
+    sock_end=-1.0,
+)
+
 #: Looks by name.
-LOOKS: dict[str, Look] = {DEFAULT_NAME: DEFAULT, "hiker": HIKER}
+LOOKS: dict[str, Look] = {DEFAULT_NAME: DEFAULT, "hiker": HIKER, "dancer": DANCER}
 
 
 def look_of(provenance: Mapping[str, Any]) -> Look:
@@ -192,7 +231,10 @@ def find_landmarks(vertices: F64, joints: F64, weights: NDArray[np.floating[Any]
 # The layers of a clothed body: its garments and hair, shoes and their soles, skin.
 
 #: A material's index here is the value of `material` in `paint.frag`.
-MATERIALS = ("skin", "trousers", "shirt", "hair", "shoe", "sole", "shorts", "jacket", "bob")
+MATERIALS = (
+    *("skin", "trousers", "shirt", "hair", "shoe", "sole", "shorts", "jacket", "bob"),
+    *("blouse", "skirt", "cap", "long hair"),
+)
 OBSCURANCE_REACH_M = 0.25
 #: Approximate number of vertices, of all layers together, that obscure others.
 EMITTERS = 6000
@@ -243,6 +285,10 @@ def clothing_layers(body: BodyArrays, landmarks: Landmarks, look: Look = DEFAULT
 
 
 def _garment(body: BodyArrays, landmarks: Landmarks, name: str) -> _Sheet:
+    if name in HANGING:
+        (vertices, faces), weights = HANGING[name](body, landmarks)
+        below = body.vertices[_nearest(vertices, body.vertices, 1)[:, 0]]
+        return _Sheet(name, vertices, faces, below, weights)
     covers, thickness = GARMENTS[name]
     offset, least, rounds = thickness(body.vertices, landmarks)
     raised = shell(body.vertices, body.faces, offset, least, rounds)
@@ -268,10 +314,8 @@ def _shoes(body: BodyArrays, landmarks: Landmarks) -> list[_Sheet]:
 
 def _nearest(points: F64, vertices: F64, count: int = 8) -> NDArray[np.int64]:
     """Return the indices (N,count) of the `vertices` (V,3) nearest to each of `points` (N,3), nearest first."""
-    candidates = np.flatnonzero(vertices[:, 1] < points[:, 1].max() + 0.05)
-    square = ((points[:, None] - vertices[None, candidates]) ** 2).sum(axis=2)
-    order = np.argsort(square, axis=1)[:, :count]
-    return candidates[order]
+    _, order = cKDTree(vertices).query(points, range(1, count + 1))
+    return np.asarray(order, np.int64)
 
 
 def _lights(sheets: list[_Sheet], normals: list[F64]) -> list[F64]:
@@ -401,8 +445,20 @@ def _bob_thickness(at: F64, landmarks: Landmarks) -> tuple[F64, F64, int]:
     return offset, 0.75 * offset, 16
 
 
-#: For each garment, two functions of the vertices (V,3) and landmarks. The first returns (V,) whether a vertex may be
-#: covered. The second returns offsets (V,) and least offsets (V,) in metres, and the number of relaxation rounds.
+def _blouse_thickness(at: F64, landmarks: Landmarks) -> tuple[F64, F64, int]:
+    """Return offset, least offset and rounds for a blouse that is tucked in at the waist."""
+    joints = landmarks.joints
+    along = (np.abs(at[:, 0]) - joints[SHOULDER, 0]) / (joints[ELBOW, 0] - joints[SHOULDER, 0])
+    sleeve = smoothstep(0.05, 0.45, along)
+    waist = smoothstep(joints[PELVIS, 1] + 0.20, joints[PELVIS, 1] + 0.11, at[:, 1]) * (along < 0)
+    folds = 0.003 * np.sin(33.0 * at[:, 0] + 4.0 * np.sin(8.0 * at[:, 1]))
+    offset = (0.020 + 0.016 * sleeve + folds) * (1 - 0.6 * waist)
+    return offset, 0.8 * offset, 14
+
+
+#: For each garment that is a shell, two functions of the vertices (V,3) and landmarks. The first returns (V,) whether a
+#: vertex may be covered. The second returns offsets (V,) and least offsets (V,) in metres, and the number of relaxation
+#: rounds.
 GARMENTS: dict[str, tuple[Covers, Thickness]] = {
     "trousers": (_trousers_covers, _trousers_thickness),
     "shirt": (_shirt_covers, _shirt_thickness),
@@ -410,78 +466,27 @@ GARMENTS: dict[str, tuple[Covers, Thickness]] = {
     "shorts": (_shorts_covers, _shorts_thickness),
     "jacket": (_jacket_covers, _jacket_thickness),
     "bob": (_hair_covers, _bob_thickness),
+    "blouse": (_shirt_covers, _blouse_thickness),
+    "cap": (_hair_covers, _bob_thickness),
 }
 
 
-# A shoe: a stack of horizontal slices of the foot, each convex and a little wider than the foot.
-#
-# Rule: a slice comes from the support function of the foot's vertices as seen from above. The shoe is closed below and
-# open at the ankle.
-
-ANGLES = 48
-MARGIN_M = 0.009
-TOP_M = 0.035  # height of the shoe above the ankle joint
-SOLE_M = 0.010  # thickness of the sole under the foot
-WELT_M = 0.016  # height of the sole's edge above the underside of the foot
-UPPER_STEP_M, FLANGE_M = 0.004, 0.005
+# The garments that hang: surfaces of their own, which no shell of the body is.
 
 
-def shoe(vertices: F64, ankle: F64, side: int, sole: bool) -> tuple[F64, NDArray[np.int64]]:
-    """Return vertices (N,3), metres, and faces (F,3) of one shoe's upper or of its sole.
-
-    `vertices`: body at rest, (V,3).
-    `ankle`: place of the foot's joint, (3,).
-    `side`: 1 for the left foot, -1 for the right one.
-    `sole`: whether to return the sole instead of the upper.
-    """
-    foot = vertices[(vertices[:, 0] * side > 0) & (vertices[:, 1] < ankle[1] + TOP_M + 0.02)]
-    ground = foot[:, 1].min()
-    if sole:
-        heights = np.array([ground - SOLE_M, ground - SOLE_M + 0.002, ground, ground + WELT_M - 0.002, ground + WELT_M])
-        margins = MARGIN_M + np.array([0.0, FLANGE_M, FLANGE_M, FLANGE_M, 0.0])
-    else:
-        heights = np.arange(ground + WELT_M - 0.004, ankle[1] + TOP_M, UPPER_STEP_M)
-        margins = np.full(len(heights), MARGIN_M)
-    rings = [
-        _ring(foot[foot[:, 1] >= min(height - 0.008, ankle[1])], height, margin)
-        for height, margin in zip(heights, margins, strict=True)
-    ]
-    points = np.vstack([*rings, rings[0].mean(axis=0, keepdims=True), rings[-1].mean(axis=0, keepdims=True)])
-    return points, _stitch(len(rings), sole)
+def _skirt(body: BodyArrays, landmarks: Landmarks) -> tuple[Stitched, F64]:
+    points, faces = skirt(body.vertices, landmarks.joints)
+    trunk = body.weights[_nearest(points, body.vertices)].mean(axis=1)
+    return (points, faces), skirt_weights(points, trunk, landmarks.joints)
 
 
-def _ring(foot: F64, height: float, margin: float) -> F64:
-    """Return the outline (ANGLES,3) of the slice at `height` around `foot` (N,3), widened by `margin`; metres."""
-    flat = foot[:, [2, 0]]
-    centre = 0.5 * (flat.min(axis=0) + flat.max(axis=0))
-    angle = np.arange(ANGLES) * (2 * np.pi / ANGLES)
-    towards = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    support = ((flat - centre) @ towards.T).max(axis=0) + margin
-    facing = np.cos(angle[:, None] - angle[None])
-    radius = np.where(facing > 0.05, support[None] / np.maximum(facing, 0.05), np.inf).min(axis=1)
-    radius = 0.25 * np.roll(radius, 1) + 0.5 * radius + 0.25 * np.roll(radius, -1)
-    flat = centre + radius[:, None] * towards
-    return np.stack([flat[:, 1], np.full(ANGLES, height), flat[:, 0]], axis=1)
+def _long_hair(body: BodyArrays, landmarks: Landmarks) -> tuple[Stitched, F64]:
+    points, faces = long_hair(body.vertices, landmarks.joints, landmarks.eye)
+    return (points, faces), long_hair_weights(points, landmarks.joints)
 
 
-def _stitch(rings: int, capped: bool) -> NDArray[np.int64]:
-    """Return the faces (F,3) between consecutive rings, and a fan that closes the first ring.
-
-    `rings`: number of rings of ANGLES vertices; the centres of the first and last ring follow as two vertices.
-    `capped`: whether a second fan closes the last ring.
-    """
-    here = np.arange(ANGLES)
-    after = (here + 1) % ANGLES
-    faces = []
-    for ring in range(rings - 1):
-        low, high = ring * ANGLES, (ring + 1) * ANGLES
-        faces += [
-            np.stack([low + here, low + after, high + here], 1),
-            np.stack([low + after, high + after, high + here], 1),
-        ]
-    bottom = np.full(ANGLES, rings * ANGLES)
-    faces.append(np.stack([bottom, after, here], 1))
-    if capped:
-        last = (rings - 1) * ANGLES
-        faces.append(np.stack([bottom + 1, last + here, last + after], 1))
-    return np.vstack(faces)
+#: For each garment that hangs, a function that returns its vertices and faces, and its skin weights (N,55).
+HANGING: dict[str, Callable[[BodyArrays, Landmarks], tuple[Stitched, F64]]] = {
+    "skirt": _skirt,
+    "long hair": _long_hair,
+}

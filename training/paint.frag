@@ -2,7 +2,8 @@
 // Paints the clothed body: where each layer ends, its colours, and the light of a soft lamp on the camera.
 // Everything is placed by the point at rest, `v_rest` (metres), relative to landmarks of the body.
 // The definitions in capitals come from the look (`Look` in `clothing.py`): colours in sRGB; HAIRLINE, FRINGE and WHORL
-// of the hair, EAR_RING round the ears; the ends of sleeves (SLEEVE_END), trouser legs (LEGS_END) and socks (SOCK_END).
+// of the hair, EAR_RING round the ears; the ends of sleeves (SLEEVE_END), trouser legs (LEGS_END) and socks (SOCK_END);
+// LEG_KEPT of the skin inside of trouser legs.
 // v_colour: r is the obscurance, 1 in the open; g is 1 on the eyeballs.
 
 in vec3 v_position;
@@ -12,7 +13,7 @@ in vec4 v_colour;
 
 uniform mat4 view;
 uniform vec3 eye;
-uniform int material;      // 0 skin, 1 trousers, 2 shirt, 3 hair, 4 shoe, 5 sole, 6 shorts, 7 jacket, 8 bob
+uniform int material;      // 0 skin, 1 trousers, 2 shirt, 3 hair, 4 shoe, 5 sole, 6 shorts, 7 jacket, 8 bob, 9 blouse, 10 skirt, 11 cap, 12 long hair
 uniform vec3 eyeball;      // centre of the left one
 uniform float eyeball_radius;
 uniform vec3 ear;          // tip of the left one
@@ -181,6 +182,38 @@ vec3 paint_hair(vec3 p) {
     return mix(c * 0.6, c, smoothstep(0.0, 0.012, hairline(p)));
 }
 
+float neckline(vec3 p) {  // of the blouse, > 0 where the neck is bare
+    float tilt = p.y - neck.y + 0.45 * (p.z - neck.z) - 0.012;
+    float scoop = 0.085 * (1.0 - length(vec2(p.x / 0.088, min(tilt, 0.0) / 0.085)));
+    return p.z > neck.z ? max(tilt, scoop) : tilt;
+}
+
+vec3 paint_blouse(vec3 p) {
+    float open = neckline(p), front = over(p.z - neck.z - 0.02, 0.005);
+    vec3 c = SHIRT * (1.0 + 0.05 * rough(p * vec3(23.0, 16.0, 23.0)));
+    c = mix(c, TRIM, over(abs(p.x) - mix(shoulder.x, elbow.x, SLEEVE_END) + 0.018, 0.0015));
+    c = mix(c, TRIM, over(open + 0.016, 0.0015) * over(0.14 - length(p.xz - neck.xz), 0.002));
+    c = mix(c, SHIRT * 0.72, front * band(abs(p.x) - 0.016, 0.0016, 0.0010) * over(-0.016 - open, 0.0015));
+    float button = fract((p.y - pelvis.y) / 0.065) - 0.5;
+    c = mix(c, TRIM, front * blob(vec2(p.x, button * 0.065), vec2(0.0060), 0.15) * over(-0.030 - open, 0.0015));
+    return mix(c, c * 0.80, band(abs(p.x) - shoulder.x + 0.006, 0.0030, 0.0020) * over(p.y - shoulder.y + 0.10, 0.01));
+}
+
+vec3 paint_skirt(vec3 p) {
+    float above = p.y - ankle.y - LEGS_END;
+    vec3 c = TROUSERS * (1.0 + 0.05 * rough(p * vec3(19.0, 9.0, 19.0)));
+    c = mix(c, STITCH, band(above - 0.045, 0.011, 0.0015));
+    c = mix(c, STITCH, 0.8 * band(above - 0.070, 0.0030, 0.0015));
+    return mix(c, TROUSERS * 0.55, over(p.y - pelvis.y - 0.068, 0.0015));                   // waistband
+}
+
+vec3 paint_long_hair(vec3 p) {
+    float along = 9.0 * atan(p.x, ear.z - p.z) + 0.6 * sin(17.0 * p.y);
+    float strands = 0.5 + 0.5 * sin(along * 2.0 + 1.5 * sin(along));
+    vec3 c = mix(HAIR, STRANDS, 0.10 + 0.25 * strands);
+    return mix(c, HAIR * 0.8, 0.6 * smoothstep(neck.y, neck.y - 0.25, p.y));
+}
+
 vec3 paint_shoe(vec3 p) {
     float side = sign(p.x);
     vec3 axis = normalize(vec3(toes.x - ankle.x, 0.0, toes.z - ankle.z));
@@ -208,7 +241,7 @@ bool cut(vec3 p) {
     float tilt = p.y - neck.y + 0.45 * (p.z - neck.z);
     if (material == 0) {  // skin well inside a garment
         bool in_shirt = abs(p.x) < mix(shoulder.x, elbow.x, SLEEVE_END - 0.35) && tilt < -0.13 && p.y > hip.y;
-        bool in_trousers = p.y < hip.y + 0.05 && p.y > ankle.y + LEGS_END + 0.09 && abs(p.x) < shoulder.x + 0.1;
+        bool in_trousers = p.y < hip.y + 0.05 && p.y > ankle.y + LEGS_END + LEG_KEPT && abs(p.x) < shoulder.x + 0.1;
         return in_shirt || in_trousers || p.y < ankle.y - 0.01;
     }
     if (material == 1 || material == 6) return p.y < ankle.y + LEGS_END || p.y > hip.y + 0.06;
@@ -216,7 +249,8 @@ bool cut(vec3 p) {
         bool open = p.z > neck.z && tilt > -0.085 + abs(p.x) * 2.6;
         return abs(p.x) > mix(shoulder.x, elbow.x, SLEEVE_END) || p.y < hip.y - 0.055 || tilt > 0.024 || open;
     }
-    if (material == 3 || material == 8) return hairline(p) < 0.0;
+    if (material == 3 || material == 8 || material == 11) return hairline(p) < 0.0;
+    if (material == 9) return abs(p.x) > mix(shoulder.x, elbow.x, SLEEVE_END) || p.y < hip.y + 0.06 || neckline(p) > 0.0;
     if (material == 7) return abs(p.x) > mix(shoulder.x, elbow.x, SLEEVE_END) || p.y < hip.y - 0.020 || tilt > 0.034;
     return false;
 }
@@ -225,11 +259,14 @@ vec3 paint(vec3 p) {
     if (material == 0) return paint_skin(p);
     if (material == 1) return paint_trousers(p);
     if (material == 2) return paint_shirt(p);
-    if (material == 3 || material == 8) return paint_hair(p);
+    if (material == 3 || material == 8 || material == 11) return paint_hair(p);
     if (material == 4) return paint_shoe(p);
     if (material == 5) return paint_sole(p);
     if (material == 6) return paint_shorts(p);
-    return paint_jacket(p);
+    if (material == 7) return paint_jacket(p);
+    if (material == 9) return paint_blouse(p);
+    if (material == 10) return paint_skirt(p);
+    return paint_long_hair(p);
 }
 
 void main() {

@@ -28,9 +28,9 @@ from trilane.training.clothing import (
     find_landmarks,
     look_named,
     look_of,
-    shoe,
 )
 from trilane.training.random_views import ATTITUDES, BANDS, Cropper, look_at, perspective, random_pose, random_view
+from trilane.training.stitched import shoe
 from trilane.training.surface import (
     BodyArrays,
     Smoother,
