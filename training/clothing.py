@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from trilane.arrays import F64
 from trilane.body.joints import JOINT_INDEX
 from trilane.errors import BadInputError
-from trilane.training.stitched import Stitched, long_hair, long_hair_weights, shoe, skirt, skirt_weights
+from trilane.training.stitched import HEM_M, Stitched, long_hair, long_hair_weights, shoe, skirt, skirt_weights
 from trilane.training.surface import BodyArrays, Smoother, obscurance, shell, smoothstep, vertex_areas, vertex_normals
 
 #: Key of the look's name in an avatar's provenance.
@@ -38,8 +38,8 @@ class Look:
     `fringe`: raggedness of the hairline, 0 to 1. `whorl`: direction from the middle of the head to the place where
     strands begin. `ear_ring`: relative size of the gap in the hair around an ear. `sleeve_end`: place along the arm
     where sleeves end: 0 is the shoulder, 1 the elbow. `legs_end`: a joint, and the height above it where trouser legs
-    end, metres. `leg_kept`: length of the leg's skin that is drawn inside of them, metres. `sock_end`: height above the
-    ankle where socks end, metres.
+    or a skirt end, metres. `leg_kept`: length of the leg's skin that is drawn inside of them, metres. `sock_end`:
+    height above the ankle where socks end, metres.
     """
 
     betas: tuple[float, ...]
@@ -133,7 +133,7 @@ HIKER = Look(
 
 DANCER = Look(
     betas=(0.9, 0.9, 1.6, 0.6, 1.2, 0.3),
-    garments=("blouse", "skirt", "cap", "long hair"),
+    garments=("blouse", "skirt", "cap", "long_hair"),
     colours=MappingProxyType(
         {
             "SKIN": (0.95, 0.79, 0.70),
@@ -157,7 +157,7 @@ DANCER = Look(
     whorl=(-0.10, 0.96, -0.20),
     ear_ring=0.01,
     sleeve_end=0.42,
-    legs_end=("left_knee", 0.020),
+    legs_end=("left_knee", HEM_M),
     leg_kept=0.22,
     sock_end=-1.0,
 )
@@ -233,7 +233,7 @@ def find_landmarks(vertices: F64, joints: F64, weights: NDArray[np.floating[Any]
 #: A material's index here is the value of `material` in `paint.frag`.
 MATERIALS = (
     *("skin", "trousers", "shirt", "hair", "shoe", "sole", "shorts", "jacket", "bob"),
-    *("blouse", "skirt", "cap", "long hair"),
+    *("blouse", "skirt", "cap", "long_hair"),
 )
 OBSCURANCE_REACH_M = 0.25
 #: Approximate number of vertices, of all layers together, that obscure others.
@@ -488,5 +488,5 @@ def _long_hair(body: BodyArrays, landmarks: Landmarks) -> tuple[Stitched, F64]:
 #: For each garment that hangs, a function that returns its vertices and faces, and its skin weights (N,55).
 HANGING: dict[str, Callable[[BodyArrays, Landmarks], tuple[Stitched, F64]]] = {
     "skirt": _skirt,
-    "long hair": _long_hair,
+    "long_hair": _long_hair,
 }

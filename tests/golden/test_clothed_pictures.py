@@ -10,7 +10,7 @@ pytest.importorskip("torch")
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import load_body
 from trilane.training import clothing
-from trilane.training.clothing import HIKER
+from trilane.training.clothing import LOOKS
 from trilane.training.random_views import BANDS, random_pose
 from trilane.training.sample_renderer import SampleRenderer
 
@@ -36,19 +36,22 @@ def test_the_paint_is_as_it_was(renderer, golden, view, seed):
     golden(f"clothes-{view}-{seed}", over_black, 1.0, 0.02)
 
 
-@pytest.fixture(scope="module")
-def opened_hiker(gl):  # noqa: ARG001 - where no context can be made, `gl` skips the test
-    """Its obscurance is coarse, which takes a third of the time."""
-    body = load_body(bundle_folder("default") / "body.npz").shape(HIKER.betas)
+@pytest.fixture(scope="module", params=["hiker", "dancer"])
+def other(gl, request):  # noqa: ARG001 - where no context can be made, `gl` skips the test
+    """The name of another look, and its renderer. Its obscurance is coarse, which takes a third of the time."""
+    look = LOOKS[request.param]
+    body = load_body(bundle_folder("default") / "body.npz").shape(look.betas)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(clothing, "EMITTERS", 600)
-        return SampleRenderer(body, threads=2, look=HIKER)
+        return request.param, SampleRenderer(body, threads=2, look=look)
 
 
 @pytest.mark.parametrize(("view", "seed"), [("full_body", 2), ("face", 3)])
-def test_the_other_look_is_as_it_was(opened_hiker, golden, view, seed):
-    """Shorter, in jacket and shorts, with hair to the jaw; the bounds are the default look's."""
-    opened_hiker.ctx.__enter__()
-    _, rgba = opened_hiker.render(opened_hiker.plan((7, seed), lambda _: np.zeros((55, 3)), view, "256"))
+def test_the_other_looks_are_as_they_were(other, golden, view, seed):
+    """One is shorter, in jacket and shorts, with hair to the jaw; one is taller, in blouse and skirt, with long hair.
+    The bounds are the default look's."""
+    name, renderer = other
+    renderer.ctx.__enter__()
+    _, rgba = renderer.render(renderer.plan((7, seed), lambda _: np.zeros((55, 3)), view, "256"))
     over_black = (rgba[..., :3] * (rgba[..., 3:] / 255)).round().astype(np.uint8)
-    golden(f"hiker-{view}-{seed}", over_black, 1.0, 0.02)
+    golden(f"{name}-{view}-{seed}", over_black, 1.0, 0.02)

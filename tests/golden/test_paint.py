@@ -12,7 +12,17 @@ from PIL import Image
 
 from trilane.arrays import F64
 from trilane.stages.gpu.opengl import shader_source
-from trilane.training.clothing import DEFAULT, GARMENTS, HIKER, MATERIALS, Landmarks, Look, find_landmarks
+from trilane.training.clothing import (
+    DANCER,
+    DEFAULT,
+    GARMENTS,
+    HANGING,
+    HIKER,
+    MATERIALS,
+    Landmarks,
+    Look,
+    find_landmarks,
+)
 from trilane.training.sample_renderer import PAINT, _places
 from trilane.training.surface import BodyArrays, body_arrays, vertex_normals
 
@@ -44,15 +54,18 @@ def landmarks(arrays: BodyArrays) -> Landmarks:
 
 def look_of(material: str) -> Look:
     """The look that has the garment; skin, shoes and soles are the default's."""
-    return HIKER if material in HIKER.garments else DEFAULT
+    return next((look for look in (HIKER, DANCER) if material in look.garments), DEFAULT)
 
 
 def points_of(material: str, body: BodyArrays, landmarks: Landmarks, random: np.random.Generator) -> tuple[F64, F64]:
     """Points 3 mm off the faces that the material may cover, half of them by area, and 1 for those on an eyeball."""
-    eyes = landmarks.eyeball[body.faces].all(axis=1)
+    if material in HANGING:
+        (vertices, faces), weights = HANGING[material](body, landmarks)
+        body = BodyArrays(vertices, faces, body.uv, body.uv_faces, weights, body.joints)
+    eyes = np.zeros(len(body.faces), bool) if material in HANGING else landmarks.eyeball[body.faces].all(axis=1)
     if material in GARMENTS:
         wanted = GARMENTS[material][0](body.vertices, landmarks)[body.faces].all(axis=1) & ~eyes
-    elif material == "skin":
+    elif material == "skin" or material in HANGING:
         wanted = body.vertices[body.faces[:, 0], 1] > -2
     else:
         wanted = body.vertices[body.faces[:, 0], 1] < landmarks.joints[7, 1] + 0.03

@@ -11,17 +11,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from trilane.arrays import shape_buckets
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import ShapedBody, load_body
-from trilane.body.joints import Skeleton
+from trilane.body.joints import JOINT_INDEX, Skeleton
 from trilane.errors import BadInputError
-from trilane.training import subject
+from trilane.scene.motion.builtin import BUILTIN
+from trilane.training import clothing, subject
 from trilane.training.clothing import (
     ANKLES,
+    DANCER,
     DEFAULT,
     GARMENTS,
+    HANGING,
     HIKER,
     LOOKS,
     clothing_layers,
@@ -29,8 +33,17 @@ from trilane.training.clothing import (
     look_named,
     look_of,
 )
-from trilane.training.random_views import ATTITUDES, BANDS, Cropper, look_at, perspective, random_pose, random_view
-from trilane.training.stitched import shoe
+from trilane.training.random_views import (
+    ATTITUDES,
+    BANDS,
+    ClothedSurface,
+    Cropper,
+    look_at,
+    perspective,
+    random_pose,
+    random_view,
+)
+from trilane.training.stitched import ANGLES, shoe
 from trilane.training.surface import (
     BodyArrays,
     Smoother,
@@ -39,6 +52,7 @@ from trilane.training.surface import (
     shell,
     smoothstep,
     vertex_areas,
+    vertex_normals,
 )
 
 #: Percentile of a layer's vertices, metres that it stands off the body at least, and the farthest at most. Hair is cut
@@ -228,6 +242,98 @@ def test_crops(held: Held, shaped: ShapedBody) -> None:
     held("pixels", [crop.pixels for crop in found])
 
 
+# The dancer: what hangs off her body is as far from it as cloth and hair are, and moves with it.
+
+
+@pytest.fixture(scope="module")
+def dancing() -> ShapedBody:
+    return load_body(bundle_folder("default") / "body.npz").shape(DANCER.betas)
+
+
+@pytest.fixture(scope="module")
+def worn(dancing: ShapedBody) -> Any:
+    """Layers by material. Their obscurance is coarse, which takes a third of the time."""
+    arrays = body_arrays(dancing)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(clothing, "EMITTERS", 600)
+        found = clothing_layers(arrays, find_landmarks(arrays.vertices, arrays.joints, arrays.weights), DANCER)
+    return {layer.material: layer for layer in found}
+
+
+def uses_of_edges(faces: Any) -> Any:
+    """Edges (E,2) and how many faces have each."""
+    edges = np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    return np.unique(edges, axis=0, return_counts=True)
+
+
+def test_all_that_the_dancer_wears_is_whole(worn: Any) -> None:
+    assert list(worn) == ["blouse", "skirt", "cap", "long_hair", "shoe", "sole", "skin"]
+    for layer in worn.values():
+        assert np.allclose(layer.weights.sum(axis=1), 1, atol=1e-5) and layer.weights.min() >= 0
+        assert all(np.isfinite(part).all() for part in (layer.vertices, layer.normal, layer.light))
+        assert layer.light.min() >= 0 and layer.light.max() <= 1 + 1e-9
+
+
+def test_the_skirt_is_one_tube_around_both_legs(dancing: ShapedBody, worn: Any) -> None:
+    """Open at hem and waist alone. All of the legs is 15 mm inside of it; where legs part, it goes around the gap."""
+    layer = worn["skirt"]
+    edges, uses = uses_of_edges(layer.faces)
+    rings = layer.vertices.reshape(-1, ANGLES, 3)
+    assert set(uses) == {1, 2} and (uses == 1).sum() == 2 * ANGLES
+    assert set(edges[uses == 1].ravel() // ANGLES) == {0, len(rings) - 1}
+    body = dancing.vertices
+    legs = np.abs(body[:, 0]) < 0.3
+    for ring in rings:
+        centre = ring.mean(axis=0)
+        inside = body[legs & (np.abs(body[:, 1] - centre[1]) < 0.008)] - centre
+        around = ring - centre
+        turn, radius = np.arctan2(around[:, 0], around[:, 2]), np.hypot(around[:, 0], around[:, 2])
+        limit = np.interp(np.arctan2(inside[:, 0], inside[:, 2]), turn, radius, period=2 * np.pi)
+        assert (limit - np.hypot(inside[:, 0], inside[:, 2])).min() > 0.012
+    hem = rings[0]
+    knee = dancing.joints[JOINT_INDEX["left_knee"]]
+    assert hem[0, 1] == pytest.approx(knee[1] + 0.02, abs=1e-9) and np.ptp(hem[:, 0]) > 2 * knee[0] + 0.15
+
+
+def test_no_leg_shows_through_the_skirt_in_a_walk(dancing: ShapedBody, worn: Any) -> None:
+    """Of the walk and the wave. In the turn after them thighs cross, and cloth folds between them."""
+    layer, skeleton = worn["skirt"], Skeleton(dancing.joints, dancing.body.parents)
+    hem, hip = layer.vertices[:, 1].min(), dancing.joints[JOINT_INDEX["left_hip"], 1]
+    height, legs = dancing.vertices[:, 1], np.abs(dancing.vertices[:, 0]) < 0.3
+    hidden = legs & (height > hem + 0.03) & (height < hip + 0.05)
+    cloth, skin = ClothedSurface([layer]), ClothedSurface([worn["skin"]])
+    for pose in BUILTIN["walk-wave-turn"]().poses[:350:25]:
+        posed = skeleton.pose(pose)
+        surface, points = cloth.posed(posed), skin.posed(posed)[hidden]
+        nearest = cKDTree(surface).query(points)[1]
+        out = np.einsum("ij,ij->i", points - surface[nearest], vertex_normals(surface, layer.faces)[nearest])
+        assert out.max() < -0.008
+
+
+def test_long_hair_is_a_closed_sheet_that_stands_off_the_back(dancing: ShapedBody, worn: Any) -> None:
+    """Closed where outside and inside meet; behind the face; 3 to 9 cm off the skin of the back."""
+    layer, joints = worn["long_hair"], dancing.joints
+    _, same = np.unique(np.round(layer.vertices, 6), axis=0, return_inverse=True)
+    faces = same.reshape(-1)[layer.faces]
+    apart = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    _, uses = uses_of_edges(faces[apart])
+    assert set(uses) <= {2, 4}, "an edge of 2 faces, or one of outside and inside at an end"
+    neck, eye = joints[JOINT_INDEX["neck"]], joints[JOINT_INDEX["left_eye"]]
+    assert layer.vertices[:, 1].min() == pytest.approx(neck[1] - 0.20 - 0.035, abs=0.003)
+    assert layer.vertices[:, 2].max() < eye[2] - 0.04
+    outside = layer.vertices.reshape(-1, ANGLES, 3)[:, : ANGLES // 2].reshape(-1, 3)
+    behind = outside[(np.abs(outside[:, 0]) < 0.05) & (outside[:, 1] < neck[1])]
+    off = cKDTree(dancing.vertices).query(behind)[0]
+    assert off.min() > 0.03 and off.max() < 0.09 and len(off) > 50
+
+
+def test_long_hair_turns_with_the_head_above_and_stays_on_the_back_below(worn: Any) -> None:
+    layer = worn["long_hair"]
+    order = np.argsort(layer.vertices[:, 1])
+    assert (layer.weights[order[-200:], JOINT_INDEX["head"]] == 1).all()
+    assert (layer.weights[order[:200], JOINT_INDEX["spine3"]] == 1).all()
+
+
 # Looks: what a look says is what the shader is compiled with, and the avatar of a look says whose it is.
 
 BODY = bundle_folder("default") / "body.npz"
@@ -236,7 +342,7 @@ BODY = bundle_folder("default") / "body.npz"
 @pytest.mark.parametrize("look", LOOKS.values(), ids=LOOKS)
 def test_a_look_is_complete(look: Any) -> None:
     """The same colours for all, each within sRGB; garments that there are; no more coefficients than a body has."""
-    assert set(look.colours) == set(DEFAULT.colours) and set(look.garments) <= set(GARMENTS)
+    assert set(look.colours) == set(DEFAULT.colours) and set(look.garments) <= set(GARMENTS) | set(HANGING)
     assert all(0 <= share <= 1 for colour in look.colours.values() for share in colour)
     assert len(look.betas) <= 10
 
@@ -261,5 +367,5 @@ def test_an_avatar_says_whose_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     assert look_of(hiker.facts) is HIKER and hiker.source.args[:2] == (Path("b"), "hiker")  # type: ignore[attr-defined]
     assert look_of(subject.clothed_subject(Path("b"), 2).facts) is DEFAULT
     assert look_of({}) is DEFAULT, "avatars that were trained before there were looks"
-    with pytest.raises(BadInputError, match="expected one of default, hiker"):
+    with pytest.raises(BadInputError, match="expected one of default, hiker, dancer"):
         look_named("nobody")
