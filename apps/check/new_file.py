@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from itertools import count
 from json import dumps
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from trilane.pipeline.pipeline_file import read_pipeline
 from trilane.writing import write_bytes
 
 A_VIDEO = "a video that PyAV reads"
-SUFFIXES = len("-99-video")  # longest text that is added to a network's name in the name of a stage
+LONGEST_ENDING = len("-video")  # longest text that is added to a network's name in the name of a stage
 ON_A_CHIP = "on a chip, each block but discard needs time_ms = MS, or scale = { CHIP = FACTOR } and --measured RUN"
 
 
@@ -78,10 +79,9 @@ def _branch(
     graph = read_graph(network, dict(shapes))
     require_weights(graph, network)
     inputs = [_picture_input(network, value.name, value_type(value)) for value in fed_inputs(graph)]
-    stem = re.sub(r"[^\w-]", "-", network.stem, flags=re.ASCII)[: LONGEST_NAME - SUFFIXES] or "network"
-    name = next(each for each in (stem, *(f"{stem}-{n}" for n in range(2, 100))) if each not in names)
-    prepared = [f"{name}-in{place}" if len(inputs) > 1 else f"{name}-in" for place in range(len(inputs))]
-    names |= {name, *prepared, f"{name}-out", f"{name}-drawn", f"{name}-video"}
+    endings = [f"-in{place}" if len(inputs) > 1 else "-in" for place in range(len(inputs))]
+    name = _free_name(network.stem, ("", *endings, "-out", "-drawn", "-video"), names)
+    prepared = [name + ending for ending in endings]
     lines = []
     for stage, port in zip(prepared, inputs, strict=True):
         of = f", port = {dumps(port)}" if len(inputs) > 1 else ""
@@ -97,6 +97,22 @@ def _branch(
     found = dumps(f"{name}.{first.name}")
     lines.append(f'{name}-out = {{ block = "discard", unit = "cpu", in = {found} }}')
     return lines + [f"# {line}" for line in _video_of(name, found, value_type(first))]
+
+
+def _free_name(stem: str, endings: Sequence[str], names: set[str]) -> str:
+    """Return a name for the stage of the network file `stem`, with a number if the name is taken.
+
+    With each of `endings`, the name is one of a stage of the branch. Those are added to `names`.
+    """
+    head = re.sub(r"[^\w-]", "-", stem, flags=re.ASCII) or "network"
+    for number in count(1):
+        mark = f"-{number}" if number > 1 else ""
+        name = head[: LONGEST_NAME - LONGEST_ENDING - len(mark)] + mark
+        branch = {name + ending for ending in endings}
+        if not branch & names:
+            break
+    names |= branch
+    return name
 
 
 def _video_of(name: str, found: str, of: PortType | None) -> list[str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import IO, Any, Final, NamedTuple, Protocol
 
@@ -185,18 +185,6 @@ class PacketSink:
         if self._plain_bytes < 0:
             content = Trace(packet=[TracePacket(compressed_packets=zlib.compress(content))]).SerializeToString()
         self._file.write(content)
-
-
-def packets_in(content: bytes) -> Iterator[TracePacket]:
-    """Yield the packets of a trace in order, compressed or not.
-
-    Raises google.protobuf.message.DecodeError for bytes that are no trace.
-    """
-    for packet in Trace.FromString(content).packet:
-        if packet.HasField("compressed_packets"):
-            yield from Trace.FromString(zlib.decompress(packet.compressed_packets)).packet
-        else:
-            yield packet
 
 
 @lru_cache(maxsize=1024)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import json
 import warnings
+import zlib
 from collections.abc import Sequence
 from functools import cache, partial
 from pathlib import Path
@@ -30,11 +31,13 @@ from trilane.avatars.network_file import read_network
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.joints import Skeleton
 from trilane.errors import BadInputError, reason
-from trilane.files import MAX_TEXT_BYTES, read_npz, read_text
+from trilane.files import read_bytes, read_npz, read_text
 from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.profile_files import load_profile
 from trilane.pipeline.journal import NAME as JOURNAL
 from trilane.pipeline.journal import read_journal
+from trilane.pipeline.measurements.read_file import MOST_TRACE_BYTES
+from trilane.pipeline.measurements.trace_slices import packets_in
 from trilane.scene.camera.files import load_camera
 from trilane.scene.camera.path import CameraPath
 from trilane.scene.footage import Footage
@@ -229,19 +232,15 @@ def _trace_events(path: Path) -> int:
 
 def _packets(path: Path) -> int:
     from google.protobuf.message import DecodeError
-    from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace
 
-    size = path.stat().st_size
-    if size > MAX_TEXT_BYTES:
-        raise BadInputError(path, f"{size} bytes", f"a trace of at most {MAX_TEXT_BYTES}")
-    trace = Trace()
+    content = read_bytes(path, MOST_TRACE_BYTES, "a trace of Perfetto")
     try:
-        trace.ParseFromString(path.read_bytes())
-    except DecodeError as error:
+        count = sum(1 for _ in packets_in(content))
+    except (DecodeError, zlib.error) as error:
         raise BadInputError(path, "bytes that do not parse", "a trace of Perfetto") from error
-    if not trace.packet:
+    if not count:
         raise BadInputError(path, "no packets", "a trace of Perfetto")
-    return len(trace.packet)
+    return count
 
 
 def inspect_motion(path: Path) -> Inspection:

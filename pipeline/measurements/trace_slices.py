@@ -66,6 +66,50 @@ def read_perfetto(data: bytes) -> Found:
     return found
 
 
+def packets_in(data: bytes) -> Iterator[TracePacket]:
+    """Yield the packets of a trace in order, compressed or not, one by one: a long trace is never held as objects.
+
+    Raises google.protobuf.message.DecodeError or zlib.error for bytes that are no trace, BadInputError for a trace that
+    is too large.
+    """
+    from google.protobuf.message import DecodeError
+
+    left = _left_after(data, MOST_UNPACKED_BYTES)
+    for packet in _uncompressed(data):
+        if not packet.compressed_packets:
+            yield packet
+            continue
+        inner = zlib.decompressobj().decompress(packet.compressed_packets, left + 1)
+        left = _left_after(inner, left)
+        for each in _uncompressed(inner):
+            if each.compressed_packets:
+                raise DecodeError("packed packets in packed packets")
+            yield each
+
+
+def _left_after(data: bytes, left: int) -> int:
+    """Return how many further bytes may be read after `data`. Raises BadInputError if `data` exceeds `left` bytes."""
+    if len(data) > left:
+        raise BadInputError("the trace", "over 512 MiB unpacked", "less", "record for a shorter time")
+    return left - len(data)
+
+
+def _uncompressed(data: bytes) -> Iterator[TracePacket]:
+    """Yield the packets of `data` as they are. Raises DecodeError."""
+    from google.protobuf.message import DecodeError
+    from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import TracePacket
+
+    at = 0
+    while at < len(data):
+        size, start = _varint(data, at + 1)
+        if data[at] != PACKET or size < 0 or start + size > len(data):
+            raise DecodeError("a packet is cut off")
+        packet = TracePacket()
+        packet.ParseFromString(data[start : start + size])
+        at = start + size
+        yield packet
+
+
 class _Sequence:
     """The state of one writer of packets: names by number, its clocks, its default track and clock."""
 
@@ -88,14 +132,13 @@ class _Slices:
         self._sequences: dict[int, _Sequence] = defaultdict(_Sequence)
         self._clocks: dict[int, list[int]] = {}  # of the whole trace, as in `_Sequence`
         self._marks: dict[object, list[tuple[int, str | None]]] = defaultdict(list)  # time, name; None for an end
-        self._left = MOST_UNPACKED_BYTES
 
     def read(self, data: bytes) -> None:
         from google.protobuf.message import DecodeError
 
         packets = 0
         try:
-            for packet in self._packets(data):
+            for packet in packets_in(data):
                 packets += 1
                 self._packet(packet)
         except (DecodeError, zlib.error) as error:
@@ -117,34 +160,6 @@ class _Slices:
                 self._found.skip("the end of a slice that began before the trace")
         if begun:
             self._found.skipped[UNENDED] += len(begun)
-
-    def _packets(self, data: bytes, *, packed: bool = False) -> Iterator[TracePacket]:
-        """Yield the packets one by one, so that a long trace is never held as objects. Raises DecodeError.
-
-        `packed`: whether `data` comes from a compressed packet.
-        """
-        from google.protobuf.message import DecodeError
-        from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import TracePacket
-
-        self._left -= len(data)
-        if self._left < 0:
-            raise BadInputError("the trace", "over 512 MiB unpacked", "less", "record for a shorter time")
-        at = 0
-        while at < len(data):
-            size, start = _varint(data, at + 1)
-            if data[at] != PACKET or size < 0 or start + size > len(data):
-                raise DecodeError("a packet is cut off")
-            packet = TracePacket()
-            packet.ParseFromString(data[start : start + size])
-            at = start + size
-            if packet.compressed_packets and packed:
-                raise DecodeError("packed packets in packed packets")
-            if packet.compressed_packets:
-                unpacker = zlib.decompressobj()
-                inner = unpacker.decompress(packet.compressed_packets, self._left + 1)
-                yield from self._packets(inner, packed=True)
-            else:
-                yield packet
 
     def _packet(self, packet: TracePacket) -> None:
         sequence = self._learned(packet)

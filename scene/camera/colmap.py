@@ -19,7 +19,7 @@ import numpy as np
 
 from trilane.errors import BadInputError
 from trilane.files import read_text, require_file
-from trilane.scene.camera.recorded import OPENGL_FROM_OPTICAL, LengthUnit, RawCamera, times_without
+from trilane.scene.camera.recorded import LengthUnit, RawCamera, times_without
 from trilane.scene.lens import Bent, Lens, checked_lens, distortion_note
 from trilane.scene.recordings import Detected, natural
 from trilane.scene.rotations import matrix_from_quat, normalised
@@ -288,7 +288,6 @@ def load_colmap(path: Path, rate_hz: float | None = None) -> RawCamera:
     world_to_camera = matrix_from_quat(normalised(np.array([image.quat for image in views])))
     turns = np.swapaxes(world_to_camera, 1, 2)
     places = -(turns @ np.array([image.shift for image in views])[:, :, None])[:, :, 0]
-    turns = turns @ OPENGL_FROM_OPTICAL
     times, rate = times_without(turns, rate_hz)
     models = " and ".join(sorted({cameras[image.camera].model for image in views}))
     notes = (f"COLMAP model, {len(views)} views by {len(cameras)} cameras ({models}), no times: {rate}", *distorted)

@@ -499,7 +499,7 @@ OPENGL_KINDS = ("arkit", "nerf", "record3d")
 
 
 def _read(kind: str, path: Path, spec: CameraSpec) -> RawCamera:
-    """Return the content of `path`, a file of the format `kind`.
+    """Return the content of `path`, a file of the format `kind`, in the axes of its poses.
 
     Raises BadInputError, also when the scene states a unit of times for a file without times.
     """
@@ -522,12 +522,13 @@ def _axes(kind: str, stated: str) -> F64:
     return np.array(axes, dtype=np.float64)  # row k is the direction of the pose's axis k, in the camera's axes
 
 
-def _with_axes(raw: RawCamera, kind: str, stated: str) -> RawCamera:
-    """Return `raw`, read with the axes that the scene states instead of those of the format `kind`."""
-    if stated == AUTO:
-        return raw
-    turns = raw.turns @ _axes(kind, AUTO).T @ _axes(kind, stated)
-    return replace(raw, turns=turns, notes=(*raw.notes, f"axes of a pose: {stated}, as given"))
+def _with_opengl_axes(raw: RawCamera, kind: str, stated: str) -> RawCamera:
+    """Return `raw`, a file of the format `kind` as its reader returned it, with OpenGL axes.
+
+    `stated`: axes of the file's poses by the scene; `auto` for those of the format.
+    """
+    said = () if stated == AUTO else (f"axes of a pose: {stated}, as given",)
+    return replace(raw, turns=raw.turns @ _axes(kind, stated), notes=(*raw.notes, *said))
 
 
 #: Axes of the poses of robots and drones.
@@ -537,13 +538,14 @@ BODY_AXES = "forward-left-up"
 def _require_camera(path: Path, raw: RawCamera, kind: str, spec: CameraSpec) -> None:
     """Raise BadInputError if the poses more likely belong to a vehicle's body than to a camera.
 
-    Nothing is checked if the scene states axes or up, or if the poses of the format have OpenGL axes.
+    `raw`: file of the format `kind` as its reader returned it. Nothing is checked if the scene states axes or up, or if
+    the poses of the format have OpenGL axes.
     """
     if spec.axes != AUTO or spec.up_axis != AUTO or kind in OPENGL_KINDS:
         return
     sound = are_rotations(np.nan_to_num(raw.turns))
     turns = raw.turns[sound]
-    if len(turns) and is_of_body(turns, turns @ _axes(kind, AUTO).T @ _axes(kind, BODY_AXES), raw.usual_up):
+    if len(turns) and is_of_body(turns @ _axes(kind, AUTO), turns @ _axes(kind, BODY_AXES), raw.usual_up):
         found = "poses which, as a camera's, are turned by 90 degrees and look up steeply"
         remedy = f"set camera.axes to \"{BODY_AXES}\" if the poses are those of a drone's or robot's body (x forward), "
         remedy += 'or to "right-down-forward" if they are the camera\'s'
@@ -567,9 +569,9 @@ def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
     if not (path.is_dir() and guess.kind in FOLDERS):
         require_file(path, EXPECTED)
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # non-finite values are left out later
-        raw = _with_axes(_read(guess.kind, path, spec), guess.kind, spec.axes)
+        raw = _read(guess.kind, path, spec)
         _require_camera(path, raw, guess.kind, spec)
-        camera = path_from_recording(raw, str(path), spec)
+        camera = path_from_recording(_with_opengl_axes(raw, guess.kind, spec.axes), str(path), spec)
     reason = guess.reason or "as given"
     taken = f"taken for {camera.detected.format}: {reason}"
     return replace(camera, notes=(*camera.notes, taken), detected=replace(camera.detected, reason=reason))

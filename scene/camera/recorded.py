@@ -394,8 +394,8 @@ FILM_STEP_DEG = 6.0
 def times_without(turns: F64, rate_hz: float | None) -> tuple[F64, str]:
     """Return times (N,), seconds, of views without times, and words on their rate.
 
-    `turns` (N, 3, 3): camera axes. `rate_hz`: views a second by the scene; None if the scene does not say. Without a
-    rate, views that are less than FILM_STEP_DEG apart are a film, and other views are stills.
+    `turns` (N, 3, 3): camera axes, OpenGL or optical. `rate_hz`: views a second by the scene; None if the scene does
+    not say. Without a rate, views that are less than FILM_STEP_DEG apart are a film, and other views are stills.
     """
     rate, how = _rate(turns) if rate_hz is None else (rate_hz, f"{rate_hz:g} a second as given")
     return np.arange(len(turns)) / rate, how
@@ -425,7 +425,8 @@ class RawCamera:
     """The content of a camera file, before poses are left out and the world is turned.
 
     `times_s` (N,): times in seconds.
-    `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes, in the file's unit.
+    `turns` (N, 3, 3), `places` (N, 3): camera to world, in the file's unit. A reader returns the axes of the file's
+    poses; `path_from_recording` takes OpenGL axes.
     `usual_up`: axis of the world that is usually up in the format.
     `lenses`: one lens for all poses or one for each, of pictures along the axes of the poses.
     `lens`: source of the lenses, in words.
@@ -458,7 +459,7 @@ class RawCamera:
 def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraPath:
     """Return the camera path of a file.
 
-    `raw`: content of the file.
+    `raw`: content of the file, with OpenGL axes.
     `where`: path of the file, for messages.
     `spec`: camera of the scene.
     Raises BadInputError when more than half of the poses are unusable.

@@ -29,7 +29,7 @@ from trilane.scene.camera.pose_table import (
     read_table,
     times_of,
 )
-from trilane.scene.camera.recorded import AUTO, LENGTH_UNITS, OPENGL_FROM_OPTICAL, LengthUnit, RawCamera
+from trilane.scene.camera.recorded import AUTO, LENGTH_UNITS, LengthUnit, RawCamera
 from trilane.scene.lens import Bent, Known, Lens, centred, checked_lens, distortion_note, measured_lens, of_opencv
 from trilane.scene.recordings import Detected
 
@@ -90,8 +90,8 @@ def load_kitti(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
     notes = (f"KITTI poses, {len(times)}, {rate}, optical axes, camera to the first one",)
     detected = Detected("KITTI poses", f"{MATRIX} columns of numbers", unit="m", rate=rate)
     lens = ((GREY,), "usual for KITTI's cameras")
-    turns = read.turns @ OPENGL_FROM_OPTICAL
-    return RawCamera(times, turns, read.places, "-y", *lens, notes, read.table.place_of, detected, lengths=read.lengths)
+    place_of = read.table.place_of
+    return RawCamera(times, read.turns, read.places, "-y", *lens, notes, place_of, detected, lengths=read.lengths)
 
 
 def _kitti_times(path: Path, read: MatrixTable, clock: TableClock) -> tuple[F64, str]:
@@ -144,16 +144,14 @@ def load_tum(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
     lens = ((KINECT,), "usual for a Kinect")
     reason = f"{TUM_COLUMNS} columns of numbers"
     detected = Detected("TUM trajectory", reason, unit="m", rate="by the times of the file")
-    turns = poses.turns @ OPENGL_FROM_OPTICAL
-    place_of = poses.table.place_of
     return RawCamera(
         poses.times_s,
-        turns,
+        poses.turns,
         poses.places,
         "z",
         *lens,
         notes,
-        place_of,
+        poses.table.place_of,
         detected,
         unit=LengthUnit.USUALLY_M,
         began_s=poses.began_s,
@@ -191,7 +189,6 @@ def load_euroc(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
         how = (f"poses of the body, brought to the camera by {EUROC_SENSOR}", *_sensor_distortion(lens, numbers))
     notes = (f"EuRoC poses, {len(poses.times_s)}{poses.rate}, time in {poses.time}, columns {poses.order}", *how)
     detected = Detected("EuRoC poses", "times in ns and commas", unit="m", rate="by the times of the file")
-    turns = turns @ OPENGL_FROM_OPTICAL
     return RawCamera(
         poses.times_s,
         turns,
@@ -260,16 +257,15 @@ def load_stray(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
     time = "" if poses.time == "s" else f", time in {poses.time}"
     notes = (f"Stray Scanner, {len(poses.times_s)} poses{poses.rate}{time}, optical axes, camera to world",)
     detected = Detected("Stray Scanner odometry", "its column names", unit="m", rate="by the times of the file")
-    turns, place_of = poses.turns @ OPENGL_FROM_OPTICAL, poses.table.place_of
     return RawCamera(
         poses.times_s,
-        turns,
+        poses.turns,
         poses.places,
         "y",
         lenses,
         source,
         notes,
-        place_of,
+        poses.table.place_of,
         detected,
         is_levelled=True,
         lengths=poses.lengths,

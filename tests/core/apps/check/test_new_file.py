@@ -14,7 +14,7 @@ import pytest
 from onnx import TensorProto, helper
 
 from support.pipeline_files import network
-from trilane.apps.check.new_file import write_new_file
+from trilane.apps.check.new_file import _free_name, write_new_file
 from trilane.apps.run.run_file import pipeline_of
 from trilane.errors import BadInputError
 from trilane.pipeline.pipeline_file import read_pipeline
@@ -65,6 +65,17 @@ def test_the_file_has_the_sizes_and_the_rate_of_the_files(folder: Path) -> None:
 def test_one_network_twice_has_two_names(folder: Path) -> None:
     write_new_file(folder / "new.toml", [folder / "det net.onnx"] * 2, folder / "clip.mp4")
     assert {"det-net", "det-net-2"} <= read_pipeline(folder / "new.toml").stages.keys()
+
+
+def test_any_number_of_networks_of_one_stem_have_names_of_their_own() -> None:
+    """A name and its endings fit into 40 characters. `a-in` is also what the stage before `a` would be called."""
+    names: set[str] = set()
+    taken = [_free_name("x" * 50, ("", "-in", "-video"), names) for _ in range(120)]
+    assert (len(set(taken)), len(names)) == (120, 360)
+    assert (taken[0], taken[99]) == ("x" * 34, "x" * 30 + "-100")
+    assert max(map(len, names)) == 40
+    names = set()
+    assert [_free_name(stem, ("", "-in"), names) for stem in ("a-in", "a", "a")] == ["a-in", "a-2", "a-3"]
 
 
 def test_the_commented_stages_write_a_video(folder: Path) -> None:

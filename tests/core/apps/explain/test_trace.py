@@ -25,7 +25,7 @@ from trilane.apps.explain.trace import (
     write_trace,
     write_tracks,
 )
-from trilane.apps.explain.trace_sinks import PLAIN_BYTES, ChromeSink, PacketSink, packets_in
+from trilane.apps.explain.trace_sinks import PLAIN_BYTES, ChromeSink, PacketSink
 from trilane.hw_profiles.application import application_graph
 from trilane.pipeline.journal import (
     SCHEMA,
@@ -40,6 +40,7 @@ from trilane.pipeline.journal import (
     Worked,
     journal_of,
 )
+from trilane.pipeline.measurements.trace_slices import packets_in
 from trilane.scheduler.events import (
     Abort,
     Dispatch,

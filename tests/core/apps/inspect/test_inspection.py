@@ -6,12 +6,14 @@ import json
 import os
 import shlex
 import shutil
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
 import av
 import numpy as np
 import pytest
+from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TracePacket
 from PIL import Image
 
 from support.run_report import make_report
@@ -196,6 +198,19 @@ def test_runs_and_reports(tmp_path: Path) -> None:
         assert found.advice == f"trilane explain {run}"
     (tmp_path / "trace.json").write_text('{"traceEvents": [{}, {}]}')
     assert inspect_file(tmp_path / "trace.json").facts == {"events": 2}
+
+
+def test_the_packets_of_a_trace_count_also_in_compressed_blocks(tmp_path: Path) -> None:
+    plain = Trace(packet=[TracePacket(timestamp=at) for at in range(1, 4)]).SerializeToString()
+    block = Trace(packet=[TracePacket(compressed_packets=zlib.compress(plain))]).SerializeToString()
+    path = tmp_path / "trace.pftrace"
+    path.write_bytes(plain + block + block)
+    found = inspect_file(path)
+    assert (found.what, found.facts) == ("a trace of 9 events", {"events": 9})
+    path.write_bytes(plain + Trace(packet=[TracePacket(compressed_packets=b"no zlib")]).SerializeToString())
+    damaged = inspect_file(path)
+    assert not damaged.usable
+    assert "bytes that do not parse" in damaged.problem
 
 
 @pytest.mark.parametrize("make", ["missing", "fifo", "loop"])
