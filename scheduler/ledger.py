@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from trilane.scheduler.events import NEVER, Drop, Graph, Job, Loss
-from trilane.scheduler.stats import FrameTimeSamples, Lateness, Samples, Sketch
+from trilane.scheduler.stats import FrameTimeSamples, Lateness, Samples, Sketch, due_ns
 from trilane.units import NS_PER_S
 
 ASSIGNED: Final = 0
@@ -129,8 +129,7 @@ class _UnitBook:
 class Books:
     """How a run is accounted for.
 
-    `target_period_ns`: longest frame time that counts as in time; it replaces the frames' own deadlines. 0: the frames'
-    own deadlines count.
+    `target_period_ns`: as for `trilane.scheduler.stats.due_ns`.
     `sketch`: function that makes a sketch, as for `trilane.scheduler.stats.Samples`.
     """
 
@@ -271,18 +270,16 @@ class Ledger:
         self.rungs[rung] += 1
         self.rung_switches += rung != self._rung and self.presented_count > 0
         self._rung = rung
-        target_ns = self._books.target_period_ns
-        if self.presented_count and not self._was_held:
-            self._between_ns += end_ns - self._last_ns
-            self._frame_times.add(end_ns - self._last_ns)
-            if target_ns:
-                self._lateness.add(end_ns - self._last_ns - target_ns)
+        before_ns = self._last_ns if self.presented_count and not self._was_held else None
+        if before_ns is not None:
+            self._between_ns += end_ns - before_ns
+            self._frame_times.add(end_ns - before_ns)
+        if (until_ns := due_ns(deadline_ns, before_ns, self._books.target_period_ns)) != NEVER:
+            self._lateness.add(end_ns - until_ns)
         self._last_ns, self._was_held = end_ns, self._is_held
         self.presented_count += 1
         if latency_ns >= 0:
             self._latency.add(latency_ns)
-        if deadline_ns != NEVER and not target_ns:
-            self._lateness.add(end_ns - deadline_ns)
         if self._books.sketch is None:
             self._keep(frame, end_ns, deadline_ns)
         if self.left is not None:
