@@ -1,14 +1,6 @@
 """Accounts for the time of each unit: every nanosecond of the run is busy, or idle for one stated cause.
 
-- busy: a job runs.
-- starved: the unit has no input.
-- blocked: the unit has input, but no free output slot, or the limit of frames in flight is reached.
-- throttled: the unit has input and a free slot, but its duty does not let it work yet.
-- preempted: the unit has a job, but no core.
-- overhead: a job is assigned but does not run (messages, scheduling, sleep), or the unit is down.
-- join: the unit has some inputs of a frame, but not all; only in a graph where branches meet.
-
-
+A unit is busy while a job runs. `CAUSES` is the one table of the causes of idle time; all other lists follow from it.
 """
 
 from __future__ import annotations
@@ -27,6 +19,47 @@ STARVED: Final = 1
 BLOCKED: Final = 2
 THROTTLED: Final = 3
 JOIN: Final = 4
+PREEMPTED: Final = "preempted"
+OVERHEAD: Final = "overhead"
+
+
+class Cause(NamedTuple):
+    """A cause of a unit's idle time.
+
+    `name`: its key in reports and traces.
+    `account`: account that gets its time; ASSIGNED for a part of the time in which a job was assigned.
+    `meaning`: what is so meanwhile, in the words of the dashboard.
+    `told`: what a comparison says of the unit.
+    `joins`: whether only a unit with a stage of several inputs has this cause.
+    """
+
+    name: str
+    account: int
+    meaning: str
+    told: str
+    joins: bool = False
+
+
+CAUSES: Final = (
+    Cause("starved", STARVED, "no input", "is starved"),
+    Cause("blocked", BLOCKED, "no free slot behind, or as many frames in flight as may be", "is blocked"),
+    Cause("throttled", THROTTLED, "held by its duty", "is held by its cap"),
+    Cause(PREEMPTED, ASSIGNED, "it has a job, but another thread has its core", "has no core"),
+    Cause(
+        OVERHEAD,
+        ASSIGNED,
+        "a job is assigned but does not run yet, or the process is down",
+        "waits for messages or its process",
+    ),
+    Cause("join", JOIN, "some inputs of a frame are there, others not", "waits for the other inputs of a frame", True),
+)
+#: The name of the cause of a unit's time without a job, by its account.
+NAMES: Final = {cause.account: cause.name for cause in CAUSES if cause.account != ASSIGNED}
+
+
+def idle_causes(*, joins: bool) -> tuple[str, ...]:
+    """Return the names of the causes of idle time. `joins`: whether a stage of the unit has several inputs."""
+    return tuple(cause.name for cause in CAUSES if joins or not cause.joins)
 
 
 class FrameLeft(NamedTuple):
@@ -85,7 +118,7 @@ class _UnitBook:
     def __init__(self) -> None:
         self.state = STARVED
         self.since_ns = 0
-        self.totals = [0, 0, 0, 0, 0]
+        self.totals = [0] * (1 + len(NAMES))
         self.busy_ns = self.preempted_ns = 0
         self.last_end_ns = 0
         self.jobs = 0
@@ -108,18 +141,12 @@ class _UnitBook:
     def shares(self, joins: bool) -> dict[str, Any]:
         """Return the unit's row of the report. `joins`: whether one of its stages has several inputs."""
         total = sum(self.totals) or 1
-        assigned, starved, blocked, throttled, join = self.totals
-        idle = {
-            "starved": starved,
-            "blocked": blocked,
-            "throttled": throttled,
-            "preempted": self.preempted_ns,
-            "overhead": assigned - self.busy_ns - self.preempted_ns,
-            **({"join": join} if joins else {}),
-        }
+        idle = {name: self.totals[account] for account, name in NAMES.items()}
+        idle[PREEMPTED] = self.preempted_ns
+        idle[OVERHEAD] = self.totals[ASSIGNED] - self.busy_ns - self.preempted_ns
         return {
             "busy": self.busy_ns / total,
-            "idle": {cause: ns / total for cause, ns in idle.items()},
+            "idle": {cause: idle[cause] / total for cause in idle_causes(joins=joins)},
             "jobs": self.jobs,
             "restarts": self.restarts,
         }

@@ -18,9 +18,9 @@ from trilane.apps.explain.trace_sinks import ChromeSink, FlowArrow, PacketSink, 
 from trilane.pipeline.journal import Begun, Ended, Record, Said, Sampled, Stepped, Worked, journal_of, target_period_ns
 from trilane.pipeline.timeline import Gone, Presented, Timeline
 from trilane.pipeline.tracks import UNKNOWN
-from trilane.pipeline.unit_history import IDLE_CAUSES, JOIN, UNEXPLAINED, IdleSlice
+from trilane.pipeline.unit_history import UNEXPLAINED, IdleSlice
 from trilane.scheduler.events import NEVER, Graph
-from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.ledger import JobRecord, idle_causes
 from trilane.scheduler.stats import due_ns
 from trilane.scheduler.virtual import Simulation
 from trilane.writing import write_atomically
@@ -260,8 +260,7 @@ class _UnitTracks:
 
     def __init__(self, sink: Sink, graph: Graph, parent: int, rank: int, flows_from: int = 1) -> None:
         self._sink, self._flows_from = sink, flows_from
-        causes = IDLE_CAUSES if graph.is_chain else (*IDLE_CAUSES, JOIN)
-        sink.recurring([*causes, UNEXPLAINED, *(stage.name for stage in graph.stages)])
+        sink.recurring([*idle_causes(joins=not graph.is_chain), UNEXPLAINED, *(stage.name for stage in graph.stages)])
         self._units = {unit: sink.track(unit, parent, rank + place) for place, unit in enumerate(graph.units)}
         self._tiles: dict[str, Tiles[JobRecord | IdleSlice]] = {unit: Tiles() for unit in graph.units}
         read = [graph.inputs_of(place) for place in range(len(graph.stages))]

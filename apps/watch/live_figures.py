@@ -45,9 +45,9 @@ from trilane.pipeline.journal import (
 )
 from trilane.pipeline.reckoning import Reckoning, places_of
 from trilane.pipeline.timeline import EndedJob, ExplainedJob, Presented, Timeline
-from trilane.pipeline.unit_history import BUSY, IDLE_CAUSES, JOIN, NAMES, OVERHEAD, PREEMPTED
+from trilane.pipeline.unit_history import BUSY, JOIN, OVERHEAD, PREEMPTED
 from trilane.scheduler.events import NEVER, Finish, JobDone, Start
-from trilane.scheduler.ledger import STARVED
+from trilane.scheduler.ledger import NAMES, STARVED, idle_causes
 from trilane.scheduler.stats import due_ns, summary_ms
 from trilane.units import COMPUTED, MEASURED, NS_PER_MS, NS_PER_S
 
@@ -414,7 +414,7 @@ class _UnitTime:
 
 
 def _shares(sums: Mapping[str, int], total_ns: int) -> Shares:
-    causes = (*IDLE_CAUSES, JOIN) if sums[JOIN] else IDLE_CAUSES
+    causes = idle_causes(joins=sums[JOIN] > 0)
     if total_ns <= 0:
         return Shares(0.0, dict.fromkeys(causes, 0.0))
     overhead_ns = max(sums[ASSIGNED] - sums[BUSY] - sums[PREEMPTED], 0)  # rounding of cut spans may make it negative
