@@ -19,6 +19,7 @@ from trilane.hw_profiles.reference_networks import CHANNELS_PER_PASS
 from trilane.hw_profiles.schema import Corners, Profile
 from trilane.hw_profiles.unit_times import JobTime, time_on
 from trilane.scheduler.events import Graph, Settings, chain
+from trilane.scheduler.ledger import NAMES, PREEMPTED, STARVED
 from trilane.scheduler.policy import POLICIES, run_settings
 from trilane.scheduler.virtual import Simulation, simulate
 from trilane.transport.slots import DEFAULT_EDGE
@@ -338,10 +339,10 @@ def _shares(
         for group in ({unit}, {each for each in UNITS if worker[each] == worker[unit]})
     )
     if not own:
-        return 0.0, {"starved": 1.0}
+        return 0.0, {NAMES[STARVED]: 1.0}
     share = units[worker[unit]]
     busy = share["busy"] * own / together
-    preempted = {"preempted": share["busy"] - busy} if own < together else {}
+    preempted = {PREEMPTED: share["busy"] - busy} if own < together else {}
     return busy, {**share["idle"], **preempted}
 
 

@@ -57,6 +57,7 @@ from trilane.hw_profiles.schema import (
     EngineRuntime,
     Profile,
     Unit,
+    around_80,
     corners_of,
 )
 from trilane.hw_profiles.unit_times import amounts, join, numbers_of, time_on
@@ -304,8 +305,8 @@ def _error_scales(profile: Profile, left_out: Sequence[CheckedRow]) -> dict[str,
 
 
 def _scaled(checked: CheckedRow, scale: float) -> Interval:
-    factor = math.exp(NORMAL_80 * scale * spread_of(checked.after))
-    return checked.after._replace(low_ms=checked.after_ms / factor, high_ms=checked.after_ms * factor)
+    low_ms, high_ms = around_80(checked.after_ms, scale * spread_of(checked.after))
+    return checked.after._replace(low_ms=low_ms, high_ms=high_ms)
 
 
 def _predicted(profile: Profile, row: OwnRow) -> tuple[float, Interval]:

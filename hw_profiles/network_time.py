@@ -32,12 +32,13 @@ from trilane.hw_profiles.host_model import UNMEASURED, with_known_intervals
 from trilane.hw_profiles.network_work import Operator, Work
 from trilane.hw_profiles.operators import COMPILED, NAMES, EngineLayer
 from trilane.hw_profiles.rates import NOTHING, FrameInterval, FrameLoad, Wanted, answers, device_power
-from trilane.hw_profiles.schema import NORMAL_80, Corners, EngineRuntime, Profile, Unit, corners_of
+from trilane.hw_profiles.schema import NORMAL_80, Corners, EngineRuntime, Profile, Unit, around_80, corners_of
 from trilane.hw_profiles.unit_times import (
     BOUNDS,
     Bound,
     JobTime,
     UnitNumbers,
+    assumes_peak,
     engine_time,
     fallback_ms,
     job_time,
@@ -45,6 +46,7 @@ from trilane.hw_profiles.unit_times import (
     machine_of,
     numbers_of,
     relative_error,
+    stated_error,
     time_on,
 )
 from trilane.units import BURST, HOST, UNITS, UnitName
@@ -147,14 +149,12 @@ def interval(profile: Profile, work: Work, time: NetworkTime) -> Interval:
     """
     unit = profile.units[time.unit]
     job = time_on(unit, profile.memory, work)
-    error = relative_error(job, unit)
     if unit.measured is not None:
         why = [unit.measured.said]
     elif unit.engine is None:
-        why = [f"the profile states a relative error of {error:.0%} for networks on its {time.unit}"]
-        peak = unit.peak
-        if peak.value is None:
-            error = math.hypot(error, peak.relative_error)
+        stated = stated_error(job, unit)
+        why = [f"the profile states a relative error of {stated:.0%} for networks on its {time.unit}"]
+        if assumes_peak(unit):
             assumed = f"{unit.peak_mac_s / 1e12:g} TMAC/s are assumed"
             why.append(f"it does not know how fast its {time.unit} is in {unit.precision}: {assumed}")
     else:
@@ -167,8 +167,7 @@ def interval(profile: Profile, work: Work, time: NetworkTime) -> Interval:
     odd = sorted({o.op_type for o in work.operators if not o.ruled})
     if odd:
         why.append(f"no rule for {', '.join(odd)}: counted as the movement of its elements")
-    factor = math.exp(NORMAL_80 * error)
-    return Interval(time.total_ms / factor, time.total_ms * factor, tuple(why))
+    return Interval(*around_80(time.total_ms, relative_error(job, unit)), tuple(why))
 
 
 def _likeness(job: JobTime) -> str:

@@ -25,7 +25,7 @@ from trilane.hw_profiles.graph_file import GraphFile
 from trilane.hw_profiles.host_model import MODEL_ERROR, UNMEASURED
 from trilane.hw_profiles.network_time import interval, price
 from trilane.hw_profiles.rates import FrameInterval, holding, wanted_drops, without_interval
-from trilane.hw_profiles.schema import NORMAL_80, Corners, Profile
+from trilane.hw_profiles.schema import Corners, Profile, around_80
 from trilane.pipeline.file_graph import (
     edge_rules,
     graph_of,
@@ -133,8 +133,7 @@ def measured_price(file: PipelineFile, name: str, measured: MeasuredStages) -> S
         return None
     time = measured.times[name].times(factor)
     source = f"measured in {measured.run}" + (f", times {factor:g}" if measured.chip != HOST else "")
-    around = math.exp(NORMAL_80 * MODEL_ERROR)
-    return StagePrice(time, source, time.mean_ms / around, time.mean_ms * around, is_measured=True)
+    return StagePrice(time, source, *around_80(time.mean_ms, MODEL_ERROR), is_measured=True)
 
 
 def stages_without_time(file: PipelineFile, measured: MeasuredStages = NOTHING_MEASURED) -> list[str]:

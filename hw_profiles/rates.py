@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from itertools import product
 from typing import Any, NamedTuple
 
-from trilane.hw_profiles.schema import CORNERS, NORMAL_80, Corner, Corners, Profile
+from trilane.hw_profiles.schema import CORNERS, Corner, Corners, Profile, around_80
 from trilane.scheduler.events import DropCause
 from trilane.units import UNITS, UnitName
 
@@ -270,5 +270,4 @@ def _watts(mean: float, deviation: float) -> _Watts:
     if not mean:
         return _Watts(0.0, 0.0, 0.0)
     variance = math.log1p((deviation / mean) ** 2)
-    middle, factor = mean * math.exp(-variance / 2), math.exp(NORMAL_80 * math.sqrt(variance))
-    return _Watts(mean, middle / factor, middle * factor)
+    return _Watts(mean, *around_80(mean * math.exp(-variance / 2), math.sqrt(variance)))

@@ -6,6 +6,7 @@ checks only types and ranges. `corners_of` returns the corner of each unit under
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
@@ -27,6 +28,12 @@ MOST_ERROR_SCALE = 20.0
 BYTES = {"int8": 1, "fp16": 2, "fp32": 4}
 
 Corners = tuple[Corner, Corner, Corner]
+
+
+def around_80(middle: float, error: float) -> tuple[float, float]:
+    """Return the ends of the 80 % interval around `middle`. `error`: standard deviation of the value's logarithm."""
+    factor = math.exp(NORMAL_80 * error)
+    return middle / factor, middle * factor
 
 
 class ProfileTable(BaseModel):

@@ -249,7 +249,20 @@ def time_on(
 
 
 def relative_error(job: JobTime, unit: Unit) -> float:
-    """Return the expected relative error of the time of `job` on `unit`; for a measured unit, the measured error.
+    """Return the expected relative error of the time of `job` on `unit`.
+
+    It is the stated error, and the error of a peak that the profile does not know.
+    """
+    return math.hypot(stated_error(job, unit), unit.peak.relative_error if assumes_peak(unit) else 0.0)
+
+
+def assumes_peak(unit: Unit) -> bool:
+    """Return whether times on `unit` are computed from a peak that its profile does not know."""
+    return unit.measured is None and unit.engine is None and unit.peak.value is None
+
+
+def stated_error(job: JobTime, unit: Unit) -> float:
+    """Return the relative error that a profile states for the time of `job`; for a measured unit, the measured error.
 
     For another unit, it combines the error of the numbers behind each part of the time and the error of the model. Both
     are multiplied by the unit's `error_scale`, which comes from the user's own rows.

@@ -24,10 +24,11 @@ from trilane.files import require_file
 from trilane.pipeline import journal_values as values
 from trilane.pipeline.journal_values import RunValues
 from trilane.scheduler.core import Core
-from trilane.scheduler.events import Action, Event, Graph, JobDone, Settings
+from trilane.scheduler.events import NEVER, Action, Event, Graph, JobDone, Settings
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.recording import Recording, row_of
 from trilane.unexpected_value import UnexpectedValue
+from trilane.units import NS_PER_S, TARGET_FPS
 from trilane.writing import require_name
 
 NAME = "journal.msgpack"
@@ -46,7 +47,8 @@ class Begun(NamedTuple):
     """The first record.
 
     `facts`: JSON values known before the first frame, with the keys of report.json where they are known: `clock`
-    ("host" or "virtual"), `began_at` (UTC, ISO 8601), `config`, `machine`, `made`, `accuracy`, `units`.
+    ("host" or "virtual"), `began_at` (UTC, ISO 8601), `config`, `machine`, `made`, `accuracy`, `units`. Also
+    `target_period_ns`, as for `trilane.scheduler.stats.due_ns`; journals of an older Trilane lack it.
     """
 
     schema: int
@@ -329,6 +331,19 @@ def config_of(begun: Begun) -> Mapping[str, Any]:
     ):
         raise BadInputError("the journal: facts", "a configuration of another form", "one as a run writes it")
     return config
+
+
+def target_period_ns(begun: Begun) -> int:
+    """Return `target_period_ns` of a journal's first record. Raises BadInputError as `config_of` does.
+
+    If the journal lacks it, the value comes from the rate of the run's scene.
+    """
+    written, settings = begun.facts.get("target_period_ns"), begun.settings
+    if type(written) is int and 0 <= written < NEVER:
+        return written
+    fps = config_of(begun).get("scene", {}).get("fps")
+    is_known = isinstance(fps, int | float) and fps * NEVER > NS_PER_S
+    return 0 if settings.deadline_ns else round(NS_PER_S / (fps if is_known else TARGET_FPS))
 
 
 #: Functions that return the written fields of a record, for the types whose fields are not written as they are.

@@ -12,13 +12,13 @@ from typing import Any, Final, get_type_hints
 
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import ACTIONS, EVENTS, NEVER, Action, Event, Finish, Graph, Settings
-from trilane.scheduler.ledger import ASSIGNED, BLOCKED, JOIN, STARVED, THROTTLED, JobRecord
+from trilane.scheduler.ledger import ASSIGNED, NAMES, JobRecord
 from trilane.scheduler.recording import CARRIED, actions_of, events_of, graph_of, settings_of
 from trilane.unexpected_value import UnexpectedValue
 
 LONGEST_FOUND: Final = 80
 MOST_NESTED: Final = 32  # depth of the facts; a configuration has five
-ACCOUNTS: Final = {ASSIGNED: "assigned", STARVED: "starved", BLOCKED: "blocked", THROTTLED: "throttled", JOIN: "join"}
+ACCOUNTS: Final = {ASSIGNED: "assigned", **NAMES}
 A_TIME: Final = f"nanoseconds, a whole number from 0 to {NEVER}"
 NUMBERS: Final = {int, float}
 PLAIN: Final = {int, float, str, bool, type(None)}

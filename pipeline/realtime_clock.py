@@ -47,7 +47,7 @@ from trilane.scheduler.events import (
     UnitDied,
     UnitReady,
 )
-from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.ledger import PREEMPTED, JobRecord
 from trilane.scheduler.stats import Samples, Sketch
 from trilane.transport import messages
 from trilane.transport.messages import Done, Failed, Ping, Ready, RunJob
@@ -159,7 +159,7 @@ def add_accounts(report: dict[str, Any], pipeline: Pipeline, cpu: CpuTimes, log:
             log.say(f"{', '.join(use.units)} had {use.cpu:.1%} of the time of cores {use.cores}: please report this")
     if not counts_run_delay():
         for row in report["units"].values():
-            row["idle"]["preempted"] = None
+            row["idle"][PREEMPTED] = None
         log.say(NO_RUN_DELAY)
 
 

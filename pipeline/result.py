@@ -267,7 +267,13 @@ class _JournaledRun:
     """
 
     def __init__(
-        self, file: JournalFile, writer: JournalWriter, graph: Graph, settings: Settings, caps: CapReadings | None
+        self,
+        file: JournalFile,
+        writer: JournalWriter,
+        graph: Graph,
+        settings: Settings,
+        caps: CapReadings | None,
+        target_ns: int,
     ) -> None:
         self.recording = Recording(graph, settings)
         self.jobs: list[JobRecord] = []
@@ -277,8 +283,8 @@ class _JournaledRun:
         self._accounts = dict.fromkeys(graph.units, -1)
         self._steps: list[_Step] = []
         self._left_out = self._flush_ns = self._sample_ns = 0
-        facts = {"clock": "host", "began_at": machine.here.now().isoformat(timespec="seconds"), **file.facts}
-        self._writer.add(Begun(SCHEMA, graph, settings, facts))
+        began = {"clock": "host", "began_at": machine.here.now().isoformat(timespec="seconds")}
+        self._writer.add(Begun(SCHEMA, graph, settings, {**began, "target_period_ns": target_ns, **file.facts}))
         self._writer.flush()
 
     def begin(self, source: JobSource, pids: Callable[[], Mapping[str, int]]) -> None:
@@ -368,13 +374,14 @@ class _JournaledRun:
 
 @contextmanager
 def recorded(
-    file: JournalFile | None, graph: Graph, settings: Settings, caps: CapReadings | None
+    file: JournalFile | None, graph: Graph, settings: Settings, caps: CapReadings | None, target_period_ns: int
 ) -> Iterator[RunRecord]:
     """Yield the record of one run, in `file`, or in memory if `file` is None.
 
     At the end everything is written to the file, however the run ended.
 
     `caps`: governor that sets the units' duties, or None.
+    `target_period_ns`: as for `trilane.scheduler.stats.due_ns`; the journal names it.
 
     Raises BadInputError if the file cannot be made.
     """
@@ -386,7 +393,7 @@ def recorded(
     except OSError as error:
         raise BadInputError.of_os_error(file.path, error, WRITABLE) from None
     with writer:
-        run = _JournaledRun(file, writer, graph, settings, caps)
+        run = _JournaledRun(file, writer, graph, settings, caps, target_period_ns)
         try:
             yield run
         finally:

@@ -44,7 +44,7 @@ from trilane.scheduler.ledger import Books
 from trilane.scheduler.policy import run_settings
 from trilane.scheduler.stats import MOST_EXACT, energy_score
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import NS_PER_MS, NS_PER_S
+from trilane.units import NS_PER_MS, NS_PER_S, TARGET_FPS
 
 RELATIVE_ERROR = 0.005
 _BINS = 4096
@@ -93,7 +93,7 @@ def run_pipeline(
     frames: int,
     *,
     policy: str = "pipelined",
-    fps: float = 30.0,
+    fps: float = TARGET_FPS,
     pace_fps: float | None = None,
     assets: Assets | None = None,
     hang_ns: int = HANG_NS,
@@ -150,7 +150,7 @@ def run_pipeline(
     if not pipeline.graph().is_chain and (settings.latch_ns or settings.works or requests is not None):
         expected = "a chain of stages, or none of latching, a ladder of work and requests for frames"
         raise BadInputError("the run's settings", "a pipeline with stages that have a list of inputs", expected)
-    with recorded(journal, pipeline.graph(), settings, governor) as record:
+    with recorded(journal, pipeline.graph(), settings, governor, target_ns) as record:
         log = RunLog(record.say, *([on_message] if on_message is not None else []))
         with (
             contextlib.closing(requests) if requests is not None else contextlib.nullcontext(),

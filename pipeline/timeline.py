@@ -58,6 +58,11 @@ class Presented(NamedTuple):
     skips: bool
     rung: int
 
+    @property
+    def before_ns(self) -> int | None:
+        """The time at which the frame before it was presented; None where `interval_ns` is."""
+        return None if self.interval_ns is None else self.end_ns - self.interval_ns
+
 
 class Gone(NamedTuple):
     """A frame that was not presented.

@@ -26,15 +26,10 @@ from typing import Final, NamedTuple
 
 from trilane.scheduler import ledger
 from trilane.scheduler.events import NEVER, Job
-from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.ledger import NAMES, JobRecord
 
-BUSY, PREEMPTED, OVERHEAD = "busy", "preempted", "overhead"
-THROTTLED, JOIN = "throttled", "join"
-_OF_ALL: Final = {ledger.STARVED: "starved", ledger.BLOCKED: "blocked", ledger.THROTTLED: THROTTLED}
-#: The cause of a unit's time without a job, by the ledger's account.
-NAMES: Final = {**_OF_ALL, ledger.JOIN: JOIN}
-#: The causes of idle time; in a graph where branches meet, JOIN is a further cause.
-IDLE_CAUSES: Final = (*_OF_ALL.values(), PREEMPTED, OVERHEAD)
+BUSY, PREEMPTED, OVERHEAD = "busy", ledger.PREEMPTED, ledger.OVERHEAD
+THROTTLED, JOIN = NAMES[ledger.THROTTLED], NAMES[ledger.JOIN]
 #: The cause of the time in which a unit has neither a job nor a noted cause. It is in no sum, so that a gap is visible.
 UNEXPLAINED = "unexplained"
 LOST, DOWN, HELD, UNKNOWN = "lost", "down", "held", "unknown"

@@ -81,7 +81,7 @@ class Choice:
         self._policy, self._source, self._flow = policy, source, flow
         self._stages, self._frames, self._bypass = flow.stages, flow.frames, flow.bypass
         self._stage_named, stages = flow.stage_named, flow.stages
-        self._deadline_ns, self._latch_ns = settings.deadline_ns, settings.latch_ns
+        self._latch_ns, self.due_from_ns = settings.latch_ns, settings.due_from_ns
         self._in_flight = min([limit for limit in (settings.in_flight, policy.in_flight) if limit], default=0)
         self.latches = settings.latch_ns > 0 and len(stages) > 1
 
@@ -145,10 +145,6 @@ class Choice:
         end_ns = earliest_completion_ns(now_ns, waiting.frame, self._stages, self._frames, todo, bypass)
         return end_ns > waiting.deadline_ns
 
-    def deadline_from_ns(self, release_ns: int) -> int:
-        """Return the deadline of a frame that was released at `release_ns`, or NEVER."""
-        return release_ns + self._deadline_ns if self._deadline_ns else NEVER
-
     def account_without_job(self, unit: UnitState, now_ns: int) -> int:
         """Return the account that gets the time of a unit with an empty queue; it says why the unit has no job."""
         if unit.life != READY:
@@ -178,7 +174,7 @@ class Choice:
         edge = stage.input
         if edge is None:
             frame, release_ns = self._source.head(now_ns)
-            return Candidate(frame, stage.position, self.deadline_from_ns(release_ns))
+            return Candidate(frame, stage.position, self.due_from_ns(release_ns))
         if stage.bypassed is None:
             slot = stage.waiting[0]
         else:
@@ -312,7 +308,7 @@ class Assignment:
     def _admit(self, now_ns: int) -> int:
         """Put the source's next frame in flight, and return its number."""
         frame, release_ns = self._source.take(now_ns)
-        self._flow.admit(frame, release_ns, self._choice.deadline_from_ns(release_ns))
+        self._flow.admit(frame, release_ns, self._choice.due_from_ns(release_ns))
         return frame
 
     def _next_stage(self, unit: UnitState, now_ns: int) -> StageState | None:

@@ -481,3 +481,7 @@ class Settings:
     hang_ns: int = 10_000_000_000
     start_ns: int = 120_000_000_000
     max_failures: int = 5
+
+    def due_from_ns(self, release_ns: int) -> int:
+        """Return the deadline of a frame that was released at `release_ns`, or NEVER."""
+        return release_ns + self.deadline_ns if self.deadline_ns else NEVER

@@ -1,14 +1,6 @@
 """Accounts for the time of each unit: every nanosecond of the run is busy, or idle for one stated cause.
 
-- busy: a job runs.
-- starved: the unit has no input.
-- blocked: the unit has input, but no free output slot, or the limit of frames in flight is reached.
-- throttled: the unit has input and a free slot, but its duty does not let it work yet.
-- preempted: the unit has a job, but no core.
-- overhead: a job is assigned but does not run (messages, scheduling, sleep), or the unit is down.
-- join: the unit has some inputs of a frame, but not all; only in a graph where branches meet.
-
-
+A unit is busy while a job runs. `CAUSES` is the one table of the causes of idle time; all other lists follow from it.
 """
 
 from __future__ import annotations
@@ -19,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 from trilane.scheduler.events import NEVER, Drop, Graph, Job, Loss
-from trilane.scheduler.stats import FrameTimeSamples, Lateness, Samples, Sketch
+from trilane.scheduler.stats import FrameTimeSamples, Lateness, Samples, Sketch, due_ns
 from trilane.units import NS_PER_S
 
 ASSIGNED: Final = 0
@@ -27,6 +19,47 @@ STARVED: Final = 1
 BLOCKED: Final = 2
 THROTTLED: Final = 3
 JOIN: Final = 4
+PREEMPTED: Final = "preempted"
+OVERHEAD: Final = "overhead"
+
+
+class Cause(NamedTuple):
+    """A cause of a unit's idle time.
+
+    `name`: its key in reports and traces.
+    `account`: account that gets its time; ASSIGNED for a part of the time in which a job was assigned.
+    `meaning`: what is so meanwhile, in the words of the dashboard.
+    `told`: what a comparison says of the unit.
+    `joins`: whether only a unit with a stage of several inputs has this cause.
+    """
+
+    name: str
+    account: int
+    meaning: str
+    told: str
+    joins: bool = False
+
+
+CAUSES: Final = (
+    Cause("starved", STARVED, "no input", "is starved"),
+    Cause("blocked", BLOCKED, "no free slot behind, or as many frames in flight as may be", "is blocked"),
+    Cause("throttled", THROTTLED, "held by its duty", "is held by its cap"),
+    Cause(PREEMPTED, ASSIGNED, "it has a job, but another thread has its core", "has no core"),
+    Cause(
+        OVERHEAD,
+        ASSIGNED,
+        "a job is assigned but does not run yet, or the process is down",
+        "waits for messages or its process",
+    ),
+    Cause("join", JOIN, "some inputs of a frame are there, others not", "waits for the other inputs of a frame", True),
+)
+#: The name of the cause of a unit's time without a job, by its account.
+NAMES: Final = {cause.account: cause.name for cause in CAUSES if cause.account != ASSIGNED}
+
+
+def idle_causes(*, joins: bool) -> tuple[str, ...]:
+    """Return the names of the causes of idle time. `joins`: whether a stage of the unit has several inputs."""
+    return tuple(cause.name for cause in CAUSES if joins or not cause.joins)
 
 
 class FrameLeft(NamedTuple):
@@ -85,7 +118,7 @@ class _UnitBook:
     def __init__(self) -> None:
         self.state = STARVED
         self.since_ns = 0
-        self.totals = [0, 0, 0, 0, 0]
+        self.totals = [0] * (1 + len(NAMES))
         self.busy_ns = self.preempted_ns = 0
         self.last_end_ns = 0
         self.jobs = 0
@@ -108,18 +141,12 @@ class _UnitBook:
     def shares(self, joins: bool) -> dict[str, Any]:
         """Return the unit's row of the report. `joins`: whether one of its stages has several inputs."""
         total = sum(self.totals) or 1
-        assigned, starved, blocked, throttled, join = self.totals
-        idle = {
-            "starved": starved,
-            "blocked": blocked,
-            "throttled": throttled,
-            "preempted": self.preempted_ns,
-            "overhead": assigned - self.busy_ns - self.preempted_ns,
-            **({"join": join} if joins else {}),
-        }
+        idle = {name: self.totals[account] for account, name in NAMES.items()}
+        idle[PREEMPTED] = self.preempted_ns
+        idle[OVERHEAD] = self.totals[ASSIGNED] - self.busy_ns - self.preempted_ns
         return {
             "busy": self.busy_ns / total,
-            "idle": {cause: ns / total for cause, ns in idle.items()},
+            "idle": {cause: idle[cause] / total for cause in idle_causes(joins=joins)},
             "jobs": self.jobs,
             "restarts": self.restarts,
         }
@@ -129,8 +156,7 @@ class _UnitBook:
 class Books:
     """How a run is accounted for.
 
-    `target_period_ns`: longest frame time that counts as in time; it replaces the frames' own deadlines. 0: the frames'
-    own deadlines count.
+    `target_period_ns`: as for `trilane.scheduler.stats.due_ns`.
     `sketch`: function that makes a sketch, as for `trilane.scheduler.stats.Samples`.
     """
 
@@ -271,18 +297,16 @@ class Ledger:
         self.rungs[rung] += 1
         self.rung_switches += rung != self._rung and self.presented_count > 0
         self._rung = rung
-        target_ns = self._books.target_period_ns
-        if self.presented_count and not self._was_held:
-            self._between_ns += end_ns - self._last_ns
-            self._frame_times.add(end_ns - self._last_ns)
-            if target_ns:
-                self._lateness.add(end_ns - self._last_ns - target_ns)
+        before_ns = self._last_ns if self.presented_count and not self._was_held else None
+        if before_ns is not None:
+            self._between_ns += end_ns - before_ns
+            self._frame_times.add(end_ns - before_ns)
+        if (until_ns := due_ns(deadline_ns, before_ns, self._books.target_period_ns)) != NEVER:
+            self._lateness.add(end_ns - until_ns)
         self._last_ns, self._was_held = end_ns, self._is_held
         self.presented_count += 1
         if latency_ns >= 0:
             self._latency.add(latency_ns)
-        if deadline_ns != NEVER and not target_ns:
-            self._lateness.add(end_ns - deadline_ns)
         if self._books.sketch is None:
             self._keep(frame, end_ns, deadline_ns)
         if self.left is not None:

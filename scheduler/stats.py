@@ -23,6 +23,7 @@ from math import ceil, comb, exp, log, sqrt
 from statistics import fmean, stdev
 from typing import Final, Protocol
 
+from trilane.scheduler.events import NEVER
 from trilane.units import NS_PER_MS, NS_PER_S
 
 CONFIDENCE = 0.95
@@ -297,8 +298,20 @@ class FrameTimeSamples:
             self._block_frames *= 2
 
 
+def due_ns(deadline_ns: int, before_ns: int | None, target_period_ns: int) -> int:
+    """Return the time in ns after whose passing a frame is late; NEVER if nothing says when the frame is due.
+
+    `deadline_ns`: time of the frame's own deadline; NEVER without one.
+    `before_ns`: time at which the frame before it was presented; None if the time since then is no frame time.
+    `target_period_ns`: longest frame time that counts as in time; it replaces the deadlines. 0: the deadlines count.
+    """
+    if not target_period_ns:
+        return deadline_ns
+    return NEVER if before_ns is None else before_ns + target_period_ns
+
+
 class Lateness:
-    """How late frames were.
+    """How late frames were, by `due_ns`.
 
     `count`: number of frames that had a deadline.
     `missed`: number of frames that came after it.

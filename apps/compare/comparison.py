@@ -36,6 +36,7 @@ from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, chang
 from trilane.apps.explain.reasons import bound_text
 from trilane.apps.run.verdict import trust_of
 from trilane.errors import BadInputError
+from trilane.scheduler.ledger import CAUSES
 
 SCHEMA: Final = 1
 METHOD: Final = (
@@ -60,14 +61,7 @@ REASONS: Final = {
     ("policy", "latest"): "the newest pose wins under latest",
     ("policy", "deadline"): "late frames are dropped under deadline",
 }
-WAITS: Final = {
-    "starved": "is starved",
-    "blocked": "is blocked",
-    "throttled": "is held by its cap",
-    "preempted": "has no core",
-    "overhead": "waits for messages or its process",
-    "join": "waits for the other inputs of a frame",
-}
+WAITS: Final = {cause.name: cause.told for cause in CAUSES}
 DASH: Final = "–"
 IN_THOUSANDS: Final = 10_000
 

@@ -27,10 +27,10 @@ from trilane.apps.compare.difference import (
 )
 from trilane.apps.compare.run_frames import CPU, INSTRUCTION_TIME, INSTRUCTIONS, Key
 from trilane.apps.compare.sides import ComparedRun, RunKind, Side, changes
+from trilane.hw_profiles.schema import NORMAL_80
 from trilane.student import student_quantile
 from trilane.units import HOST_CLOCK
 
-Z_80: Final = 1.281552
 FRAME_TIME, LATENCY, WORK, SERVICE, WAIT, BUSY, IDLE = (
     "frame time", "latency", "work", "service", "wait", "busy", "idle",
 )  # fmt: skip
@@ -217,7 +217,7 @@ def _deviation_of(told: ComparedRun) -> float | None:
         return deviation
     times = told.document["frame_time_ms"]
     low, high, quantile = (
-        (times["low"], times["high"], Z_80)
+        (times["low"], times["high"], NORMAL_80)
         if told.kind is RunKind.PREDICTION
         else (times.get("mean_low"), times.get("mean_high"), student_quantile(inf))
     )

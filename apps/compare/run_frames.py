@@ -19,11 +19,10 @@ from trilane.arrays import F64, I64
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import Begun, Counted, Ended, Record, Worked, read_journal
 from trilane.pipeline.timeline import Presented, Timeline
-from trilane.pipeline.unit_history import BUSY, IDLE_CAUSES, JOIN, OVERHEAD, PREEMPTED, IdleSlice
-from trilane.scheduler.ledger import JobRecord
+from trilane.pipeline.unit_history import BUSY, JOIN, OVERHEAD, PREEMPTED, IdleSlice
+from trilane.scheduler.ledger import JobRecord, idle_causes
 from trilane.units import NS_PER_MS
 
-STATES = (BUSY, *IDLE_CAUSES)  # and JOIN, for a unit with a stage of several inputs
 INSTRUCTIONS, INSTRUCTION_TIME, CPU = "instructions", "time of an instruction", "CPU time"
 #: Metric of a stage in the journal -> measure of a series.
 REPORTED = {f"bytes_{name}": f"bytes {name.replace('_', ' ')}" for name in ("read", "written", "uploaded", "read_back")}
@@ -185,12 +184,10 @@ def _unit(
             pieces.append((piece.begin_ns, piece.end_ns, states))
     pieces.sort(key=lambda piece: piece[:2])
     weights = np.diff(end_ns) / NS_PER_MS
-    found = (*STATES, JOIN) if any(JOIN in parts for _, _, parts in pieces) else STATES
+    causes = idle_causes(joins=any(JOIN in parts for _, _, parts in pieces))
     return {
-        Key("busy" if state == BUSY else "idle", unit, "" if state == BUSY else state): Series(
-            frames[1:], _within(pieces, state, end_ns), weights
-        )
-        for state in found
+        key: Series(frames[1:], _within(pieces, state, end_ns), weights)
+        for key, state in [(Key("busy", unit), BUSY), *((Key("idle", unit, cause), cause) for cause in causes)]
     }
 
 

@@ -40,7 +40,8 @@ from trilane.apps.dashboard.view import (
 from trilane.apps.watch.followed_run import CUT_OFF, FollowedRun, RunState
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, Begun, Ended, Record, Stepped, journal_in, read_journal
-from trilane.pipeline.unit_history import IDLE_CAUSES, JOIN, UNEXPLAINED
+from trilane.pipeline.unit_history import UNEXPLAINED
+from trilane.scheduler.ledger import idle_causes
 
 FIRST_SPAN_MS: Final = 5000.0
 FIGURES_EVERY_MS: Final = 1000.0
@@ -49,7 +50,7 @@ MOST_IDLE: Final = 6000
 MOST_NOTES: Final = 100
 OVER: Final = "the run is over"
 NO_VIDEO: Final = "there are no pictures: video.mp4 is missing or cannot be read"
-CAUSE_NAMES: Final = (*IDLE_CAUSES, JOIN, UNEXPLAINED)
+CAUSE_NAMES: Final = (*idle_causes(joins=True), UNEXPLAINED)
 TIMES: Final = [("begin", "<f8"), ("end", "<f8")]
 JOB: Final = np.dtype([("unit", "u1"), ("stage", "u1"), ("frame", "<u4"), *TIMES, ("wait", "<f8")])
 IDLE: Final = np.dtype([("unit", "u1"), ("cause", "u1"), *TIMES])

@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import IO, Any, Final, Generic, TypeVar
 
 from trilane.apps.explain.trace_sinks import ChromeSink, FlowArrow, PacketSink, Sink
-from trilane.pipeline.journal import Begun, Ended, Record, Said, Sampled, Stepped, Worked, journal_of
+from trilane.pipeline.journal import Begun, Ended, Record, Said, Sampled, Stepped, Worked, journal_of, target_period_ns
 from trilane.pipeline.timeline import Gone, Presented, Timeline
 from trilane.pipeline.tracks import UNKNOWN
-from trilane.pipeline.unit_history import IDLE_CAUSES, JOIN, UNEXPLAINED, IdleSlice
+from trilane.pipeline.unit_history import UNEXPLAINED, IdleSlice
 from trilane.scheduler.events import NEVER, Graph
-from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.ledger import JobRecord, idle_causes
+from trilane.scheduler.stats import due_ns
 from trilane.scheduler.virtual import Simulation
 from trilane.writing import write_atomically
 
@@ -187,9 +188,10 @@ def write_predicted(runs: Mapping[str, Simulation], facts: Mapping[str, Any], ta
     `runs`: name of a group of tracks -> run. `facts`: facts that all runs have, as in `Begun`.
     """
     records: dict[str, Iterable[Record]] = {}
+    begun = {"clock": "virtual", "target_period_ns": 0, **facts}
     for name, run in runs.items():
         assert run.recording is not None
-        records[name] = journal_of(run.recording, run.jobs, {"clock": "virtual", **facts}, run.report)
+        records[name] = journal_of(run.recording, run.jobs, begun, run.report)
     with write_atomically(target) as draft, draft.open("wb") as file:
         write_tracks(PacketSink(file), records)
 
@@ -202,8 +204,7 @@ class _FrameTracks:
 
     def __init__(self, sink: Sink, begun: Begun, parent: int, rank: int) -> None:
         self._sink, self._parent = sink, parent
-        self._deadline_ns = begun.settings.deadline_ns
-        self._target_ns = 0 if self._deadline_ns else target_period_ns(begun)
+        self._settings, self._target_ns = begun.settings, target_period_ns(begun)
         self._ranks = {EXPECTED: rank, ACTUAL: rank + 1}
         self._lanes = {name: Lanes(MOST_LANES) for name in self._ranks}
         self._tracks: dict[tuple[str, int], int] = {}
@@ -216,12 +217,11 @@ class _FrameTracks:
         """Write a frame that has left the pipeline: presented, lost or dropped."""
         if isinstance(frame, Gone):
             if frame.frame != UNKNOWN:
-                self._expect(frame.frame, frame.release_ns)
+                self._expect(frame.frame, frame.release_ns, self._before_ns)
             notes = {"frame": frame.frame} if frame.frame != UNKNOWN else {}
             self._sink.instant(self._left_out, frame.at_ns, f"{frame.kind} {frame.cause}", notes)
             return
-        due_ns = self._expect(frame.frame, frame.release_ns)
-        late_ns = frame.end_ns - due_ns
+        late_ns = frame.end_ns - self._expect(frame.frame, frame.release_ns, frame.before_ns)
         name = f"late {frame.frame}" if late_ns > 0 else f"{frame.frame}"
         notes = {"late_us": late_ns // NS_PER_US} if late_ns > 0 else {}
         self._slice(ACTUAL, frame.release_ns, frame.end_ns, name, notes)
@@ -233,32 +233,22 @@ class _FrameTracks:
             self._flying = in_flight
             self._sink.count(self._in_flight, at_ns, self._flying)
 
-    def _expect(self, frame: int, release_ns: int) -> int:
+    def _expect(self, frame: int, release_ns: int, before_ns: int | None) -> int:
         """Write the slice of time in which a frame is expected, and return its end, when the frame is due.
 
-        Without a deadline and a rate, write nothing and return NEVER.
+        If nothing says when it is due, write nothing and return NEVER. `before_ns`: as for `due_ns`.
         """
-        if self._deadline_ns:
-            begin_ns, due_ns = release_ns, release_ns + self._deadline_ns
-        elif self._target_ns and self._before_ns is not None:
-            begin_ns, due_ns = self._before_ns, self._before_ns + self._target_ns
-        else:
-            return NEVER
-        self._slice(EXPECTED, begin_ns, due_ns, f"{frame}", {})
-        return due_ns
+        until_ns = due_ns(self._settings.due_from_ns(release_ns), before_ns, self._target_ns)
+        if until_ns != NEVER:
+            begin_ns = until_ns - self._target_ns if self._target_ns else release_ns
+            self._slice(EXPECTED, begin_ns, until_ns, f"{frame}", {})
+        return until_ns
 
     def _slice(self, name: str, begin_ns: int, end_ns: int, text: str, notes: dict[str, int]) -> None:
         lane, begin_ns = self._lanes[name].place(begin_ns, end_ns)
         if (name, lane) not in self._tracks:
             self._tracks[name, lane] = self._sink.track(name, self._parent, self._ranks[name])
         self._sink.slice(self._tracks[name, lane], begin_ns, end_ns, text, notes)
-
-
-def target_period_ns(begun: Begun) -> int:
-    """Return the frame time of the scene's rate in ns; 0 if the journal names no rate."""
-    scene = begun.facts.get("config", {}).get("scene", {})
-    fps = scene.get("fps") if isinstance(scene, dict) else None
-    return round(1e9 / fps) if isinstance(fps, int | float) and fps > 0 else 0
 
 
 class _UnitTracks:
@@ -270,8 +260,7 @@ class _UnitTracks:
 
     def __init__(self, sink: Sink, graph: Graph, parent: int, rank: int, flows_from: int = 1) -> None:
         self._sink, self._flows_from = sink, flows_from
-        causes = IDLE_CAUSES if graph.is_chain else (*IDLE_CAUSES, JOIN)
-        sink.recurring([*causes, UNEXPLAINED, *(stage.name for stage in graph.stages)])
+        sink.recurring([*idle_causes(joins=not graph.is_chain), UNEXPLAINED, *(stage.name for stage in graph.stages)])
         self._units = {unit: sink.track(unit, parent, rank + place) for place, unit in enumerate(graph.units)}
         self._tiles: dict[str, Tiles[JobRecord | IdleSlice]] = {unit: Tiles() for unit in graph.units}
         read = [graph.inputs_of(place) for place in range(len(graph.stages))]

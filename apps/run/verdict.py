@@ -86,8 +86,6 @@ def percent(share: float | None) -> str:
     return "unknown" if share is None else f"{100 * share:.1f} %" if share < 0.1 else f"{100 * share:.0f} %"
 
 
-#: Rate that a run must hold, in frames a second, if no option, scene or file states a rate.
-TARGET_FPS: Final = 30.0
 #: Largest share of late, dropped and lost frames in a run that passes: 99 of 100 frames are in time.
 MOST_LATE: Final = 0.01
 #: Smallest share of a unit's time for which the verdict names a cause of idle time.

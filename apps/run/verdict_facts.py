@@ -17,7 +17,6 @@ from trilane.apps.run.verdict import (
     LEAST_NAMED,
     MOST_OTHERS,
     SO_FAR,
-    TARGET_FPS,
     UNKNOWN,
     Facts,
     LateFrames,
@@ -32,7 +31,7 @@ from trilane.apps.run.verdict import (
 )
 from trilane.hw_profiles.rates import wanted_drops
 from trilane.scheduler.policy import POLICIES
-from trilane.units import NO_FIGURES
+from trilane.units import NO_FIGURES, TARGET_FPS
 
 if TYPE_CHECKING:
     from trilane.apps.run.report import Report

@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple
 
 from trilane.apps.run.report import read_report
 from trilane.apps.run.verdict import judged
-from trilane.apps.run.verdict_facts import facts_of, target_fps, verdict_of
+from trilane.apps.run.verdict_facts import facts_of, verdict_of
 from trilane.apps.watch.figures import (
     DropCount,
     FrameFigures,
@@ -41,13 +41,14 @@ from trilane.pipeline.journal import (
     Stepped,
     Worked,
     config_of,
+    target_period_ns,
 )
 from trilane.pipeline.reckoning import Reckoning, places_of
 from trilane.pipeline.timeline import EndedJob, ExplainedJob, Presented, Timeline
-from trilane.pipeline.unit_history import BUSY, IDLE_CAUSES, JOIN, NAMES, OVERHEAD, PREEMPTED
+from trilane.pipeline.unit_history import BUSY, JOIN, OVERHEAD, PREEMPTED
 from trilane.scheduler.events import NEVER, Finish, JobDone, Start
-from trilane.scheduler.ledger import STARVED
-from trilane.scheduler.stats import summary_ms
+from trilane.scheduler.ledger import NAMES, STARVED, idle_causes
+from trilane.scheduler.stats import due_ns, summary_ms
 from trilane.units import COMPUTED, MEASURED, NS_PER_MS, NS_PER_S
 
 WINDOW_NS: Final = 5_000_000_000
@@ -88,7 +89,7 @@ class LiveFigures:
         self._begun = begun
         self._bound: Mapping[str, Any] | None = None
         self._report: Mapping[str, Any] | None = None
-        self._late, self._target_ns = 0, NS_PER_S / target_fps({"config": config_of(begun)})
+        self._late, self._target_ns = 0, target_period_ns(begun)
         self._first_ns: int | None = None
         self._last_ns = 0
         self._finished_ns = NEVER
@@ -222,11 +223,8 @@ class LiveFigures:
             self._intervals += 1
         if presented.latency_ns is not None:
             self._latencies.add(presented.latency_ns)
-        deadline_ns = self._settings.deadline_ns
-        if deadline_ns:
-            self._late += presented.end_ns > presented.release_ns + deadline_ns
-        elif presented.interval_ns is not None:
-            self._late += presented.interval_ns > self._target_ns
+        deadline_ns = self._settings.due_from_ns(presented.release_ns)
+        self._late += presented.end_ns > due_ns(deadline_ns, presented.before_ns, self._target_ns)
         self._recent.append(presented)
         while self._recent[0].end_ns < presented.end_ns - WINDOW_NS:
             self._recent.popleft()
@@ -416,7 +414,7 @@ class _UnitTime:
 
 
 def _shares(sums: Mapping[str, int], total_ns: int) -> Shares:
-    causes = (*IDLE_CAUSES, JOIN) if sums[JOIN] else IDLE_CAUSES
+    causes = idle_causes(joins=sums[JOIN] > 0)
     if total_ns <= 0:
         return Shares(0.0, dict.fromkeys(causes, 0.0))
     overhead_ns = max(sums[ASSIGNED] - sums[BUSY] - sums[PREEMPTED], 0)  # rounding of cut spans may make it negative

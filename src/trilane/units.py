@@ -10,6 +10,8 @@ from typing import Literal, get_args
 
 #: Nanoseconds in a millisecond and in a second.
 NS_PER_MS, NS_PER_S = 1e6, 1e9
+#: Rate that a run must hold, in frames a second, if no option, scene or file states a rate.
+TARGET_FPS = 30.0
 #: Longest virtual time of a prediction, minutes.
 MAX_MINUTES = 24 * 60
 

@@ -11,14 +11,15 @@ from typing import Any
 
 from trilane.pipeline.journal import records_of
 from trilane.pipeline.timeline import Timeline
-from trilane.pipeline.unit_history import BUSY, IDLE_CAUSES, OVERHEAD, PREEMPTED, UNEXPLAINED, IdleSlice
+from trilane.pipeline.unit_history import BUSY, OVERHEAD, PREEMPTED, UNEXPLAINED, IdleSlice
 from trilane.scheduler.events import Event, Graph, SetDuty, Settings, StageSpec
-from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.ledger import JobRecord, idle_causes
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.virtual import Simulation, simulate
 
 MS = 1_000_000
+CAUSES = idle_causes(joins=False)
 EDGES = ("single", "double", "triple", "fifo:1", "fifo:3", "orphan", "orphan:4")
 UNITS = ("a", "b", "c")
 
@@ -40,12 +41,10 @@ def second_accounts(recording: Recording, jobs: Iterable[JobRecord]) -> dict[str
     parts += [(job.unit, BUSY, job.end_ns - job.begin_ns - job.preempted_ns - job.asleep_ns) for job in ended]
     parts += [(piece.unit, PREEMPTED, piece.preempted_ns) for piece in slices]
     parts += [(piece.unit, piece.cause, piece.end_ns - piece.begin_ns - piece.preempted_ns) for piece in slices]
-    sums = {unit: dict.fromkeys((BUSY, *IDLE_CAUSES, UNEXPLAINED), 0) for unit, _, _ in parts}
+    sums = {unit: dict.fromkeys((BUSY, *CAUSES, UNEXPLAINED), 0) for unit, _, _ in parts}
     for unit, cause, ns in parts:
         sums[unit][cause] += ns
-    return {
-        unit: {cause: row[cause] / max(total_ns, 1) for cause in (BUSY, *IDLE_CAUSES)} for unit, row in sums.items()
-    }
+    return {unit: {cause: row[cause] / max(total_ns, 1) for cause in (BUSY, *CAUSES)} for unit, row in sums.items()}
 
 
 def largest_difference(units: Mapping[str, Mapping[str, Any]], second: Mapping[str, Mapping[str, float]]) -> float:

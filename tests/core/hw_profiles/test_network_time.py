@@ -17,7 +17,7 @@ from trilane.hw_profiles.operators import NAMES, EngineLayer, Layers
 from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
 from trilane.hw_profiles.schema import Profile, Quantity, corners_of
-from trilane.hw_profiles.unit_times import layer_times, relative_error, time_on, unsure
+from trilane.hw_profiles.unit_times import layer_times, relative_error, stated_error, time_on, unsure
 
 CHIP = load_profile("snapdragon-888")
 TOP = corners_of(CHIP, "burst")
@@ -236,5 +236,8 @@ def test_a_precision_whose_speed_nobody_states_is_said_and_less_certain() -> Non
     profile = CHIP.model_copy(update={"units": {**CHIP.units, "dsp": dsp}})
     around = interval(profile, work, price(profile, work, "dsp", TOP))
     assert around.why[-1] == "it does not know how fast its dsp is in fp32: 0.1 TMAC/s are assumed"
-    stated = relative_error(time_on(dsp, profile.memory, work), dsp)
-    assert spread_of(around) == pytest.approx(math.hypot(stated, 1.0))
+    job = time_on(dsp, profile.memory, work)
+    stated = stated_error(job, dsp)
+    assert spread_of(around) == pytest.approx(relative_error(job, dsp)) == pytest.approx(math.hypot(stated, 1.0))
+    known = CHIP.units["dsp"]
+    assert relative_error(job, known) == stated_error(job, known)

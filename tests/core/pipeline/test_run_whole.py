@@ -166,6 +166,7 @@ def test_a_run_with_a_journal_keeps_nothing_and_writes_the_same(world: World, tm
     assert isinstance(begun, Begun)
     assert (begun.graph, begun.settings, begun.facts["made"]) == (PIPELINE.graph(), kept.recording.settings, "today")
     assert (begun.facts["clock"], begun.facts["began_at"][-6:]) == ("host", "+00:00")
+    assert begun.facts["target_period_ns"] == round(1e9 / 30)
     assert [tuple(each) for each in records if isinstance(each, Stepped)] == kept.recording.steps
     assert [tuple(each) for each in records if isinstance(each, Accounted)] == kept.recording.accounts
     assert sorted(each.job for each in records if isinstance(each, Worked)) == sorted(kept.jobs)

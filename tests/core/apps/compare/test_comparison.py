@@ -15,7 +15,7 @@ import pytest
 from support.compared_runs import simulated, write_run
 from support.run_report import make_report
 from trilane.apps.compare import run_frames
-from trilane.apps.compare.comparison import NO_DIFFERENCE, TOO_FEW, WAITS, Comparison, compare, document
+from trilane.apps.compare.comparison import NO_DIFFERENCE, TOO_FEW, Comparison, compare, document
 from trilane.apps.compare.difference import Chance, Finding
 from trilane.apps.compare.gate import GatedPair, LimitOutcome, judge, read_gate, whole
 from trilane.apps.compare.page import page
@@ -24,7 +24,6 @@ from trilane.apps.compare.run_frames import Key, frames_of
 from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, changes, read_side, read_told
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, JournalWriter, Worked, journal_of
-from trilane.pipeline.run_metrics import IdleShares
 from trilane.scheduler.virtual import Simulation
 
 Make = Callable[..., Path]
@@ -500,7 +499,3 @@ def test_no_pipe_and_no_device_is_read(make: Make, name: str, kind: str) -> None
     for given in (folder, folder / name) if name == "report.json" else (folder,):
         with pytest.raises(BadInputError, match="a device, a pipe or a socket"):
             read_side(str(given))
-
-
-def test_every_cause_of_idleness_has_words() -> None:
-    assert set(WAITS) == set(IdleShares.model_fields)
