@@ -48,6 +48,14 @@ class _Model(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+class _Figures(_Model):
+    """Figures of which some may not be measured: these are None and not written."""
+
+    @model_serializer(mode="wrap")
+    def _known(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        return {key: value for key, value in write(self).items() if value is not None}
+
+
 class ByteRange(_Model):
     """How bytes stand for real numbers: `real = (q - zero_point) * scale`, q in 0..255."""
 
@@ -109,7 +117,7 @@ class SeedFigures(_Model):
     least_psnr_db: Finite
 
 
-class AccuracyFigures(_Model):
+class AccuracyFigures(_Figures):
     """Image error of one network on one runtime, on poses and views that were not trained on.
 
     `psnr_db_by_band`: mean PSNR in dB, in front of random backgrounds, inside the bounding box of the true mask.
@@ -146,10 +154,6 @@ class AccuracyFigures(_Model):
             raise ValueError("'worst' needs 'by_seed' and 'samples' beside it")
         return self
 
-    @model_serializer(mode="wrap")
-    def _known(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        return {key: value for key, value in write(self).items() if value is not None}
-
 
 class MadeWith(_Model):
     """The software that measured the figures.
@@ -166,12 +170,17 @@ class MadeWith(_Model):
     runtimes: dict[str, str]
 
 
-class BySize(_Model):
-    """The loss by smaller tensors: the same views are painted at several tensor sizes, then enlarged to the first size.
+#: Side in pixels of a square with as many pixels as a rectangle.
+Side = Annotated[int, Field(ge=8, le=4096)]
+
+
+class BySize(_Figures):
+    """Image error by size of the tensor, at the density of the picture: the planner's table.
 
     `date`: date in UTC. `runtime`: runtime that ran the network. `seed`, `per_band`, `held_out`: choice of the views.
-    `psnr_db`: mean PSNR in dB inside the bounding box of the true mask, by HEIGHTxWIDTH of the tensor; the network's
-    own size comes first.
+    `psnr_db_by_picture`: for bodies that cover side x side pixels of the picture, and tensors of side x side pixels:
+    mean PSNR in dB inside the bounding box of the true mask, by the two sides. All rows have the same tensors.
+    `psnr_db`: what an older Trilane measured instead: PSNR by HEIGHTxWIDTH of the tensor, the network's own size first.
     """
 
     date: Day
@@ -179,7 +188,21 @@ class BySize(_Model):
     seed: int
     per_band: int = Field(ge=1)
     held_out: tuple[str, ...]
-    psnr_db: dict[Annotated[str, Field(pattern=r"^[0-9]{1,4}x[0-9]{1,4}$")], Finite] = Field(min_length=1)
+    psnr_db: dict[Annotated[str, Field(pattern=r"^[0-9]{1,4}x[0-9]{1,4}$")], Finite] | None = Field(
+        default=None, min_length=1
+    )
+    psnr_db_by_picture: dict[Side, Annotated[dict[Side, Finite], Field(min_length=2)]] | None = Field(
+        default=None, min_length=1
+    )
+
+    @model_validator(mode="after")
+    def _one_of_both(self) -> Self:
+        if (self.psnr_db is None) == (self.psnr_db_by_picture is None):
+            raise ValueError("one of 'psnr_db_by_picture' and 'psnr_db' is needed")
+        rows = list((self.psnr_db_by_picture or {}).values())
+        if any(row.keys() != rows[0].keys() for row in rows):
+            raise ValueError("'psnr_db_by_picture' needs the same tensors in all rows")
+        return self
 
 
 #: Figures that a validation repeats at its top level; they are those of its `runtime`.
@@ -198,7 +221,7 @@ class Validation(AccuracyFigures):
     `other_runtimes`: figures of more runtimes, by name.
     `size`: tensor size, as `trilane run --size` takes it.
     `texture_filter`: filter of the neural texture.
-    `by_size`: loss of quality by smaller tensors; None if it was not measured.
+    `by_size`: image error by tensor size; None if it was not measured.
     More keys: `per_band`, number of views of each band and seed; `held_out`, origin of each motion, by name; `float`,
     figures of the network before it was quantised; `psnr_loss_db`, loss of PSNR by quantising, by band.
     """

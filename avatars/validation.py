@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from trilane.arrays import parse_shape
 from trilane.avatars.bundle import BUILT_IN, Bundle, bundle_folder
 from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation, digests_of, figures_digest
@@ -163,23 +165,30 @@ def name_of(folder: Path) -> str:
     return next(known, str(folder))
 
 
-# The loss of an avatar in smaller tensors than its network was trained for. Rule: the loss comes from the avatar's
-# validation, or there is no figure.
+# The tensor sizes that an avatar needs, and its loss in smaller ones. Rule: they come from the avatar's validation, or
+# there are none.
 
-WHOLE = 1000  # pixels of a tensor of the network's own size, in thousandths
+WHOLE = 1000  # pixels of a tensor of the full size, in thousandths
 DIGITS = 2
+#: A tensor is large enough for a body if it loses at most this much of the PSNR at the best measured size, in dB.
+TOLERANCE_DB = 0.3
+#: Work of the smaller tensors whose loss is told: 3/4 and 1/2 of the sides.
+WORKS = (563, 250)
 
 
 @dataclass(frozen=True)
 class SizeLoss:
-    """The loss of an avatar in smaller tensors.
+    """The tensor sizes that an avatar needs, and its loss in smaller tensors.
 
     `source`: source of the figures; without figures, why there are none and which command measures them.
-    `by_work`: loss of PSNR in dB, by the tensor's pixels in thousandths of the largest; empty without figures.
+    `by_work`: loss of PSNR in dB, by the tensor's pixels in thousandths of the full size; empty without figures.
+    `curve`: full size, in pixels of the tensor by pixels of the picture that the body covers, see `curve_of`. If it is
+    empty, the full size is the network's own.
     """
 
     source: str
     by_work: Mapping[int, float]
+    curve: tuple[tuple[int, int], ...] = ()
 
     def at(self, work: int) -> float | None:
         """Return the loss in dB of a tensor with `work` thousandths of the pixels; 0 for a tensor of the full size.
@@ -199,9 +208,59 @@ def size_loss(bundle: Bundle) -> SizeLoss:
     if validation is None or refused(bundle):
         how = f"`{VALIDATE} {name_of(bundle.folder)}` first, then {measures}"
         return SizeLoss(f"avatar {name}: {NO_FIGURES} by tensor size, for it has no valid validation: {how}", {})
-    if validation.by_size is None:
+    by_size = validation.by_size
+    if by_size is None:
         return SizeLoss(f"avatar {name}: {NO_FIGURES} by tensor size; {measures}", {})
-    pixels = {math.prod(parse_shape(size)): psnr for size, psnr in validation.by_size.psnr_db.items()}
+    source = f"{from_validation(by_size.date)}, by tensor size"
+    if by_size.psnr_db_by_picture is not None:
+        table = by_size.psnr_db_by_picture
+        return SizeLoss(source, {WHOLE: 0.0, **_losses(table)}, curve_of(table))
+    pixels = {math.prod(parse_shape(size)): psnr for size, psnr in (by_size.psnr_db or {}).items()}
     own = max(pixels)
     losses = {WHOLE * count // own: round(pixels[own] - psnr, DIGITS) for count, psnr in pixels.items()}
-    return SizeLoss(f"{from_validation(validation.by_size.date)}, by tensor size", losses)
+    return SizeLoss(source, losses)
+
+
+def curve_of(table: Mapping[int, Mapping[int, float]]) -> tuple[tuple[int, int], ...]:
+    """Return the smallest tensor that is large enough by `table`, as (pixels of the picture, pixels of the tensor).
+
+    A larger body never has a smaller tensor than a smaller body.
+
+    `table`: PSNR in dB, as `BySize.psnr_db_by_picture`.
+    """
+    curve: list[tuple[int, int]] = []
+    for side in sorted(table):
+        row = sorted(table[side].items())
+        enough = max(psnr for _, psnr in row) - TOLERANCE_DB
+        at = next(number for number, (_, psnr) in enumerate(row) if psnr >= enough)
+        (low, below), (high, above) = row[max(at - 1, 0)], row[at]
+        part = (enough - below) / (above - below) if at else 1.0
+        pixels = math.ceil((low * (high / low) ** part) ** 2)
+        curve.append((side * side, max(pixels, curve[-1][1] if curve else 0)))
+    return tuple(curve)
+
+
+def psnr_at(row: Mapping[int, float], pixels: float) -> float | None:
+    """Return the PSNR in dB of a tensor of `pixels`, interpolated in their logarithm; None for one beyond `row`."""
+    sides = sorted(row)
+    if not sides[0] ** 2 <= pixels <= sides[-1] ** 2:
+        return None
+    return float(np.interp(math.log(pixels) / 2, [math.log(side) for side in sides], [row[side] for side in sides]))
+
+
+def _losses(table: Mapping[int, Mapping[int, float]]) -> dict[int, float]:
+    """Return the mean loss over the bodies of `table`, by work; a work that was not measured for any body is left out.
+
+    A smaller tensor never counts as better.
+    """
+    losses = {}
+    for work in WORKS:
+        found = [
+            max(whole - less, 0.0)
+            for (_, pixels), side in zip(curve_of(table), sorted(table), strict=True)
+            if (whole := psnr_at(table[side], pixels)) is not None
+            and (less := psnr_at(table[side], pixels * work / WHOLE)) is not None
+        ]
+        if found:
+            losses[work] = round(sum(found) / len(found), DIGITS)
+    return losses

@@ -360,6 +360,11 @@ def tight_shape(rects: Sequence[Rect], output: Shape, density: float = 1.0, marg
     return min(shapes, key=lambda shape: (max(shape) > MOST_ASPECT * min(shape), shape[0] * shape[1], max(shape)))
 
 
+def covered(rect: Rect, output: Shape) -> int:
+    """Return the number of pixels of a picture of `output` (height, width) that `rect` touches."""
+    return math.prod(_pixels(on_grid(rect, output), output))
+
+
 def _pixels(rect: Rect, output: Shape) -> tuple[int, int]:
     """Return (height, width) in pixels of a rectangle on the pixel grid of a picture of `output`."""
     return round(rect.height * output[0] / 2), round(rect.width * output[1] / 2)

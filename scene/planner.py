@@ -8,6 +8,9 @@ number of pixels for which its network was trained. A body with more pixels on t
 detail. Such a body gets up to `MOST_GROWTH` times that number. A body so far away that its tensor would be denser than
 `MOST_DENSITY` gets fewer pixels (docs/decisions/planner.md has the figures).
 
+If the error of the avatars was measured by size of body and tensor, the measured curve takes the place of this rule: it
+has the fewest pixels with which a body of each size is painted nearly as well as possible.
+
 Avatars of different networks have separate tensors of one shape. The network that needs the most pixels sets a frame's
 budget, and the least dense tensor sets its density.
 
@@ -33,7 +36,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import IntEnum
 from itertools import combinations, pairwise
 from typing import NamedTuple
@@ -41,6 +44,7 @@ from typing import NamedTuple
 from trilane.arrays import Floats, Shape, shapes_within
 from trilane.errors import BadInputError
 from trilane.scene.crop import DenseLayout, Rect, apart, by_network, lay_out_at, tight_shape
+from trilane.scene.tensor_budget import TensorBudget, area
 
 
 class FrameWork(IntEnum):
@@ -75,8 +79,6 @@ def work_of(
     return FrameWork.FULL
 
 
-#: Largest density, tensor pixels per picture pixel along a side: with more, the picture is no nearer to the truth.
-MOST_DENSITY = 2.25
 #: A density counts as good if it is at least this share of the best density.
 AS_GOOD = 0.95
 #: Cost of a visible change of shape, in pixels of this many frames; also the number of frames in which a smaller shape
@@ -86,51 +88,6 @@ PATIENCE = 10
 FAST = 0.01
 #: A change of the density by this factor makes a change of shape twice as visible.
 DENSITY_STEP = 1.25
-#: Most pixels of an avatar, as a multiple of those for which its network was trained: sides of 5/4.
-MOST_GROWTH = 25 / 16
-#: Sides of a tensor, as shares of the sides for which its network was trained. The smaller ones are for frames that
-#: would be late, and for error budgets.
-SIDES = (1.0, 0.75, 0.5)
-ALL_WORK = 1000
-
-
-def work_of_side(side: float) -> int:
-    """Return the work, in thousandths of all pixels, of a tensor whose sides are scaled by `side`."""
-    return math.ceil(ALL_WORK * side * side)
-
-
-@dataclass(frozen=True)
-class TensorBudget:
-    """The number of pixels that a tensor may have.
-
-    `own`: pixels for which the network was trained, per avatar.
-    `most`: most pixels of all avatars together.
-    `work`: thousandths of these pixels that are allowed.
-    """
-
-    own: int
-    most: int
-    work: int = ALL_WORK
-
-    def scaled(self, work: int) -> TensorBudget:
-        """Return this budget with `work` thousandths of the pixels allowed."""
-        return replace(self, work=work)
-
-    def most_of(self, avatars: int) -> int:
-        """Return the most pixels for `avatars` visible avatars, whatever their size on the picture."""
-        return self._allowed(avatars * self.own * MOST_GROWTH)
-
-    def of(self, rects: Sequence[Rect], output: Shape) -> int:
-        """Return the pixels for the avatars at `rects` on a picture of `output` (height, width).
-
-        They get the pixels for which the network was trained, or as many as the picture shows if that is more. The
-        result is limited by `most_of` and `work`.
-        """
-        own = len(rects) * self.own
-        return min(self._allowed(max(own, area(tight_shape(rects, output)))), self.most_of(len(rects)))
-
-    def _allowed(self, pixels: float) -> int:
-        return int(min(pixels, self.most)) * self.work // ALL_WORK
 
 
 @dataclass(frozen=True)
@@ -232,9 +189,15 @@ def pixels_of(rects: Sequence[Rect], networks: Sequence[int], output: Shape, bud
     return max(budget.of(own, output) for own in _grouped(rects, networks))
 
 
-def _dense(rects: Sequence[Rect], networks: Sequence[int], output: Shape, shape: Shape) -> DenseLayout | None:
+def _dense(
+    rects: Sequence[Rect], networks: Sequence[int], output: Shape, shape: Shape, budget: TensorBudget
+) -> DenseLayout | None:
     """Return the densest layout in tensors of `shape`, one per network; None if there is no room for all avatars."""
-    return apart(rects, networks or [0] * len(rects), lambda own: lay_out_at(own, output, shape, MOST_DENSITY))
+
+    def lay(own: Sequence[Rect]) -> DenseLayout | None:
+        return lay_out_at(own, output, shape, budget.density(own, output))
+
+    return apart(rects, networks or [0] * len(rects), lay)
 
 
 def _fits(
@@ -248,7 +211,7 @@ def _fits(
     most = budget.most_of(max(map(len, _grouped(rects, networks))))
     pixels = pixels_of(rects, networks, output, budget)
     allowed = [shape for shape in shapes if area(shape) <= most] or shapes
-    fits = {shape: fit for shape in allowed if (fit := _dense(rects, networks, output, shape)) is not None}
+    fits = {shape: fit for shape in allowed if (fit := _dense(rects, networks, output, shape, budget)) is not None}
     within = [fit.density for shape, fit in fits.items() if area(shape) <= pixels]
     enough = AS_GOOD * max(within or [fit.density for fit in fits.values()], default=0.0)
     return fits, [shape for shape, fit in fits.items() if fit.density >= enough]
@@ -364,17 +327,12 @@ def ideal_shape(rects: Sequence[Rect], output: Shape, budget: TensorBudget, netw
     `networks`: number of the network of each avatar at `rects`; empty if one network paints all.
     """
     pixels = pixels_of(rects, networks, output, budget)
-    tight = [tight_shape(own, output, MOST_DENSITY) for own in _grouped(rects, networks)]
+    tight = [tight_shape(own, output, budget.density(own, output)) for own in _grouped(rects, networks)]
     shapes = [*shapes_within(pixels), *(shape for shape in tight if area(shape) <= pixels)]
-    fits = [(fit.density, shape) for shape in shapes if (fit := _dense(rects, networks, output, shape))]
+    fits = [(fit.density, shape) for shape in shapes if (fit := _dense(rects, networks, output, shape, budget))]
     if not fits:
         return max(shapes, key=area)
     return max(fits, key=lambda one: (one[0], -area(one[1]), one[1]))[1]
-
-
-def area(shape: Shape) -> int:
-    """Return the number of pixels of a tensor of `shape`."""
-    return shape[0] * shape[1]
 
 
 MOST_SHAPES = 10

@@ -19,8 +19,8 @@ from trilane.arrays import F32, U8, Shape, shape_buckets
 from trilane.body.joints import JOINTS, POSE_FEATURES
 from trilane.errors import BadInputError
 from trilane.pipeline.description import UnitSettings
-from trilane.scene.planner import ALL_WORK, TensorBudget
 from trilane.scene.schema import Scene, StrictModel
+from trilane.scene.tensor_budget import ALL_WORK, Curve, TensorBudget
 from trilane.transport.live_window import LiveWindow
 from trilane.transport.packets import header_dtype
 from trilane.unexpected_value import UnexpectedValue
@@ -140,6 +140,8 @@ class RunConfig(StrictModel):
     `changes`: for each of `works`, pairs of a time in seconds at which a planned tensor changes, and its shape from
     then on; empty if the changes were not foreseen.
     `own_pixels`: number of pixels of the tensor with which the network was trained.
+    `size_curves`: measured tensor pixels of each avatar, by the picture's pixels that its body covers; empty if one of
+    them was not measured.
     `works`: sizes of a planned tensor in thousandths of `own_pixels`, the largest first. The run steps down to smaller
     ones if frames would be late.
     `record`: whether the frames are encoded to a video.
@@ -159,6 +161,7 @@ class RunConfig(StrictModel):
     shapes: tuple[Shape, ...] = ()
     changes: tuple[tuple[tuple[float, Shape], ...], ...] = ()
     own_pixels: int = 0
+    size_curves: tuple[Curve, ...] = ()
     works: tuple[int, ...] = (ALL_WORK,)
     record: bool = True
     posed_vertices: tuple[int, ...] = ()
@@ -187,7 +190,7 @@ class RunConfig(StrictModel):
     @property
     def tensor_budgets(self) -> tuple[TensorBudget, ...]:
         """The budget of a planned tensor for each of `works`."""
-        whole = TensorBudget(self.own_pixels, self.scene.most_side**2)
+        whole = TensorBudget(self.own_pixels, self.scene.most_side**2, curves=self.size_curves)
         return tuple(whole.scaled(work) for work in self.works)
 
     @property

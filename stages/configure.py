@@ -25,9 +25,9 @@ from trilane.hw_profiles.profile_files import load_profile
 from trilane.machine import shortage
 from trilane.pipeline.memory import Assets
 from trilane.scene.footage import Footage
-from trilane.scene.planner import TensorBudget
 from trilane.scene.schema import BUILT_IN_PREFIX, FILE_KEYS, Scene, find_scene, load_scene, located, scene_from
 from trilane.scene.staging import Staged, require_person, stage_scene
+from trilane.scene.tensor_budget import TensorBudget
 from trilane.stages.avatar_assets import AvatarData, load_avatar, networks_of_avatars, pack_assets
 from trilane.stages.config import NetworkCut, RunConfig
 from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
@@ -151,8 +151,9 @@ def configure(
     cuts = requested_cuts(options.split, list(networks.values()))
     unit, why = skinning_unit(options.skinning, gl)
     own = max(network.shape[1] * network.shape[2] for network in networks.values())
-    whole = TensorBudget(own, scene.most_side**2)
     losses = tuple(size_loss(avatar.bundle) for avatar in avatars.values())
+    curves = tuple(loss.curve for loss in losses) if all(loss.curve for loss in losses) else ()
+    whole = TensorBudget(own, scene.most_side**2, curves=curves)
     works, sizes = tensor_works(scene, options.policy, losses)
     budgets = [whole.scaled(work) for work in works]
     painters = tuple(numbers[folder] for folder in folders) if len(networks) > 1 else ()
@@ -168,6 +169,7 @@ def configure(
         shapes=foreseen.shapes.shapes if foreseen else (),
         changes=foreseen.changes if foreseen else (),
         own_pixels=whole.own,
+        size_curves=whole.curves,
         works=works,
         posed_vertices=tuple(len(avatars[folder].shaped.vertices) for folder in folders) if unit == "cpu" else (),
         cuts=cuts,

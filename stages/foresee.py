@@ -26,24 +26,20 @@ from trilane.body.joints import Skeleton
 from trilane.errors import BadInputError
 from trilane.scene.crop import Rect
 from trilane.scene.planner import (
-    ALL_WORK,
     MOST_SHAPES,
-    SIDES,
     Demand,
     LookAhead,
     ShapeSet,
-    TensorBudget,
-    area,
     choose_shapes,
     foreseen_changes,
     ideal_shape,
     joined,
     larger_shapes,
     pixels_of,
-    work_of_side,
 )
 from trilane.scene.schema import Scene
 from trilane.scene.staging import Staged
+from trilane.scene.tensor_budget import ALL_WORK, SIDES, TensorBudget, area, work_of_side
 from trilane.scheduler.policy import policy_named
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 

@@ -15,7 +15,7 @@ import moderngl
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import F32, F64, U8, Floats
+from trilane.arrays import F32, F64, U8, Floats, Shape
 from trilane.body.body import ShapedBody
 from trilane.body.joints import Skeleton
 from trilane.body.skinning import largest_weights
@@ -99,6 +99,12 @@ class SampleRenderer:
     def training_sample(self, seed: Sequence[int], band: str, density: float) -> Sample:
         """Return the planned sample of `seed` in a random pose, see `plan`."""
         return self.plan(seed, random_pose, band, density)
+
+    def crop(self, sample: Sample, buckets: Sequence[Shape]) -> Crop:
+        """Return the crop of `sample` in one of the tensor shapes `buckets`."""
+        crop = self.cropper.crop(self.skeleton.pose(sample.pose), sample.view, buckets)
+        assert crop is not None  # a planned sample is seen
+        return crop
 
     def placed(self, sample: Sample) -> tuple[F64, Placement]:
         """Return the view matrix (4,4) of `sample`, and the placement of its body for the GPU unit's packed pass.

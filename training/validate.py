@@ -6,6 +6,7 @@ read.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,10 +17,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trilane import machine
-from trilane.arrays import BUCKET_STEP, F64, U8, Shape
+from trilane.arrays import F64, U8, Shape, shapes_within
 from trilane.avatars.bundle import Bundle, write_manifest
 from trilane.avatars.manifest import (
     AT_THE_TOP,
+    Band,
     BySize,
     MadeWith,
     Validation,
@@ -30,16 +32,17 @@ from trilane.avatars.manifest import (
 from trilane.avatars.network_file import reshaped
 from trilane.scene.motion.files import load_motion
 from trilane.scene.motion.motion import Motion
-from trilane.scene.planner import SIDES
 from trilane.scene.schema import AvatarSpec
 from trilane.stages.config import Quantisation
 from trilane.stages.dsp.runtime import RuntimeOptions, Session, load_runtime
+from trilane.stages.gpu.composite_painters import taps_of
 from trilane.stages.gpu.raster import PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.stages.machine_facts import package_version
 from trilane.training.clothing import look_of
 from trilane.training.dataset import VALIDATION_SIZE, plan_validation
 from trilane.training.image_error import SIDE, ImageError, SampleError, image_error, over, scenes, summary
+from trilane.training.random_views import OUTPUT_ROWS, Crop, View
 from trilane.training.sample_renderer import BAND_NAMES, Sample, SampleRenderer
 
 # Evaluates an avatar on held-out samples: compares every painter's picture of a sample with the ground truth.
@@ -259,58 +262,73 @@ def _origin(motion: str) -> str:
     return "built in" if motion.startswith("builtin:") else f"sha256 {sha256_of([Path(motion)])}"
 
 
-# The loss of quality by smaller tensors: the same views, painted at several tensor sizes.
+# The image error by size of body and tensor: the same views, painted at several tensor sizes.
 #
-# Rule: a smaller picture is enlarged to the size of the largest one as the composite stage does: bilinearly, in linear
-# light, with premultiplied alpha. All pictures are then compared with the same ground truth.
+# Rule: a tensor is shown on the picture as the composite stage does it: bilinear reads, averaged over the pixel, in
+# linear light, with premultiplied alpha. All tensors are compared with the same ground truth, which has the picture's
+# pixels.
 
 DIGITS = 2
-
-
-def sizes_of(own: Shape) -> list[Shape]:
-    """Return the tensor shapes at which the planner may run a network, largest first, each once.
-
-    `own`: (height, width) of the network's own tensor, which is the first result. Sides are multiples of `BUCKET_STEP`.
-    """
-    return list(dict.fromkeys((_stepped(own[0] * side), _stepped(own[1] * side)) for side in SIDES))
-
-
-def _stepped(side: float) -> int:
-    return max(int(side) // BUCKET_STEP, 1) * BUCKET_STEP
+#: Sides of squares with as many pixels as the tensor may have. The largest is 5/4 of a network's usual 256.
+TENSOR_SIDES = (48, 64, 96, 128, 160, 192, 256, 320)
+#: Sides of squares with as many pixels of the picture as the body covers, and the band of their views: in pictures of
+#: 480 to 720 rows, most bodies of that size are seen so.
+PICTURE_SIDES: dict[int, Band] = {
+    64: "far",
+    96: "far",
+    128: "far",
+    192: "full_body",
+    256: "full_body",
+    384: "upper_body",
+}
+#: The integer network's painter draws its input itself.
+NO_UV = np.empty((0, 0, 3), np.float32)
 
 
 def measure_sizes(
     bundle: Bundle, plan: ValidationPlan, renderer: SampleRenderer, look: Callable[[], None] = lambda: None
 ) -> BySize:
-    """Measure the image error of `bundle` by tensor size.
+    """Measure the image error of `bundle` by size of body and tensor.
 
     `plan`: plan of the validation. The views are those of its first seed, painted on its first runtime.
     `renderer`: renderer from `open_renderer`.
     `look`: called after every view.
     Raises BadInputError, MissingPartError.
     """
-    own, *smaller = sizes_of(bundle.read_network().shape[1:3])
     runtime, seed = plan.runtimes[0], plan.seeds[0]
     paint = integer_painter(renderer, bundle, runtime, plan.threads)
-    size = f"{own[0]}x{own[1]}"
-    found: dict[Shape, list[float]] = {shape: [] for shape in (own, *smaller)}
-    for sample in plan_validation(renderer, plan.per_band, seed, held_out_motions(plan.held_out), size):
-        uv, truth = renderer.render(sample)
-        for shape, errors in found.items():
-            picture = paint(replace(sample, crop=replace(sample.crop, shape=shape)), uv)
-            error = image_error(picture if shape == own else enlarged(picture, own), truth)
-            if error is not None:
-                errors.append(error.psnr_db)
+    found: dict[int, dict[int, list[float]]] = {side: {tensor: [] for tensor in TENSOR_SIDES} for side in PICTURE_SIDES}
+    for sample in plan_validation(renderer, plan.per_band, seed, held_out_motions(plan.held_out)):
+        sides = [side for side, band in PICTURE_SIDES.items() if band == BAND_NAMES[sample.band]]
+        seen = [replace(sample, crop=on_picture(sample.crop, sample.view, side)) for side in sides]
+        truths = [renderer.render(each)[1] for each in seen]
+        for tensor in TENSOR_SIDES if sides else ():
+            crop = renderer.crop(sample, shapes_within(tensor * tensor))
+            image = paint(replace(sample, crop=crop), NO_UV)
+            for side, each, truth in zip(sides, seen, truths, strict=True):
+                error = image_error(shown(image, crop, each.crop), truth)
+                if error is not None:
+                    found[side][tensor].append(error.psnr_db)
         look()
-    psnr_db = {f"{h}x{w}": round(float(np.mean(errors)), DIGITS) for (h, w), errors in found.items()}
     return BySize(
         date=machine.here.now().date(),
         runtime=runtime,
         seed=seed,
         per_band=plan.per_band,
         held_out=tuple(Path(name).name for name in plan.held_out),
-        psnr_db=psnr_db,
+        psnr_db_by_picture={
+            side: {tensor: round(float(np.mean(errors)), DIGITS) for tensor, errors in row.items()}
+            for side, row in found.items()
+        },
     )
+
+
+def on_picture(crop: Crop, view: View, side: int) -> Crop:
+    """Return `crop` with as many pixels as the picture has there, if the body covers `side` x `side` of its pixels."""
+    wide, high = (view.projection[axis, axis] / crop.projection[axis, axis] for axis in (0, 1))
+    pixels = wide * high * OUTPUT_ROWS * round(OUTPUT_ROWS * view.aspect)  # of the crop, where the body has crop.pixels
+    scale = side * math.sqrt(pixels / crop.pixels / math.prod(crop.shape))
+    return replace(crop, shape=(round(crop.shape[0] * scale), round(crop.shape[1] * scale)))
 
 
 def with_sizes(validation: Validation, by_size: BySize) -> Validation:
@@ -318,17 +336,36 @@ def with_sizes(validation: Validation, by_size: BySize) -> Validation:
     return with_figures_digest(validation.model_copy(update={"by_size": by_size}))
 
 
-def enlarged(picture: U8, shape: Shape) -> U8:
-    """Return `picture` (h,w,4) uint8, sRGB with straight alpha, enlarged to `shape` (height, width)."""
-    alpha = picture[..., 3:] / 255.0
-    planes = np.dstack([_linear(picture[..., :3] / 255.0) * alpha, alpha]).astype(np.float32)
-    larger = np.dstack([_resized(planes[..., plane], shape) for plane in range(4)])
-    colour = _encoded(larger[..., :3] / np.maximum(larger[..., 3:], 1e-6))
-    return np.asarray(np.round(np.clip(np.dstack([colour, larger[..., 3:]]), 0, 1) * 255), np.uint8)
+def shown(image: U8, painted: Crop, seen: Crop) -> U8:
+    """Return the tensor's `image` (h,w,4) uint8, sRGB with straight alpha, as the pixels of the crop `seen`.
+
+    `painted`: crop of the tensor, of the same view.
+    """
+    alpha = image[..., 3:] / 255.0
+    planes = np.dstack([_linear(image[..., :3] / 255.0) * alpha, alpha])
+    for axis, element in ((0, 1), (1, 0)):
+        planes = np.moveaxis(_read(np.moveaxis(planes, axis, 0), painted, seen, element), 0, axis)
+    colour = _encoded(planes[..., :3] / np.maximum(planes[..., 3:], 1e-6))
+    return np.asarray(np.round(np.clip(np.dstack([colour, planes[..., 3:]]), 0, 1) * 255), np.uint8)
 
 
-def _resized(plane: NDArray[np.float32], shape: Shape) -> NDArray[np.float32]:
-    return np.asarray(Image.fromarray(plane).resize(shape[::-1], Image.Resampling.BILINEAR))
+def _read(rows: F64, painted: Crop, seen: Crop, element: int) -> F64:
+    """Return the lines of the crop `seen`, read from the lines `rows` of the crop `painted`.
+
+    `element`: row of the projection that the lines follow: 0 for columns, 1 for rows.
+    """
+    old, new = painted.projection, seen.projection
+    scale = old[element, element] / new[element, element]
+    shift = (old[element, 2] - scale * new[element, 2]) / old[3, 2] * (1 if element == 0 else -1)
+    count, lines = seen.shape[1 - element], len(rows)
+    density = scale * lines / count
+    taps = taps_of((lines, lines), (lines / density, lines / density))
+    at = (np.arange(count * taps) + 0.5) / (count * taps)  # 0..1 of `seen`, from the left or from the top
+    place = np.clip((scale * (2 * at - 1) + shift + 1) / 2 * lines - 0.5, 0, lines - 1)
+    low = np.floor(place).astype(int)
+    part = (place - low).reshape(-1, 1, 1)
+    read = rows[low] * (1 - part) + rows[np.minimum(low + 1, lines - 1)] * part
+    return np.asarray(read.reshape(count, taps, *rows.shape[1:]).mean(axis=1))
 
 
 def _linear(encoded: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from trilane.avatars.bundle import Bundle
-    from trilane.avatars.manifest import Validation
+    from trilane.avatars.manifest import BySize, Validation
     from trilane.training.validate import Evaluated, FloatNetwork, ValidationPlan
 
 EPILOG_TRAIN = """\b
@@ -245,7 +245,7 @@ def validate(
     ] = None,
     sizes: Annotated[
         bool,
-        typer.Option("--sizes", help="Measure only what smaller tensors cost; the other figures stay as they are."),
+        typer.Option("--sizes", help="Measure only the error by size of body and tensor; the rest stays as it is."),
     ] = False,
     json: JsonOption = False,
 ) -> None:
@@ -289,6 +289,8 @@ def validate(
     validated = _add_sizes(bundle, plan) if sizes else _validate(bundle, plan, float_network, sheet)
     if not json and validated.manifest.validation is not None:
         stdout_console().print(_band_table(validated.manifest.validation))
+        if validated.manifest.validation.by_size is not None:
+            stdout_console().print(_size_table(validated.manifest.validation.by_size))
     print_facts({"name": bundle.manifest.name, "validation": validation_facts(validated)}, json)
 
 
@@ -311,6 +313,22 @@ def _band_table(validation: Validation) -> Table:
     for band in own.psnr_db_by_band:
         cells = (f"{by[band]:.{digits}f}" if band in by else "-" for by, digits in columns.values())
         table.add_row(band.replace("_", " "), *cells)
+    return table
+
+
+def _size_table(by_size: BySize) -> Table:
+    """Return a table of PSNR in dB with a row for each size of the body and a column for each size of the tensor."""
+    from rich.table import Table
+
+    from trilane.avatars.validation import from_validation
+
+    rows = {f"{side}²": row for side, row in (by_size.psnr_db_by_picture or {}).items()}
+    tensors = [f"{side}²" for side in next(iter(rows.values()), {})]
+    table = Table(
+        "picture", *tensors, caption=f"PSNR, dB, by pixels of body and tensor, {from_validation(by_size.date)}"
+    )
+    for side, row in rows.items():
+        table.add_row(side, *(f"{psnr:.1f}" for psnr in row.values()))
     return table
 
 

@@ -46,6 +46,7 @@ NOT_SETTINGS = (
     "shapes",
     "changes",
     "own_pixels",
+    "size_curves",
     "works",
     "posed_vertices",
     "pace_ns",

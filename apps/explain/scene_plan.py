@@ -23,6 +23,7 @@ from PIL import Image, ImageDraw
 from trilane.apps.run.report_facts import worst_loss
 from trilane.arrays import F64, I64, Shape
 from trilane.avatars.network_file import NetworkFile
+from trilane.avatars.validation import TOLERANCE_DB
 from trilane.body.joints import Skeleton
 from trilane.body.skinning import DETAILS, CpuSkinner, left_out
 from trilane.errors import BadInputError
@@ -33,7 +34,8 @@ from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.pipeline.memory import Assets
 from trilane.scene.crop import Rect
-from trilane.scene.planner import ALL_WORK, MOST_DENSITY, FrameWork
+from trilane.scene.planner import FrameWork
+from trilane.scene.tensor_budget import ALL_WORK, MOST_DENSITY
 from trilane.scheduler.placement import Ranked
 from trilane.stages.avatar_assets import distinct, mesh_levels_of, networks_of, painting, shaped_body, staged_of
 from trilane.stages.config import RunConfig, pose_dtype, posed_vertices, posed_vertices_bytes
@@ -255,7 +257,10 @@ def explain(checked: Checked, profile: str, performance_profile: str, most_measu
         },
         "shapes": [list(shape) for shape in checked.config.buckets],
         "avatars": [_avatar(checked, number) for number in range(len(scene.avatars))],
-        "phases": [_phase(group, errors, costs, names, bodies) for group, errors in zip(groups, rows, strict=True)],
+        "phases": [
+            _phase(group, errors, costs, names, bodies) | {"why": _why(group, bool(checked.config.size_curves))}
+            for group, errors in zip(groups, rows, strict=True)
+        ],
         "image": _image(checked),
         "totals": _totals(frames, costs),
         "placement": costs.placement(*_usual(frames, costs), checked.asked_cores),
@@ -339,7 +344,6 @@ def _phase(
             }
             for (number, one), error in zip(first.seen.items(), errors, strict=True)
         ],
-        "why": _why(group),
         "cost": cost.as_json(),
         "saved": _saved(cost, costs.of(FIXED, *costs.in_view(first))),
     }
@@ -357,13 +361,18 @@ def _most(group: Sequence[PlannedFrame]) -> float:
     return max(planned.plan.density or 0.0 for planned in group)
 
 
-def _why(group: Sequence[PlannedFrame]) -> str:
-    """Return, in words, why the tensor of a phase has its size."""
+def _why(group: Sequence[PlannedFrame], is_measured: bool) -> str:
+    """Return, in words, why the tensor of a phase has its size.
+
+    `is_measured`: whether the size follows the table in each avatar's manifest.
+    """
     first = group[0].plan
     if first.work in WHY:
         return WHY[first.work]
     if first.density is None:
         return "the scene fixes the tensor's size"
+    if is_measured:
+        return f"the fewest pixels within {TOLERANCE_DB:g} dB of the best size, by the table `by_size` in the manifest"
     if _most(group) >= MOST_DENSITY:
         return f"{MOST_DENSITY:g} tensor pixels along a side of a pixel of the picture: more make no better picture"
     return "the pixels that the network was trained to paint, in the shape that fits best of those that are ready"

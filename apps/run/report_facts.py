@@ -20,7 +20,7 @@ from trilane.avatars.validation import SizeLoss
 from trilane.machine import here
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_metrics import PolicyMetrics, RunMetrics
-from trilane.scene.planner import ALL_WORK
+from trilane.scene.tensor_budget import ALL_WORK
 from trilane.stages.config import RunConfig
 from trilane.units import COMPARED, COMPUTED, MEASURED
 

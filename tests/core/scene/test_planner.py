@@ -25,15 +25,12 @@ from trilane.scene.crop import (
 )
 from trilane.scene.planner import (
     AS_GOOD,
-    MOST_DENSITY,
     PATIENCE,
     Demand,
     HeldMesh,
     HeldShape,
     LookAhead,
     ShapeSet,
-    TensorBudget,
-    area,
     choose_shapes,
     foreseen_changes,
     hold_mesh,
@@ -43,6 +40,7 @@ from trilane.scene.planner import (
     plan_tensor,
     serves,
 )
+from trilane.scene.tensor_budget import MOST_DENSITY, TensorBudget, area
 
 OUTPUT = (480, 640)
 SIDES = st.integers(1, 40).map(lambda steps: 32 * steps)

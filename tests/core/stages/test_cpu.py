@@ -18,8 +18,9 @@ from trilane.body.skinning import FrameSkinner
 from trilane.errors import TrilaneError
 from trilane.pipeline.description import UnitSettings
 from trilane.scene.crop import Rect, choose_bucket, grow, lay_out
-from trilane.scene.planner import TensorBudget, plan_tensor
+from trilane.scene.planner import plan_tensor
 from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene
+from trilane.scene.tensor_budget import TensorBudget
 from trilane.stages.avatar_assets import shaped_body, staged_of
 from trilane.stages.config import RunConfig, pose_dtype, posed_vertices, posed_vertices_bytes
 from trilane.stages.cpu import pose

@@ -16,7 +16,6 @@ from trilane.scene.planner import (
     Demand,
     LookAhead,
     ShapeSet,
-    TensorBudget,
     choose_shapes,
     foreseen_changes,
     ideal_shape,
@@ -24,6 +23,7 @@ from trilane.scene.planner import (
 )
 from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene
 from trilane.scene.staging import Staged, stage_scene
+from trilane.scene.tensor_budget import TensorBudget
 from trilane.stages.avatar_assets import AvatarData, load_avatar
 from trilane.stages.config import RunConfig
 from trilane.stages.configure import configure

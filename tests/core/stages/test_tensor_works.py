@@ -9,19 +9,19 @@ from collections.abc import Sequence
 from datetime import date
 from pathlib import Path
 
-import numpy as np
 import pytest
+from pydantic import ValidationError
 
 from support.small_inputs import validated
 from trilane.apps.run.report import Resolution
 from trilane.apps.run.report_facts import resolution_note, resolution_of
 from trilane.avatars.bundle import load_bundle, write_manifest
 from trilane.avatars.manifest import BySize
-from trilane.avatars.validation import SizeLoss, size_loss
+from trilane.avatars.validation import SizeLoss, _losses, curve_of, psnr_at, size_loss
 from trilane.errors import BadInputError
 from trilane.scene.crop import Rect
-from trilane.scene.planner import TensorBudget, work_of_side
 from trilane.scene.schema import Scene
+from trilane.scene.tensor_budget import TensorBudget, work_of_side
 from trilane.stages.config import RunConfig
 from trilane.stages.configure import configure
 from trilane.stages.foresee import tensor_works
@@ -146,14 +146,79 @@ def test_frames_are_counted_by_size_with_what_it_costs() -> None:
     assert json.dumps(found) and math.isfinite(found["sizes"][2]["psnr_loss_db"])
 
 
-def test_a_picture_is_enlarged_in_linear_light_with_its_colours_times_alpha() -> None:
-    """Two pixels, white and a black that is transparent, to four: white stays white, and alpha falls by quarters."""
-    size_figures = pytest.importorskip("trilane.training.validate")
-    picture = np.array([[[255, 255, 255, 255], [0, 0, 0, 0]]] * 2, np.uint8)
-    larger = size_figures.enlarged(picture, (2, 4))
-    assert larger[0, :, 3].tolist() == [255, 191, 64, 0]
-    assert (larger[0, :3, :3] == 255).all()
-    grey = np.array([[[0, 0, 0, 255], [255, 255, 255, 255]]] * 2, np.uint8)
-    assert size_figures.enlarged(grey, (2, 4))[0, 1].tolist() == [137, 137, 137, 255]  # a quarter of the light
-    assert size_figures.sizes_of((256, 256)) == [(256, 256), (192, 192), (128, 128)]
-    assert size_figures.sizes_of((64, 64)) == [(64, 64), (32, 32)]
+#: PSNR by tensor, for bodies of 64², 128² and 256² pixels.
+TABLE = {
+    64: {64: 30.0, 128: 31.0, 256: 30.0},
+    128: {64: 27.0, 128: 32.0, 256: 32.2},
+    256: {64: 20.0, 128: 28.0, 256: 34.3},
+}
+
+
+def test_the_curve_has_the_smallest_tensor_within_the_tolerance() -> None:
+    """0.3 dB: 7/10 of the way to 128², which is the best; less than 128² by 0.1; and 6.0 of 6.3 dB of the way to 256².
+
+    The second row alone needs 128 x 2^-0.02 = 126.2, since 31.9 is 4.9 of 5 dB of the way from 64².
+    """
+    ways = ((64, 0.7), (64, 4.9 / 5), (128, 6.0 / 6.3))
+    sides = [low * 2**part for low, part in ways]
+    assert curve_of(TABLE) == tuple(
+        (picture**2, math.ceil(side**2)) for picture, side in zip(TABLE, sides, strict=True)
+    )
+
+
+def test_a_larger_body_never_has_a_smaller_tensor() -> None:
+    table = {64: {64: 20.0, 256: 30.0}, 128: {64: 30.0, 256: 20.0}}
+    (_, far), (_, near) = curve_of(table)
+    assert far == near == math.ceil((64 * 4 ** (9.7 / 10)) ** 2)
+    assert curve_of({128: table[128]}) == ((128 * 128, 64 * 64),)  # the least tensor of all is enough
+
+
+def test_losses_of_a_table_are_means_over_the_bodies_whose_smaller_tensor_was_measured() -> None:
+    """A quarter of the pixels is half a side: 128 / 2 and more were measured for the third body alone."""
+    table = {64: {64: 30.0, 128: 31.0, 256: 31.0}, 256: {64: 20.0, 128: 28.0, 256: 36.0}}
+    assert curve_of(table)[0][1] < 128 * 128
+    pixels = curve_of(table)[1][1]
+    assert _losses(table)[250] == pytest.approx(8.0, abs=0.01)
+    log = math.log2(math.sqrt(curve_of(table)[0][1] * 0.563) / 64)
+    steep = 8.0 * -math.log2(math.sqrt(0.563))
+    assert _losses(table)[563] == pytest.approx((0.7 - log + steep) / 2, abs=0.01)
+    assert psnr_at(table[256], pixels) == pytest.approx(35.7, abs=0.001)
+    assert psnr_at(table[256], 63 * 63) is None and psnr_at(table[256], 257 * 257) is None
+
+
+def test_a_table_in_a_valid_manifest_is_the_planners(tiny_bundle: Path, tmp_path: Path) -> None:
+    """Changed by hand, it is nobody's."""
+    from trilane.training.validate import with_sizes
+
+    own = shutil.copytree(tiny_bundle, tmp_path / "own")
+    write_manifest(own, validated(load_bundle(own)))
+    manifest = load_bundle(own).manifest
+    measured = BySize(
+        date=date(2026, 3, 4), runtime="ort", seed=1, per_band=2, held_out=("a",), psnr_db_by_picture=TABLE
+    )
+    assert manifest.validation is not None
+    write_manifest(own, manifest.model_copy(update={"validation": with_sizes(manifest.validation, measured)}))
+    assert size_loss(load_bundle(own)).curve == curve_of(TABLE)
+    file = tmp_path / "scene.toml"
+    file.write_text(f'size = "auto"\nframes = 2\n[[avatars]]\nbundle = "{own}"\n')
+    config = configure(RunOptions(scene=str(file), runtime="ort"), tmp_path, lambda: None).config
+    assert config.size_curves == (curve_of(TABLE),) == config.tensor_budgets[0].curves
+    text = (own / "manifest.json").read_text().replace("34.3", "31.3")
+    (own / "manifest.json").write_text(text)
+    assert size_loss(load_bundle(own)).curve == ()
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        {},
+        {"psnr_db": {"64x64": 30.0}, "psnr_db_by_picture": TABLE},
+        {"psnr_db_by_picture": {64: {64: 30.0, 128: 31.0}, 128: {64: 30.0, 96: 31.0}}},
+        {"psnr_db_by_picture": {64: {64: 30.0}}},
+    ],
+)
+def test_a_table_is_whole_or_refused(said: dict[str, object]) -> None:
+    with pytest.raises(ValidationError):
+        BySize.model_validate(
+            {"date": date(2026, 3, 4), "runtime": "ort", "seed": 1, "per_band": 2, "held_out": (), **said}
+        )

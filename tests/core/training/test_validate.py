@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime
 from types import SimpleNamespace
 from typing import Any
@@ -20,7 +20,8 @@ from trilane.arrays import U8
 from trilane.avatars.bundle import Bundle, load_bundle
 from trilane.avatars.manifest import digests_of
 from trilane.body.body import load_body
-from trilane.training import validate
+from trilane.scene.crop import SCREEN, Rect, crop_projection
+from trilane.training import random_views, validate
 from trilane.training.clothing import LOOKS
 from trilane.training.image_error import (
     ImageError,
@@ -235,14 +236,11 @@ def test_ssim_by_loops(side, window):
 
 
 @dataclass(frozen=True)
-class Crop:
-    shape: tuple[int, int]
-
-
-@dataclass(frozen=True)
 class Sample:
     name: str
-    crop: Crop
+    view: random_views.View
+    crop: random_views.Crop
+    band: int
 
 
 def square(side: int, grey: int) -> U8:
@@ -252,60 +250,90 @@ def square(side: int, grey: int) -> U8:
     return picture
 
 
-def test_every_view_is_painted_at_every_size(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three views, of which the second shows nobody. In the first, greys are 64 off in the own size and 128 in the
-    smaller one, in the third 32 in both: 20 log10(255 / 64) = 12.01 dB, and so on.
+def test_every_view_is_painted_at_every_size_and_seen_at_every_density(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two far views of which one shows nobody, and one of a face, which no row has.
+
+    Greys are off by 64 in tensors of less than 128² pixels, else by 32: 20 log10(255 / 64) = 12.01 dB, and so on.
     """
-    views = ["first", "nobody", "third"]
     asked: list[Any] = []
+    camera = random_views.View(np.eye(4), random_views.perspective(1.0, 4 / 3), 4 / 3)
+    whole = random_views.Crop((256, 256), camera.projection, 480 * 640)
+    monkeypatch.setattr(validate, "PICTURE_SIDES", {64: "far", 96: "far"})
 
     def painter(renderer: Any, bundle: Any, runtime: str, threads: int) -> Any:
         asked.append((renderer, bundle, runtime, threads))
+        return lambda sample, _: square(64, 64 if math.prod(sample.crop.shape) < 128 * 128 else 32)
 
-        def paint(sample: Any, uv: str) -> U8:
-            assert uv == f"uv of {sample.name}"
-            off = {64: 64, 32: 128}[sample.crop.shape[0]] if sample.name == "first" else 32
-            return square(sample.crop.shape[0], off)
+    def planned(renderer: Any, per_band: int, seed: int, motions: Any) -> list[Any]:
+        asked.append((renderer, per_band, seed, motions))
+        return [Sample(name, camera, whole, band) for name, band in (("first", 0), ("nobody", 0), ("face", 3))]
 
-        return paint
-
-    def planned(renderer: Any, per_band: int, seed: int, motions: Any, size: str) -> list[Any]:
-        asked.append((renderer, per_band, seed, motions, size))
-        return [Sample(name=name, crop=Crop((9, 9))) for name in views]
-
-    def rendered(sample: Any) -> tuple[str, U8]:
-        truth = square(64, 0)
-        if sample.name == "nobody":
-            truth[..., 3] = 0
-        return f"uv of {sample.name}", truth
+    def rendered(sample: Any) -> tuple[None, U8]:
+        seen.append((sample.name, sample.crop.shape))
+        truth = np.zeros((*sample.crop.shape, 4), np.uint8)
+        truth[...] = square(1, 0) if sample.name == "first" else 0
+        return None, truth
 
     monkeypatch.setattr(validate, "integer_painter", painter)
     monkeypatch.setattr(validate, "plan_validation", planned)
     monkeypatch.setattr(validate, "held_out_motions", lambda names: ("motions", names))
-    renderer: Any = SimpleNamespace(render=rendered)
-    bundle: Any = SimpleNamespace(read_network=lambda: SimpleNamespace(shape=(1, 64, 64, 12)))
+    seen: list[Any] = []
+    renderer: Any = SimpleNamespace(
+        render=rendered, crop=lambda _, buckets: replace(whole, shape=max(buckets, key=math.prod))
+    )
+    bundle: Any = SimpleNamespace()
     plan = ValidationPlan(
         held_out=("/far/a.bvh", "builtin:b"), seeds=(5, 6), per_band=3, runtimes=("x", "y"), threads=2
     )
     before, looks = machine.here.now().date(), list[int]()
     found = validate.measure_sizes(bundle, plan, renderer, lambda: looks.append(1))
     assert before <= found.date <= machine.here.now().date()
-    assert asked == [(renderer, bundle, "x", 2), (renderer, 3, 5, ("motions", plan.held_out), "64x64")]
+    assert asked == [(renderer, bundle, "x", 2), (renderer, 3, 5, ("motions", plan.held_out))]
     assert (found.runtime, found.seed, found.per_band, found.held_out) == ("x", 5, 3, ("a.bvh", "builtin:b"))
+    assert seen == [(name, (side, side)) for name in ("first", "nobody") for side in (64, 96)]
     assert len(looks) == 3
-    db = {off: 20 * np.log10(255 / off) for off in (32, 64, 128)}
-    assert list(found.psnr_db) == ["64x64", "32x32"]
-    assert found.psnr_db == {
-        "64x64": round((db[64] + db[32]) / 2, 2),
-        "32x32": round((db[128] + db[32]) / 2, 2),
-    }
+    row = {side: round(20 * np.log10(255 / (64 if side < 128 else 32)), 2) for side in validate.TENSOR_SIDES}
+    assert found.psnr_db_by_picture == {64: row, 96: row} and found.psnr_db is None
 
 
-def test_sizes_are_whole_steps_of_the_networks_own() -> None:
-    """Three quarters and a half, down to whole steps of 32 pixels, and at least one."""
-    assert validate.sizes_of((512, 256)) == [(512, 256), (384, 192), (256, 128)]
-    assert validate.sizes_of((160, 96)) == [(160, 96), (96, 64), (64, 32)]
-    assert validate.sizes_of((32, 32)) == [(32, 32)]
+def crop_of(shape: tuple[int, int], rect: Rect = SCREEN) -> random_views.Crop:
+    return random_views.Crop(shape, crop_projection(random_views.perspective(1.0, 1.0), rect), 1.0)
+
+
+def test_a_crop_has_the_density_at_which_the_body_covers_the_side() -> None:
+    """The right half of the screen, 480 x 320 pixels, of which the body has a quarter: 0.64 of it are 96 x 128."""
+    view = random_views.View(np.eye(4), random_views.perspective(1.0, 4 / 3), 4 / 3)
+    half = crop_projection(view.projection, Rect(0.0, -1.0, 1.0, 1.0))
+    crop = random_views.Crop((96, 64), half, 480 * 320 / 4)
+    assert validate.on_picture(crop, view, 100).shape == (round(200 * 1.5**0.5), round(200 / 1.5**0.5)) == (245, 163)
+
+
+def test_a_tensor_is_shown_in_linear_light_with_its_colours_times_alpha() -> None:
+    """Two pixels, white and a black that is transparent, to four: white stays white, and alpha falls by quarters."""
+    picture = np.array([[[255, 255, 255, 255], [0, 0, 0, 0]]] * 2, np.uint8)
+    larger = validate.shown(picture, crop_of((2, 2)), crop_of((2, 4)))
+    assert larger[0, :, 3].tolist() == [255, 191, 64, 0]
+    assert (larger[0, :3, :3] == 255).all()
+    grey = np.array([[[0, 0, 0, 255], [255, 255, 255, 255]]] * 2, np.uint8)
+    assert validate.shown(grey, crop_of((2, 2)), crop_of((2, 4)))[0, 1].tolist() == [137, 137, 137, 255]
+
+
+def test_a_denser_tensor_is_averaged_over_the_pixel() -> None:
+    """Four white columns of eight to two pixels: two of three columns are white under the left one."""
+    picture = np.full((8, 8, 4), 255, np.uint8)
+    picture[:, 3:, :] = 0
+    less = validate.shown(picture, crop_of((8, 8)), crop_of((2, 2)))
+    assert less[..., 3].tolist() == [[191, 0]] * 2
+    assert (less[:, 0, :3] == 255).all()
+
+
+def test_a_part_of_the_tensor_is_read_where_it_lies() -> None:
+    """Of eight columns and rows the right three quarters, and the upper half: columns 2 to 7 and rows 0 to 3."""
+    picture = np.full((8, 8, 4), 255, np.uint8)
+    picture[..., 0] = 20 * np.arange(8)
+    picture[..., 1] = 20 * np.arange(8)[:, None]
+    part = validate.shown(picture, crop_of((8, 8)), crop_of((4, 6), Rect(-0.5, 0.0, 1.0, 1.0)))
+    assert (part == picture[:4, 2:]).all()
 
 
 def test_light_is_linear_between_its_ends() -> None:

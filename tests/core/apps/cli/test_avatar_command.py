@@ -276,6 +276,8 @@ def test_validate_writes_what_it_prints_and_sizes_beside_it(
 ) -> None:
     """A view of each band, of an avatar whose pictures mean nothing."""
     pytest.importorskip("skimage")
+    from trilane.training.validate import PICTURE_SIDES, TENSOR_SIDES
+
     own = shutil.copytree(drawable_bundle, tmp_path / "own")
     views = ("validate", own, "--seed", 1, "--per-band", 1, "--runtime", "ort", "--size", "64x64")
     printed = call(*views, "--sheet", tmp_path / "sheet.png")["validation"]
@@ -288,7 +290,10 @@ def test_validate_writes_what_it_prints_and_sizes_beside_it(
     out, _ = command("avatar", *views, "--sizes")
     assert f"{written.psnr_db_by_band['face']:.2f}" in out
     added = load_bundle(own).manifest.validation
-    assert added is not None and added.by_size is not None and set(added.by_size.psnr_db) == {"64x64", "32x32"}
+    assert added is not None and added.by_size is not None and added.by_size.psnr_db_by_picture is not None
+    table = added.by_size.psnr_db_by_picture
+    assert list(table) == [*PICTURE_SIDES] and {tuple(row) for row in table.values()} == {TENSOR_SIDES}
+    assert "384²" in out and f"{table[384][320]:.1f}" in out
     assert added.psnr_db_by_band == written.psnr_db_by_band
 
 
