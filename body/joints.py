@@ -96,7 +96,7 @@ def rodrigues(rotvec: ArrayLike) -> F64:
 
 @dataclass(frozen=True)
 class Posed:
-    """A skeleton in one pose. The arrays are the skeleton's own buffers: its next `pose` overwrites them.
+    """A skeleton in one pose. The arrays are buffers of the skeleton: the next call of `Skeleton.pose` overwrites them.
 
     `matrices` (55,3,4) float32: skinning matrices; x_world = sum_k w_k (matrices_k @ [x_rest, 1]).
     `joints` (55,3) float64: positions in the world, metres.

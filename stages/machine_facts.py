@@ -1,4 +1,4 @@
-"""Facts about the machine that made a measurement. Every reported number has them beside it.
+"""Facts about the machine that made a measurement. Every reported number has these facts beside it.
 
 Rule: a fact was read or tried on this machine. A fact that could not be read is absent; none is guessed.
 """
@@ -51,7 +51,7 @@ def package_version(name: str) -> str | None:
 
 
 def versions_with(package: str) -> list[str]:
-    """Return name and version of each package that measured times depend on, also of `package`, a runtime's."""
+    """Return name and version of each package on which measured times depend. `package`: package of the runtime."""
     return [f"{name} {package_version(name)}" for name in dict.fromkeys(("trilane", *PACKAGES, package))]
 
 
@@ -99,7 +99,7 @@ def gl_facts() -> dict[str, Any] | None:
 
 
 def runtime_facts() -> dict[str, Any]:
-    """Return the installed inference runtimes and what each can run on."""
+    """Return the installed inference runtimes, and the devices on which each can run."""
     import onnxruntime
 
     facts: dict[str, Any] = {"onnxruntime": list(onnxruntime.get_available_providers())}

@@ -2,17 +2,17 @@
 
 The block `prepare` writes a picture in a network's size, layout and numbers. The number for a byte b of channel c is
 ((b / 255 - mean[c]) / sd[c]) / step + zero_point; for an integer type it is rounded and clipped. Without keys, mean is
-0, sd is 1, and step is 1 for floats. For bytes, step is 1/255, so that bytes do not change; the zero point is 0, or
--128 for signed bytes.
+0 and sd is 1. The step is 1 for floats and 1/255 for bytes, so that bytes do not change. The zero point is 0, but -128
+for signed bytes.
 
 The block `overlay` draws these outputs on a picture:
 
 - `mask`: classes or scores. If it has three axes, the smaller of the first and the last has the channels. The largest
-  of several channels is the class, and channel 0 is the background. A single float channel is a mask where it is above
-  0.5; a single integer channel contains classes.
+of several channels is the class, and channel 0 is the background. A pixel of a single float channel belongs to the mask
+if it is above 0.5. A single integer channel contains classes.
 - `depth`: one channel, drawn from its least number (blue) to its largest (red).
 - `boxes`: rows of x0, y0, x1, y1 and maybe a score, in pixels of the picture, or from 0 to 1. A box with score 0 is not
-  drawn.
+drawn.
 
 Mask and depth are stretched over the picture.
 """
@@ -96,7 +96,7 @@ class Preparation:
         return self._channels, self._height, self._width
 
     def _channelled(self, picture: U8) -> U8:
-        """Return `picture` with as many channels as the network reads."""
+        """Return `picture` (h,w,c) with the number of channels that the network reads."""
         count = picture.shape[2]
         if count == self._channels:
             return picture
@@ -128,7 +128,7 @@ _DEFAULTS: Final = {"mean": 0.0, "sd": 1.0}
 
 
 def _each(values: Sequence[float] | None, channels: int, other: float, where: str) -> NDArray[np.float64]:
-    """Return a value for each channel (channels,). `other`: value for all channels if `values` is None."""
+    """Return a value for each channel (channels,). `other`: value of all channels if `values` is None."""
     given = [other] if values is None else list(values)
     if len(given) not in (1, channels):
         expected = f"1 or {channels}, one for each channel"
@@ -173,7 +173,7 @@ class Prepare(PortedStage):
 
 
 def build_prepare(settings: Mapping[str, Any], unit: UnitContext) -> Prepare:  # noqa: ARG001 - a factory's signature
-    """Build the block. Raises BadInputError."""
+    """Build the block `prepare`. Raises BadInputError."""
     return Prepare(settings)
 
 
@@ -255,7 +255,7 @@ class Overlay(PortedStage):
 
 
 def _channels(array: NDArray[Any]) -> NDArray[Any]:
-    """Return `array` as (channels, height, width); the smaller of the first and the last of three axes has channels."""
+    """Return `array` as (channels, height, width). Of three axes, the smaller of first and last has the channels."""
     planes = array.reshape([size for size in array.shape if size > 1])
     if planes.ndim == 2:
         return planes[None]
@@ -279,5 +279,5 @@ def _depth_colours(depth: F32) -> U8:
 
 
 def build_overlay(settings: Mapping[str, Any], unit: UnitContext) -> Overlay:  # noqa: ARG001 - a factory's signature
-    """Build the block. Raises BadInputError."""
+    """Build the block `overlay`. Raises BadInputError."""
     return Overlay(settings)

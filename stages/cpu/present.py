@@ -1,9 +1,9 @@
 """The present stage: it encodes frames as a segment of video, and writes a digest of every frame to a text file.
 
-The stage computes the digest of the bytes in the slot before it uses them otherwise. Each process writes one segment
-with a name of its own; the parent joins the segments (`apps/run/run_files.py`). A segment is fragmented MP4: if its
-writer is killed, it is readable, and lacks at most the last frame. Frames that are compared after the run are kept as
-arrays in a folder beside it.
+The stage computes a frame's digest from the bytes in the slot before it encodes the frame. Each process writes one
+segment with a name of its own; the parent joins the segments (`apps/run/run_files.py`). A segment is fragmented MP4: if
+its writer is killed, it is readable, and lacks at most the last frame. Frames that are compared after the run are kept
+as arrays in a folder beside the segment.
 """
 
 from __future__ import annotations
@@ -210,7 +210,7 @@ class KeptFrames:
 
 
 def kept_frames(folder: Path) -> dict[int, Path]:
-    """Return the file of each frame that was kept in `folder`, by the frame's number."""
+    """Return the files of the frames that were kept in `folder`, by frame number."""
     return {
         int(file.stem): file for file in sorted((folder / KEPT_FOLDER).glob("*.npy"), key=lambda file: int(file.stem))
     }

@@ -1,6 +1,6 @@
 """The infer stage: it runs the avatar's integer network, or a part of it, from the input slot to the output slot.
 
-`bind` makes all sessions and bindings. A frame allocates nothing, and nothing runs with nobody in view. The tensors
+`bind` makes all sessions and bindings. A frame allocates nothing. If nobody is in view, no network runs. The tensors
 that cross a cut of the network are in the slot in the order of the cut, each on its own cache lines. All processes with
 the same configuration use the same offsets.
 """
@@ -113,8 +113,8 @@ class BoundPart:
     """A part of the network, bound to an input slot and an output slot.
 
     `passed`: pairs (source, target) of tensors that are copied unchanged for a later part.
-    `in_bytes`: bytes that the part reads, with its weights if they come from memory.
-    `out_bytes`: bytes that the part writes.
+    `in_bytes`: number of bytes that the part reads, including its weights if they do not fit into the cache.
+    `out_bytes`: number of bytes that the part writes.
     """
 
     binding: Binding
@@ -246,7 +246,7 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> InferStage:
 def _bound(session: Session, part: NetworkPart, source: U8, target: U8, weights: int) -> BoundPart:
     """Return `part`, bound to the slots `source` and `target`.
 
-    `weights`: bytes of the part's weights that each run reads from memory.
+    `weights`: number of bytes of the part's weights that each run reads from memory.
     """
     given, handed_on = views(source, part.crossing_in), views(target, part.crossing_out)
     inputs, outputs = [given[name] for name in part.inputs], [handed_on[name] for name in part.outputs]

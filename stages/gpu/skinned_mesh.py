@@ -104,7 +104,7 @@ def _surface(normal: Floats | None, colour: Floats | None, source: NDArray[np.in
 
 
 def is_closed(vertices: Floats, faces: Ints) -> bool:
-    """Return whether the faces (F,3) enclose a volume and wind outward; a share `MAX_OPEN` of edges may be open.
+    """Return whether `faces` (F,3) enclose a volume and wind outward; the share `MAX_OPEN` of edges may be open.
 
     Bodies have small openings that no camera sees, such as the backs of the eyes.
     """
@@ -335,7 +335,10 @@ class SkinnedMesh:
         return _vertex_array(self._ctx, program, [self._content], indices, self.arrays)
 
     def upload_pose(self, pose: BodyPose) -> None:
-        """Write the skinning matrices, and for a mesh with pose blend shapes the pose feature. Raises ValueError."""
+        """Write the skinning matrices, and for a mesh with pose blend shapes the pose feature, to the GPU.
+
+        Raises ValueError if `pose` lacks the feature that the mesh needs.
+        """
         upload(self._ctx, self._joints, np.ascontiguousarray(pose.joints, np.float32))
         if self.posedirs is None:
             return
