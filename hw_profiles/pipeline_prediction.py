@@ -87,7 +87,7 @@ class StagePrice:
 
 
 def given_price(file: PipelineFile, name: str) -> StagePrice | None:
-    """Return the time that the file states for stage `name`; None if it states none."""
+    """Return the time that the file states for the stage `name`; None if the file states none."""
     stage = file.stages[name]
     time = stage.own_time
     if time is None:
@@ -179,7 +179,7 @@ def prices_of(
 
 
 def _without_a_time(file: PipelineFile, names: Sequence[str], measured: MeasuredStages) -> BadInputError:
-    """Return the error for stages without a time; its place is the first stage, and it names the others."""
+    """Return the error for the stages `names`, which have no time. Its place is the first; its text names the rest."""
     first = names[0]
     found = f"{file.stages[first].named_kind} without a time"
     if names[1:]:
@@ -216,7 +216,7 @@ def bound_of(file: PipelineFile, prices: Mapping[str, StagePrice]) -> tuple[Grap
 class Drawn:
     """A function for the virtual clock that returns the time of each job in ns.
 
-    `factors`: factor on each stage's time; 1 for a stage that is missing.
+    `factors`: factor on the time of each stage, by name; 1 for a stage that is not listed.
     """
 
     def __init__(self, prices: Mapping[str, StagePrice], seed: int, factors: Mapping[str, float] | None = None) -> None:
@@ -253,9 +253,12 @@ def _draw_ms(time: StageTime, rng: np.random.Generator) -> NDArray[np.float64]:
 def predict_file(
     file: PipelineFile, prices: Mapping[str, StagePrice], frames: int = 0, seed: int = 0
 ) -> dict[str, Any]:
-    """Return the prediction, with the keys of report.json.
+    """Return the prediction of `file`, with the keys of report.json.
+
+    `prices`: time of each stage, by name.
 
     `frames`: number of frames of the simulated run; 0: the file's number, or 1000 if it has none.
+    `seed`: seed of all random numbers.
     """
     graph, bound = bound_of(file, prices)
     settings = settings_of(file, frames, seed, hang_ns=NEVER_HANGS_NS)
@@ -294,7 +297,7 @@ def _without_intervals(answer: dict[str, Any]) -> dict[str, Any]:
 
 
 def _share(file: PipelineFile) -> str:
-    """Return a sentence about the share of frames that are presented, if `every` leaves some out; otherwise ""."""
+    """Return a sentence about the share of presented frames if the key `every` leaves some out; otherwise ""."""
     period = file.periods[file.latency_to]
     return f"; {file.latency_to} has one frame of {period}, by every" if period > 1 else ""
 
@@ -310,7 +313,7 @@ def _row(stage: StagePrice) -> dict[str, Any]:
 
 
 def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], seed: int) -> FrameInterval:
-    """Return the time of a frame if the source is always ready."""
+    """Return the frame time, with its interval, if the source is always ready. `seed`: seed of the simulated runs."""
     (graph, settings), skips = always_fed(file), skips_of(file, seed)
 
     def needs_ms(end: Ends) -> float:
@@ -337,7 +340,7 @@ def always_fed(file: PipelineFile) -> tuple[Graph, Settings]:
 def holding_back(graph: Graph) -> Graph:
     """Return the graph with edges that delay their writers and never drop a frame.
 
-    Such edges are needed to judge a rate, which holds if every frame is presented.
+    A rate is judged with these edges, because it holds only if every frame is presented.
     """
     rules = ((rule, edge_rule(rule)) for rule in graph.edges)
     edges = (f"fifo:{known.slots}" if known.yields else rule for rule, known in rules)
@@ -354,7 +357,7 @@ def fed_bound_ms(file: PipelineFile, times_ms: Mapping[str, float]) -> float:
 
 
 def repeats_after(file: PipelineFile) -> int:
-    """Return the number of frames after which the pattern of their stages repeats."""
+    """Return the number of frames after which the keys `every` and the pattern of the bypass select the same stages."""
     return math.lcm(*file.periods.values(), len(file.bypass[1].pattern or ".") if file.bypass else 1)
 
 
@@ -379,8 +382,9 @@ def steady_ms(run: Simulation, stop_ns: int, repeats: int) -> float:
 def over_ends(ms_at: Callable[[Ends], float], is_unsure: bool = True) -> FrameInterval:
     """Return a time with its interval.
 
-    The ends of the interval are the times that result if all stages have the low ends, or the high ends, of theirs.
-    The errors of all stages count as one error, because they come from one model of one chip, or from one run.
+    The ends of the interval are the times that result if all stages have the low ends, or the high ends, of their
+    intervals. The errors of all stages count as one error, because they come from one model of one chip, or from one
+    run.
 
     `ms_at`: function that returns the time in ms at an end.
     `is_unsure`: whether the ends differ from the expected time.

@@ -71,7 +71,7 @@ def holding(fps: float, times: FrameInterval, dropped: int = 0, late: int = 0, f
 
 
 def wanted_drops(dropped: Mapping[str, int]) -> int:
-    """Return the number of dropped frames without the frames that `every` leaves out.
+    """Return the number of dropped frames, apart from those that the key `every` of a pipeline file leaves out.
 
     `dropped`: numbers of dropped frames by place and cause, as in report.json.
     """
@@ -79,7 +79,7 @@ def wanted_drops(dropped: Mapping[str, int]) -> int:
 
 
 def without_interval(rate: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `rate`, a result of `holding`, without intervals; for a frame time whose error is not known."""
+    """Return `rate`, a result of `holding`, without intervals, for a frame time of unknown error."""
     ms = (1 - rate["reserve"]) * 1e3 / rate["fps"]
     holds = f"{'yes' if rate['holds'] else 'no'}; {_short(ms)} ms of {_short(1e3 / rate['fps'])} ms (no interval)"
     said = {"words": rate["words"].partition(",")[0], "sentence": f"holds {rate['fps']:g} fps: {holds}"}
@@ -191,7 +191,10 @@ def _by_power(profile: Profile, corners: Corners, load: FrameLoad, limit_w: floa
 
 
 def _allowed(requested: Corners, load: FrameLoad) -> list[Corners]:
-    """Return all combinations of corners up to the requested ones; a unit without work keeps its requested corner."""
+    """Return all combinations of corners in which no unit is above its requested corner.
+
+    A unit that has no work in `load` keeps its requested corner.
+    """
     working = load.work_ms(requested)
 
     def up_to(unit: UnitName, corner: Corner) -> tuple[Corner, ...]:

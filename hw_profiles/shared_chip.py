@@ -1,11 +1,11 @@
 """Predicts several tenants on one chip: avatars, networks and pipeline files, each at its rate, with power and heat.
 
 `tenants.py` computes the times of their jobs, and `trilane.scheduler.shared_units` decides whose job waits. This file
-computes how much a network slows while other jobs use the memory: it has the bandwidth that they leave (Gables, Hill
-and Reddi, 2019). Each avatar's camera, display and composition take `application_use_fraction` of the bandwidth all the
-time. A network on another unit takes the bytes that it moves, spread over its time. Jobs of one unit follow each other
-and never compete. A network that nothing slows has the time of `network_time.price`. Keys of the prediction that mean
-the same as in report.json have the same names.
+computes how much a network slows while other jobs use the memory: the network has the bandwidth that these jobs leave
+(Gables, Hill and Reddi, 2019). Each avatar's camera, display and composition take `application_use_fraction` of the
+bandwidth all the time. A network on another unit takes the bytes that it moves, spread over its time. Jobs of one unit
+follow each other and never compete. A network that nothing slows has the time of `network_time.price`. Keys of the
+prediction that mean the same as in report.json have the same names.
 """
 
 from __future__ import annotations
@@ -130,14 +130,14 @@ def needed(
 
 
 def _busy_s(run: Simulation, tenant: SharingPipeline, unit: str) -> float:
-    """Return the busy time in seconds of the chip's unit `unit` for a tenant."""
+    """Return the busy time in seconds of the chip's unit `unit` in jobs of `tenant`."""
     rows = run.report["units"]
     own = [name for name, hardware in tenant.hardware.items() if hardware == unit and name in rows]
     return float(sum(rows[name]["busy"] for name in own) * run.report["duration_s"])
 
 
 def _seconds(tenants: Sequence[SharingPipeline], costs: _Costs) -> float:
-    """Return the length of the run in virtual seconds."""
+    """Return the length of the simulated runs in virtual seconds."""
     slowest = max(
         max(1 / tenant.fps, sum(means.values()) / 1e3) for tenant, means in zip(tenants, costs.mean_ms, strict=True)
     )

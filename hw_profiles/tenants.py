@@ -96,7 +96,7 @@ class SharingPipeline(Protocol):
     `repeats`: number of frames after which its jobs are the same again.
     `graph`: its graph for the scheduler.
     `fed`: (graph, settings) for a run whose source is always ready and in which no frame is dropped.
-    `hardware`: unit of the chip for each of its units; a unit without one has its own name.
+    `hardware`: for each unit of the pipeline, the chip's unit that does its jobs, or its own name without one.
     """
 
     @property
@@ -136,10 +136,15 @@ class SharingPipeline(Protocol):
         """Return whether a frame takes the bypass of the graph."""
 
     def on(self, profile: Profile, corners: Corners, end: Ends, always: float) -> Jobs:
-        """Return the times of its jobs. `always`: share of the bandwidth that is taken all the time, 0 to 1."""
+        """Return the times of its jobs on the chip `profile`.
+
+        `corners`: corner of each unit of the chip.
+        `end`: expected times, or one end of their intervals.
+        `always`: share of the memory's bandwidth that is taken all the time, 0 to 1.
+        """
 
     def facts(self, profile: Profile) -> dict[str, Any]:
-        """Return its keys `unit`, `numbers`, `precision`, `policy` and `edge` of a prediction."""
+        """Return a prediction's keys `unit`, `numbers`, `precision`, `policy` and `edge` for this pipeline."""
 
 
 def check_rate(name: str, fps: float) -> None:
@@ -150,7 +155,7 @@ def check_rate(name: str, fps: float) -> None:
 
 @dataclass(frozen=True)
 class Tenant:
-    """An avatar, or a network by itself, as a `Pipeline`.
+    """An avatar, or a network by itself, as a `SharingPipeline`.
 
     `networks`: one network for each combination of tensor shape, number of avatars in view and levels of their meshes.
     `frames`: for each frame, the index of its network in `networks`, or `SKIPS`; after its end the list starts over.
@@ -158,7 +163,7 @@ class Tenant:
     `variant`: how the stages are connected and scheduled.
     `is_bare`: whether it consists only of the network, whose result is due when the next frame comes.
     `avatars`: number of avatars in view for each of `networks`; empty for one avatar each.
-    `meshes`: number of their vertices over that of a whole mesh, for each of `networks`; empty for whole meshes.
+    `meshes`: for each of `networks`, the vertices in view divided by those of one whole mesh; empty for whole meshes.
     `computes`: precision and runtime of the networks.
 
     Raises BadInputError for a unit or a rate out of range.
@@ -220,7 +225,7 @@ class Tenant:
         return run_settings(policy, ENDLESS, shown_ns, shown_ns, **limits)
 
     def plan(self, kind: int, stretch: float = 1.0) -> Plan:
-        """Return the application of a frame with the network `networks[kind]`. `stretch`: factor on its time."""
+        """Return the application with the network `networks[kind]`. `stretch`: factor on the network's time."""
         avatars = self.avatars[kind] if self.avatars else 1
         meshes = self.meshes[kind] if self.meshes else None
         return Plan(self.networks[kind], self.unit, self.variant, avatars=avatars, meshes=meshes, stretch=stretch)
@@ -297,7 +302,7 @@ class _AvatarJobs:
         return {stage: whole * ms for (stage, _), ms in times.items()}
 
     def _stretch(self, work: Work) -> float:
-        """Return the factor on a network's time at this end of its interval."""
+        """Return the factor that turns a network's expected time into the time at the chosen end of its interval."""
         if self._end == "expected":
             return 1.0
         time = price(self._chip, work, self._tenant.unit, self._corners)
@@ -307,7 +312,7 @@ class _AvatarJobs:
 
 @dataclass(frozen=True)
 class FileTenant:
-    """A pipeline file, as a `Pipeline`.
+    """A pipeline file, as a `SharingPipeline`.
 
     `graphs`: graphs of its networks, by the stage's name.
     `precision`: int8, fp16 or fp32 for networks whose stage states none; None: the network and its unit decide.
@@ -372,7 +377,10 @@ class FileTenant:
 
 
 class _Priced(NamedTuple):
-    """A network whose time comes from the chip's model. `factor`: time at the end of its interval / expected time."""
+    """A network whose time comes from the chip's model.
+
+    `factor`: time at the chosen end of its interval, divided by the expected time.
+    """
 
     work: Work
     chip: Profile

@@ -62,8 +62,8 @@ SCREEN = Rect(-1.0, -1.0, 1.0, 1.0)
 def choose_bucket(rect: Rect, output: Shape, buckets: Sequence[Shape]) -> tuple[Shape, Rect]:
     """Return the tensor shape that wastes the least area on `rect`, and `rect` grown to that shape's aspect ratio.
 
-    The grown rectangle contains `rect`. It is moved onto the screen if it fits there. If a side is longer than the
-    screen, it extends beyond both edges of the screen by the same length. Of two shapes that waste the same area, the
+    The grown rectangle contains `rect`, and is moved onto the screen if it fits there. A side that is longer than the
+    screen extends beyond both edges of the screen by the same length. Of two shapes that waste the same area, the
     larger one is chosen.
 
     `rect`: rectangle of the mesh.
@@ -132,7 +132,7 @@ def _grow_from_pixel(low: float, high: float, length: float, side: int) -> tuple
 
 
 def crop_projection(projection: ArrayLike, rect: Rect) -> F64:
-    """Return `projection` (4,4) followed by the map from `rect` to the whole screen; depth does not change.
+    """Return `projection` (4,4), followed by the map that stretches `rect` to the whole screen; depth does not change.
 
     In NDC, x' = (2 x - (x0 + x1)) / (x1 - x0). In clip space, X' = (2 X - (x0 + x1) W) / (x1 - x0), which is linear.
     Therefore the crop is exact for any projection.
@@ -287,17 +287,17 @@ def lay_out_at(
 
 
 def by_network(networks: Sequence[int]) -> list[list[int]]:
-    """Return a list of the avatars' indices for each network. `networks`: number of each visible avatar's network."""
+    """Return, for each network, the indices of its avatars. `networks`: number of each visible avatar's network."""
     return [[place for place, one in enumerate(networks) if one == network] for network in sorted(set(networks))]
 
 
 def apart(
     rects: Sequence[Rect], networks: Sequence[int], lay: Callable[[Sequence[Rect]], DenseLayout | None]
 ) -> DenseLayout | None:
-    """Return a layout with a separate tensor for the avatars of each network; None if the avatars of any do not fit.
+    """Return a layout with a separate tensor for the avatars of each network; None if a tensor has too little room.
 
     `rects`, `networks`: mesh rectangle of each visible avatar, and number of its network.
-    `lay`: lays out the avatars of one network, always in a tensor of one shape.
+    `lay`: function that lays out the avatars of one network, always in a tensor of one shape.
     The density of the result is the least density of these tensors.
     """
     groups = by_network(networks)
@@ -349,8 +349,8 @@ def _no_room(rects: Sequence[Rect], buckets: Sequence[Shape]) -> BadInputError:
 def tight_shape(rects: Sequence[Rect], output: Shape, density: float = 1.0, margin_px: int = MARGIN_PX) -> Shape:
     """Return the shape of least area with room for the avatars at `density`; sides are multiples of `BUCKET_STEP`.
 
-    For several avatars, shapes whose longer side exceeds `MOST_ASPECT` times the shorter side are taken only if all
-    arrangements have such shapes. The other parameters are those of `lay_out_at`.
+    For several avatars, a shape whose longer side exceeds `MOST_ASPECT` times the shorter is taken only if every
+    arrangement has such a shape. The other parameters are those of `lay_out_at`.
     """
     whole = [_pixels(on_grid(rect, output), output) for rect in rects]
     sizes = [(math.ceil(height * density), math.ceil(width * density)) for height, width in whole]

@@ -1,9 +1,9 @@
 """Reads the plain values and arrays of a Python pickle without executing anything in it.
 
 Rule: only None, numbers, text, bytes, lists, tuples, dicts and NumPy arrays of numbers are built. Nothing else is
-imported, called or built. `pickletools` splits the file into operations, and the tables below execute those that make
-such values. Any other object in the file becomes a `Foreign`, which only holds the object's name. An operation that is
-not in a table ends the reading.
+imported, called or built. `pickletools` splits the file into operations. Only the operations in the tables below are
+executed. Any other object in the file becomes a `Foreign`, which only holds the object's name. Any other operation ends
+the reading.
 
 The size of a file limits the memory that it can use. Text and bytes are pieces of the file. An array is a view of bytes
 whose number must match its shape. The number of operations is limited. Keys of dicts are text, whose hash a file cannot
@@ -103,7 +103,7 @@ class _Reader:
             values.append(value)
 
     def bytes_of(self, raw: Any) -> bytes:
-        """Return `raw`, which is bytes, or the bytes of a text that Python 2 and older protocols wrote for bytes.
+        """Return `raw` if it is bytes, or the bytes for which Python 2 and older protocols wrote the text `raw`.
 
         The same text object always gives the same bytes object.
         """
@@ -153,7 +153,7 @@ def printable(text: str) -> str:
 
 
 def wanted(value: Any, kind: type, what: str) -> Any:
-    """Return `value` if its type is `kind`. Raises TypeError otherwise. `what`: expected value in words."""
+    """Return `value` if its type is `kind`, otherwise raise TypeError. `what`: expected value in words."""
     if type(value) is not kind:
         found = "nothing" if value is None else type(value).__name__
         raise TypeError(f"{found} in place of {what}")
