@@ -178,7 +178,7 @@ def _require_finite(values: F64, where: str, expected: str) -> None:
 
 
 def _ancestors(parents: NDArray[np.int32]) -> list[NDArray[np.intp]]:
-    """Return an array (J + 1,) for each round k: the 2^k-th ancestor of each joint.
+    """Return an array (J + 1,) for each round k: the 2^k-th ancestor of each joint, by `parents` (J,).
 
     Index J stands for an identity transform above the root; it is its own ancestor.
     """

@@ -162,7 +162,7 @@ def _network_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[st
 
 
 def split_work(work: Work, share: float) -> tuple[Work, Work]:
-    """Return `work` in two parts; the first has the first operators that together do `share` of the products."""
+    """Return (first operators of `work` that together do `share` of its products, the other operators)."""
     macs, cut = 0, 0
     for cut, operator in enumerate(work.operators, 1):  # noqa: B007
         macs += operator.macs

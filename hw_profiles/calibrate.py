@@ -251,7 +251,7 @@ def calibrate(name: str | Path, rows: Sequence[OwnRow]) -> Calibrated:
 
 
 def calibrate_tables(data: Mapping[str, Any], path: Path, rows: Sequence[OwnRow]) -> Calibrated:
-    """Fit the tables of a profile to `rows`. `path`: file of the tables, for messages. Raises BadInputError."""
+    """Fit a profile's tables `data` to `rows`. `path`: file of the tables, for messages. Raises BadInputError."""
     profile = parse_profile(data, path)
     for row in rows:
         try:

@@ -342,7 +342,7 @@ def _distinct(layers: Layers, room: int) -> tuple[F64, F64]:
 
 
 def priors(engine: EngineName, chips: Sequence[str]) -> tuple[Numbers, Numbers]:
-    """Return (logarithms of the values, spreads) of an engine's numbers before the fit."""
+    """Return (logarithms of the values, spreads) of an engine's numbers for `chips` before the fit."""
     factors = [factor_prior(engine, name) for name in NAMES]
     rates = [[rate_prior(engine, chip, KEY_OF_RATE[rate][0]) for rate in RATES] for chip in chips]
     values = [[math.log(_seconds(engine, r, p.value)) for r, p in zip(RATES, row, strict=True)] for row in rates]
@@ -460,7 +460,10 @@ def cross_validate(
 
 
 def predict_rows(fitted: Fitted, rows: Sequence[Latency], layers: Mapping[str, Layers]) -> list[LeftOut]:
-    """Return the rows whose chip `fitted` knows, each with its prediction by `fitted`."""
+    """Return the rows whose chip `fitted` knows, each with its prediction by `fitted`.
+
+    `layers`: layers of each network, by name.
+    """
     known = [row for row in rows if row.chip in fitted.chips]
     data = _Rows(known, layers, fitted.chips)
     ms, shares = data.predict(fitted.numbers)
@@ -560,7 +563,7 @@ def rate_prior(engine: EngineName, chip: str, key: str) -> Prior:
 
 
 def factor_prior(engine: EngineName, term: str) -> Prior:
-    """Return the prior of a term's factor."""
+    """Return the prior of the factor of `term` on `engine`."""
     if term in UNITS_OF_RATES:
         return Prior(1, 1e-6)
     return (FP16_FACTORS if engine.startswith("fp16") else FACTORS)[term]

@@ -55,7 +55,10 @@ def type_name(kind: int) -> str:
 
 
 def bytes_of(shape: tuple[int, ...], kind: int) -> int:
-    """Return the size of a tensor in bytes. Raises UnexpectedValue if its elements are no numbers."""
+    """Return the size of a tensor in bytes. Raises UnexpectedValue if its elements are no numbers.
+
+    `shape`, `kind`: as in `check_size`.
+    """
     if kind not in _BITS:
         remedy = "leave the part of the graph that handles text to the program"
         raise UnexpectedValue(f"elements of type {type_name(kind)}", "numbers", remedy)
@@ -283,7 +286,7 @@ def with_shapes(model: onnx.ModelProto, given: Mapping[str, Shape]) -> onnx.Mode
 def _known(
     graph: onnx.GraphProto, inputs: Sequence[onnx.ValueInfoProto], inferred: Mapping[str, onnx.ValueInfoProto]
 ) -> dict[str, Shape]:
-    """Return the static shapes of all tensors that have one, by name."""
+    """Return the static shape of each tensor that has one, by name. `inferred`: result of `_inferred`."""
     shapes = {tensor.name: tuple(tensor.dims) for tensor in graph.initializer}
     values = (*inputs, *inferred.values())
     return shapes | {value.name: sizes for value in values if (sizes := _sizes(value, least=0)) is not None}
@@ -473,7 +476,11 @@ def _results(
     shapes: Mapping[str, tuple[int, ...]],
     opsets: Sequence[onnx.OperatorSetIdProto],
 ) -> list[NDArray[np.generic]]:
-    """Return the values that `node` computes; an empty list if an input is unknown, or a result may be too large."""
+    """Return the values that `node` computes; an empty list if an input is unknown, or a result may be too large.
+
+    `known`: known values of tensors, by name.
+    `opsets`: versions of the operator sets.
+    """
     if node.domain not in ("", "ai.onnx"):
         return []
     if node.op_type in OF_SHAPES and node.input and node.input[0] in shapes:

@@ -251,7 +251,7 @@ def _cores(place: Place) -> str:
 
 
 def unit_rows(placement: Placement) -> dict[str, Any]:
-    """Return `cores` and `threads` of each unit for JSON."""
+    """Return, by unit of `placement`, a row with `cores` and `threads` for JSON."""
     return {unit: {"cores": list(place.cores), "threads": place.threads} for unit, place in placement.items()}
 
 
@@ -261,7 +261,7 @@ def placement_of(rows: Mapping[str, Any]) -> Placement:
 
 
 def predictions(best: Ranked, rule: Ranked, found: Sequence[Ranked]) -> dict[str, Any]:
-    """Return the predictions of a placement as keys of a report.
+    """Return the keys `predicted_ms`, `rule_ms`, `rule` and `alternatives` of a report's `placement`.
 
     `best`: placement that was chosen.
     `rule`: placement that suits any run.

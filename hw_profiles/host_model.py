@@ -78,7 +78,7 @@ class Placed(NamedTuple):
 
     @property
     def facts(self) -> dict[str, Any]:
-        """The key `placement` of a prediction."""
+        """The value of a prediction's key `placement`: `units`, and the keys of `predictions`."""
         return {"units": unit_rows(self.best.placement), **predictions(self.best, self.rule, self.found)}
 
 
@@ -148,7 +148,7 @@ def _times(profile: Profile, plan: Plan, corners: Corners, cores: int, given: Pl
 
 
 def with_threads(unit: Unit, threads: int) -> Unit:
-    """Return the network's unit with `threads` threads; its peak rates are in proportion to them."""
+    """Return the network's unit with `threads` threads, and peak rates in proportion to this number."""
     scale = threads / unit.threads
     rates: dict[str, Quantity] = {name: getattr(unit, name) for name in PEAKS}
     scaled = {name: rate.model_copy(update={"value": rate.or_else(0.0) * scale}) for name, rate in rates.items()}

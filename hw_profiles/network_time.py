@@ -91,7 +91,7 @@ class Interval(NamedTuple):
 
 
 def spread_of(around: Interval) -> float:
-    """Return the standard deviation of the time's logarithm that an interval stands for."""
+    """Return the standard deviation of the time's logarithm for which the 80 % interval `around` stands."""
     return math.log(around.high_ms / around.low_ms) / 2 / NORMAL_80
 
 
@@ -333,9 +333,10 @@ def _times(time: NetworkTime, around: Interval) -> dict[str, Any]:
 
 
 def operator_rows(work: Work, time: NetworkTime) -> list[dict[str, Any]]:
-    """Return a row for each operator in the order of the file, with its bound and its share of the network's time.
+    """Return a row for each operator, in the order of the file.
 
-    An operator that the unit's runtime folds into another one has no row.
+    Its keys are `name`, `op_type`, `ms`, `share` of the network's time, `bound`, `macs` and `elements`. An operator
+    that the unit's runtime folds into another one has no row.
     """
     counts = {operator.name: (operator.macs, operator.moved) for operator in work.operators}
     total_ms = time.total_ms
@@ -354,7 +355,7 @@ def operator_rows(work: Work, time: NetworkTime) -> list[dict[str, Any]]:
 
 
 def without_rule(work: Work) -> list[dict[str, Any]]:
-    """Return a row for each type of operators without a rule: their number, and their share of all moved elements."""
+    """Return a row for each operator type without a rule: `op_type`, `count`, `share_of_elements` that it moves."""
     moved = Counter[str]()
     for operator in work.operators:
         if not operator.ruled:

@@ -269,7 +269,7 @@ def _costs_nothing(node: Any, constants: set[str]) -> bool:
 
 
 def _live_counts(graph: Any, shapes: Shapes, constants: set[str]) -> list[int]:
-    """Return for each node the elements of all results so far that later nodes read or that are outputs."""
+    """Return for each node how many elements exist after it, because later nodes read them or they are outputs."""
     last_use = {name: index for index, node in enumerate(graph.node) for name in node.input if name not in constants}
     last_use |= {output.name: len(graph.node) for output in graph.output}
     freed: dict[int, int] = {}

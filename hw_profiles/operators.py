@@ -473,7 +473,7 @@ def _movement(node: Any, kind: str, moved: int, names: _Graph) -> Iterator[tuple
 
 
 def _padded(shape: tuple[int, ...], block: int) -> int:
-    """Return the number of elements of a tensor whose channels, the second axis, are rounded up to whole blocks."""
+    """Return the elements of a tensor of `shape` with its channels, the second axis, rounded up to whole blocks."""
     if len(shape) != 4:
         return prod(shape)
     return shape[0] * _up(shape[1], block) * shape[2] * shape[3]
@@ -500,7 +500,7 @@ def _products(node: Any, shapes: Shapes) -> Iterator[tuple[str, float]]:
 
 
 def _padding(count: int, block: int) -> float:
-    """Return the number of channels rounded up to whole blocks, divided by the number of channels."""
+    """Return `count` channels rounded up to whole blocks, divided by `count`."""
     return _up(count, block) / count
 
 
@@ -533,6 +533,7 @@ def _grouped(places: int, c_in: int, c_out: int, groups: int, stride: int) -> It
 
     `places`: number of output positions times number of kernel positions.
     `c_in`, `c_out`: input and output channels of all groups together.
+    `stride`: stride of the kernel.
     """
     if c_in > groups:
         yield "grouped", places * _up(c_in // groups, INPUT_BLOCK) * _up(c_out, OUTPUT_BLOCK)

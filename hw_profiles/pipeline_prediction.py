@@ -198,7 +198,7 @@ def _without_a_time(file: PipelineFile, names: Sequence[str], measured: Measured
 
 
 def factors_at(prices: Mapping[str, StagePrice], end: Ends) -> dict[str, float]:
-    """Return for each stage its time at an end of its interval, divided by its expected time."""
+    """Return, by stage, its time at `end` of its interval, divided by its expected time."""
     found = {}
     for name, each in prices.items():
         at = {"expected": None, "low": each.low_ms, "high": each.high_ms}[end]
@@ -207,7 +207,7 @@ def factors_at(prices: Mapping[str, StagePrice], end: Ends) -> dict[str, float]:
 
 
 def bound_of(file: PipelineFile, prices: Mapping[str, StagePrice]) -> tuple[Graph, PeriodBound]:
-    """Return the scheduler's graph of a file and the bound on its period, from the mean times of its stages."""
+    """Return (scheduler's graph of `file`, lower bound on its period, from the mean times of its stages)."""
     times = {name: each.mean_ns for name, each in prices.items()}
     graph = graph_of(file, edge_rules(file))
     return graph, period_bound(graph, times, in_flight_of(file), source_ns(file), shares_of(file))
@@ -288,7 +288,7 @@ def predict_file(
 
 
 def _without_intervals(answer: dict[str, Any]) -> dict[str, Any]:
-    """Return the prediction with None for its intervals, because the error of a stage is not known."""
+    """Return the prediction `answer` with None for its intervals, because the error of a stage is not known."""
     for key in ("needs_ms", "frame_time_ms", "latency_ms"):
         answer[key] = {**answer[key], "low": None, "high": None}
     if rate := answer.get("rate"):
@@ -401,7 +401,7 @@ def _intervals(
     needs: FrameInterval,
     seed: int,
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the intervals of the mean frame time and of the mean latency, from short simulated runs at both ends.
+    """Return (interval of the mean frame time, interval of the mean latency), from short simulated runs at both ends.
 
     If no frame is dropped, the interval of the frame time comes from `needs` and the period of the source.
     """

@@ -144,7 +144,8 @@ def what_if(
 ) -> list[dict[str, Any]]:
     """Return a row for the network under each of `ALTERNATIVES` that the unit allows.
 
-    With `fps`, return a row for every policy with every edge, which says whether the rate holds, and at which power.
+    A row has `name`, `policy`, `edge`, `frame_ms`, `fps` and `latency_ms`. With `fps`, return a row of `at_rate` for
+    every policy with every edge instead.
 
     `profile`: hardware profile of the chip.
     `network`: network that runs.
@@ -401,7 +402,7 @@ def every_variant() -> Iterator[Variant]:
 def at_rate(profile: Profile, plan: Plan, corners: Corners, fps: float) -> dict[str, Any]:
     """Return one row of the comparison at a rate.
 
-    Its keys say whether the rate holds, which share of frames is dropped, and how much power the device takes.
+    Besides the keys of `what_if`, the row has `holds`, `dropped` (share of frames) and `power_w` of the device.
 
     `profile`: hardware profile of the chip.
     `plan`: application that runs on it.

@@ -170,7 +170,7 @@ class ConfigurationRow:
         return value
 
     def range(self, column: str) -> tuple[float, float] | None:
-        """Return the values of `column`_min and `column`_max; None if one of them is blank. Raises BadInputError."""
+        """Return (value of `column`_min, value of `column`_max); None if a value is blank. Raises BadInputError."""
         low, high = self.number(f"{column}_min"), self.number(f"{column}_max")
         if low is None or high is None:
             return None
@@ -265,7 +265,7 @@ def _basic_block(b: GraphBuilder, x: TensorRef, width: int, stride: int) -> Tens
 
 
 def _squeeze(b: GraphBuilder, x: TensorRef) -> TensorRef:
-    """Append squeeze-and-excitation, and return its result: mean over the picture, two 1x1 convolutions, gate."""
+    """Append squeeze-and-excitation of `x`: mean over the picture, two 1x1 convolutions, gate. Return the result."""
     inner = squeeze_channels(x.channels)
     pooled = b.op("GlobalAveragePool", [x.name], (x.channels, 1, 1))
     hidden = b.same("Relu", b.conv(pooled, inner, 1, bias=True))
@@ -382,7 +382,7 @@ class GraphBuilder:
         return self.op(kind, [x.name, *more], x[1:], **attributes)
 
     def normed(self, x: TensorRef) -> TensorRef:
-        """Append the normalisation that `norm` of the builder names."""
+        """Append the normalisation of `x` that `norm` of the builder names."""
         if self.norm == "batch":
             return x
         scales = [self.weight((x.channels,)), self.weight((x.channels,))]
@@ -402,7 +402,7 @@ class GraphBuilder:
         return y if act is None else self.same(act, y)
 
     def upsampled(self, x: TensorRef) -> TensorRef:
-        """Append a resize to twice the size, by nearest neighbour."""
+        """Append a resize of `x` to twice the size, by nearest neighbour."""
         shape = (x.channels, 2 * x.height, 2 * x.width)
         return self.op("Resize", [x.name, "", self.twice.name], shape, mode="nearest")
 
@@ -413,7 +413,7 @@ class GraphBuilder:
         return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 21)])
 
     def add(self, x: TensorRef, y: TensorRef) -> TensorRef:
-        """Return the sum of two tensors of one size."""
+        """Append the sum of `x` and `y`, which have the same size."""
         return self.op("Add", [x.name, y.name], x[1:])
 
 

@@ -96,7 +96,10 @@ def _run(
 ) -> Sequence[Simulation]:
     """Return the simulated runs of `tenants` for `seconds` of virtual time.
 
+    `costs`: times of the tenants' jobs.
+    `turns`: name in TURNS.
     `fed`: index of the tenant whose source is always ready; None: no such tenant.
+    `keep`: whether the steps and jobs of each run are recorded.
     """
     stop = round(NS_PER_S * seconds), Stop()
     cores: dict[str, str] = {name: unit.core for name, unit in profile.units.items() if unit.core}
@@ -187,7 +190,7 @@ class _Costs:
         return self.jobs[job.tenant].network_ms(job.network, use)
 
     def _demand(self, job: _Job) -> float:
-        """Return the share of the bandwidth that a network takes while it runs, 0 to 1."""
+        """Return the share of the bandwidth that the network of `job` takes while it runs, 0 to 1."""
         moved = self.jobs[job.tenant].moved_bytes(job.network)
         return moved / (self._ms(job, self._always) / 1e3) / self._bytes_s
 
@@ -316,7 +319,10 @@ def _kept(report: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _settled_ms(moments: Sequence[Moment], at: Callable[[Corners], Together], number: int) -> float | None:
-    """Return the mean frame time of tenant `number` in ms in the last fifth of the moments; None without moments."""
+    """Return the mean frame time of tenant `number` in ms in the last fifth of the moments; None without moments.
+
+    `at`: function that returns the settled state at given corners.
+    """
     last = last_fifth(moments)
     return _mean([at(each.corners).runs[number].report["frame_time_ms"]["mean"] for each in last]) or None
 

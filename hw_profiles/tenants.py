@@ -73,10 +73,13 @@ class Jobs(Protocol):
     def is_known(self) -> bool: ...
 
     def service_ns(self, stage: str, unit: str, frame: int, begin_ns: int) -> int:
-        """Return the time of a job in ns if no other tenant runs."""
+        """Return the time in ns of the job of `stage` for `frame` on `unit`, if no other tenant runs.
+
+        `begin_ns`: virtual time at which the job begins.
+        """
 
     def network(self, stage: str, frame: int) -> Hashable | None:
-        """Return a name for the network that a job computes; None if the job computes none."""
+        """Return a name for the network that the job of `stage` for `frame` computes; None if it computes none."""
 
     def network_ms(self, network: Any, use: float) -> float:
         """Return the time of a job with `network` in ms, while other jobs take the share `use` of the bandwidth."""
@@ -133,7 +136,7 @@ class SharingPipeline(Protocol):
         """
 
     def skips(self, frame: int, is_fresh: bool) -> bool:
-        """Return whether a frame takes the bypass of the graph."""
+        """Return whether a frame takes the bypass of the graph. `is_fresh`: whether its job is fresh."""
 
     def on(self, profile: Profile, corners: Corners, end: Ends, always: float) -> Jobs:
         """Return the times of its jobs on the chip `profile`.
@@ -148,7 +151,7 @@ class SharingPipeline(Protocol):
 
 
 def check_rate(name: str, fps: float) -> None:
-    """Raise BadInputError for a rate out of range."""
+    """Raise BadInputError if `fps`, frames a second, is out of range. `name`: name of the tenant, for the message."""
     if not LEAST_FPS <= fps <= MOST_FPS:
         raise BadInputError(f"{name}: rate", f"{fps:g}", f"{LEAST_FPS:g} to {MOST_FPS:g} frames a second")
 

@@ -119,7 +119,7 @@ class PlacedCamera:
         return view_from_pose(self.turn @ turn @ self.mount, at)
 
     def reach(self) -> tuple[F64, F64]:
-        """Return the (lowest, highest) coordinates (3,) of the camera in the scene, metres; it may move along ways."""
+        """Return the (lowest, highest) coordinates (3,) of the camera in the scene, metres, over its whole movement."""
         places = self.path.places @ self.turn.T + self.shift
         low, high = places.min(axis=0), places.max(axis=0)
         if self.ways:
@@ -158,7 +158,7 @@ def steered(view: F64, pivot: F64, azimuth_deg: float, elevation_deg: float, zoo
 
 
 def _turn(arm: F64, azimuth_deg: float, elevation_deg: float) -> F64:
-    """Return the rotation (3, 3) that steers a camera at `arm` (3,) from the pivot.
+    """Return the rotation (3, 3) that steers a camera at `arm` (3,) from the pivot. Angles are as in `steered`.
 
     The elevation stays between LOWEST_DEG and HIGHEST_DEG. If the camera's own elevation is outside this range, the
     range is widened to it.
@@ -300,6 +300,9 @@ def _from_the_middle(path: CameraPath) -> tuple[CameraPath, F64, F64]:
 
 
 def _tilt_deg(path: CameraPath, times: F64) -> float:
-    """Return the angle, degrees, by which the camera is tilted up to bring its median line of sight into SIGHT_DEG."""
+    """Return the angle, degrees, by which the camera is tilted up to bring its median line of sight into SIGHT_DEG.
+
+    `times` (F,): moments of the median, seconds.
+    """
     sight = float(np.median([np.degrees(np.arcsin(np.clip(-path.pose(float(t))[0][1, 2], -1, 1))) for t in times]))
     return float(np.clip(np.clip(sight, *SIGHT_DEG) - sight, -LARGEST_TILT_DEG, LARGEST_TILT_DEG))

@@ -60,7 +60,7 @@ SCREEN = Rect(-1.0, -1.0, 1.0, 1.0)
 
 
 def choose_bucket(rect: Rect, output: Shape, buckets: Sequence[Shape]) -> tuple[Shape, Rect]:
-    """Return the tensor shape that wastes the least area on `rect`, and `rect` grown to that shape's aspect ratio.
+    """Return (tensor shape that wastes the least area on `rect`, `rect` grown to the aspect ratio of that shape).
 
     The grown rectangle contains `rect`, and is moved onto the screen if it fits there. A side that is longer than the
     screen extends beyond both edges of the screen by the same length. Of two shapes that waste the same area, the
@@ -88,7 +88,7 @@ def choose_bucket(rect: Rect, output: Shape, buckets: Sequence[Shape]) -> tuple[
 
 
 def grow(low: float, high: float, length: float) -> tuple[float, float]:
-    """Return the ends of an interval of `length` about the middle of [low, high].
+    """Return the (lower, upper) end of an interval of `length` about the middle of [`low`, `high`], NDC.
 
     The interval is moved into [-1, 1] if it fits; otherwise it is centred on 0.
     """
@@ -361,7 +361,7 @@ def tight_shape(rects: Sequence[Rect], output: Shape, density: float = 1.0, marg
 
 
 def _pixels(rect: Rect, output: Shape) -> tuple[int, int]:
-    """Return (height, width) in pixels of a rectangle on the pixel grid of a picture of `output`."""
+    """Return (height, width) in pixels of `rect`, a rectangle on the pixel grid of a picture of `output`."""
     return round(rect.height * output[0] / 2), round(rect.width * output[1] / 2)
 
 
@@ -393,7 +393,10 @@ def _arrangements(
 
 
 def _rows(sizes: Sequence[tuple[float, float]]) -> Iterator[tuple[tuple[int, ...], ...]]:
-    """Yield the avatars' indices, tallest avatar first, divided into one row, two rows, and so on."""
+    """Yield the avatars' indices, tallest avatar first, divided into one row, two rows, and so on.
+
+    `sizes`: (height, width) of each avatar.
+    """
     order = sorted(range(len(sizes)), key=lambda k: -sizes[k][0])
     for count in range(1, len(order) + 1):
         each = math.ceil(len(order) / count)

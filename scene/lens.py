@@ -186,12 +186,18 @@ class Lens:
 
 
 def centred(width_px: float, height_px: float, focal_px: float, known: Known = Known.ALL) -> Lens:
-    """Return a lens with square pixels, whose principal point is the middle of its picture."""
+    """Return a lens with square pixels, whose principal point is the middle of its picture.
+
+    `focal_px`: both focal lengths, pixels. The other parameters are those of `Lens`.
+    """
     return Lens(width_px, height_px, focal_px, focal_px, width_px / 2, height_px / 2, known)
 
 
 def of_opencv(width_px: float, height_px: float, fx: float, fy: float, cx: float, cy: float) -> Lens:
-    """Return a lens from numbers of OpenCV or Kalibr, which count `cx` and `cy` from the centre of the first pixel."""
+    """Return a lens from numbers of OpenCV or Kalibr, which count `cx` and `cy` from the centre of the first pixel.
+
+    The parameters are otherwise those of `Lens`.
+    """
     return Lens(width_px, height_px, fx, fy, cx + 0.5, cy + 0.5)
 
 
@@ -263,7 +269,10 @@ def distortion_note(lenses: Iterable[Bent]) -> tuple[str, ...]:
 
 
 def largest_px(lens: Lens, parameters: Mapping[str, float], is_fisheye: bool = False) -> float:
-    """Return the largest distance, pixels, by which distortion moves a point on the picture's border."""
+    """Return the largest distance, pixels, by which distortion moves a point on the picture's border.
+
+    `parameters`, `is_fisheye`: as in `Bent`.
+    """
     part = np.linspace(0.0, 1.0, BORDER_STEPS)
     zero, one = np.zeros(BORDER_STEPS), np.ones(BORDER_STEPS)
     border = np.column_stack([np.concatenate([part, part, zero, one]), np.concatenate([zero, one, part, part])])

@@ -61,7 +61,7 @@ class Table(StrictModel):
 
 
 class OutputSpec(Table):
-    """The table `output` of a scene: size of the shown picture."""
+    """The size of the shown picture."""
 
     width: int = Field(
         default=640, ge=64, le=MAX_SIDE, multiple_of=2, description="Width of the shown picture, pixels."
@@ -72,7 +72,7 @@ class OutputSpec(Table):
 
 
 class AvatarSpec(Table):
-    """A table of `avatars` of a scene: an avatar, its place, and its motion."""
+    """An avatar, with its place and its motion."""
 
     name: str | None = Field(
         default=None,
@@ -178,7 +178,7 @@ FILE_KEYS = ("format", "up_axis", "metres_per_unit", "rate_hz", "time_unit", "ax
 
 
 class CameraSpec(Table):
-    """The table `camera` of a scene: source, lens and place of the camera."""
+    """The camera, with its source, lens and place."""
 
     source: str = Field(default="builtin:orbit", description="`builtin:NAME`, a file or a folder.")
     format: Literal["auto", "arkit", "colmap", "euroc", "kitti", "nerf", "record3d", "stray", "tum"] = Field(
@@ -259,7 +259,7 @@ class CameraSpec(Table):
 
 
 class PlaneSpec(Table):
-    """A table of `planes` of a scene: a rectangle to show, such as a plane that a phone detected."""
+    """A plane to show, such as one that a phone has detected: a rectangle."""
 
     centre: Annotated[tuple[Finite, Finite, Finite], LISTED] = Field(
         default=(0.0, 0.0, 0.0), description="Centre of the rectangle in the world: x, y, z in metres."
@@ -299,7 +299,7 @@ def _scene_size(size: str) -> str:
 
 
 class Scene(Table):
-    """The content of a scene file: what the pictures show, and how it is drawn."""
+    """The content of a scene: what its pictures show, and how they are drawn."""
 
     name: str = Field(default="scene", min_length=1, max_length=80, pattern=NAME, description="Name of the scene.")
     fps: float = Field(

@@ -232,7 +232,7 @@ def _is_enough(share: float) -> bool:
 def _shares(
     camera: PlacedCamera, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]
 ) -> tuple[float, float]:
-    """Return (share of the frames in which the camera shows the bodies, mean height of the bodies).
+    """Return (share of the frames in which `camera` shows the bodies, mean height of the bodies).
 
     The height is a share of the picture's height.
     """

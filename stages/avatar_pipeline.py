@@ -184,7 +184,7 @@ def _thrown_away(checked: Checked) -> Iterator[RunConfig]:
 
 
 def _spinning(placement: Placement, cores: int) -> dict[str, Any]:
-    """Return settings in which a unit's threads spin if there are enough cores for the unit to share none in the run.
+    """Return each unit's settings in `placement`. Threads spin if there are so many cores that no unit shares one.
 
     `cores`: number of available cores.
     """

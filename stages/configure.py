@@ -185,7 +185,7 @@ def configure(
 
 
 def requested_runtime(asked: str) -> tuple[str, str]:
-    """Return (runtime, reason): the requested one, or for `auto` the fastest installed one.
+    """Return (runtime, reason): the runtime `asked`, or for `auto` the fastest installed runtime.
 
     Raises BadInputError, MissingPartError.
     """
@@ -248,7 +248,7 @@ def _accuracy(avatars: Sequence[tuple[AvatarData, int]], drawn: DrawnAs) -> dict
 
 
 def skinning_unit(asked: str, gl: GlFacts = gl_facts) -> tuple[str, str]:
-    """Return (`cpu` or `gpu`, reason): the requested unit, or for `auto` the GPU if the driver is hardware.
+    """Return (`cpu` or `gpu`, reason): the unit `asked`, or for `auto` the GPU if its driver is hardware.
 
     Raises BadInputError for another word.
     """
@@ -262,7 +262,7 @@ def skinning_unit(asked: str, gl: GlFacts = gl_facts) -> tuple[str, str]:
 
 
 def required_machine(gl: GlFacts = gl_facts) -> dict[str, Any]:
-    """Return facts about this machine.
+    """Return `machine_facts` of this machine. `gl`: function that returns facts about the OpenGL driver.
 
     Raises MissingPartError if no OpenGL context can be made, TrilaneError if memory is short.
     """

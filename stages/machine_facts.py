@@ -68,7 +68,7 @@ def cpu_facts() -> dict[str, Any]:
 
 
 def open_gl() -> dict[str, Any]:
-    """Open an OpenGL context in this process and describe it. Raises MissingPartError if none can be opened."""
+    """Open an OpenGL context in this process, and return facts about its driver and limits. Raises MissingPartError."""
     from trilane.stages.gpu.opengl import describe, open_context
 
     context = open_context()
@@ -85,7 +85,7 @@ def open_gl() -> dict[str, Any]:
 
 @cache
 def gl_facts() -> dict[str, Any] | None:
-    """Return facts about the OpenGL driver that EGL gives; None if no driver works.
+    """Return the facts of `open_gl` about the driver that EGL gives; None if no driver works.
 
     A process of its own tries the driver, because a driver may crash.
     """
@@ -99,7 +99,7 @@ def gl_facts() -> dict[str, Any] | None:
 
 
 def runtime_facts() -> dict[str, Any]:
-    """Return the installed inference runtimes, and the devices on which each can run."""
+    """Return, by package of an installed runtime, the devices or providers on which it can run."""
     import onnxruntime
 
     facts: dict[str, Any] = {"onnxruntime": list(onnxruntime.get_available_providers())}

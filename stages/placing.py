@@ -129,7 +129,10 @@ def considered(cores: Sequence[CpuCore], asked: Placement) -> list[CpuCore]:
 
 
 def times_rows(times: Times) -> list[dict[str, Any]]:
-    """Return the measured times as rows, one for each unit and number of threads. Times are in ms."""
+    """Return a row for each unit and number of threads, with the measured times of a frame.
+
+    Its keys are `unit`, `threads`, `ms`, and `core_ms`, the CPU time of all threads.
+    """
     return [
         {"unit": unit, "threads": threads, "ms": work.serial_ns / NS_PER_MS, "core_ms": work.core_ns / NS_PER_MS}
         for unit, works in times.items()
@@ -138,7 +141,7 @@ def times_rows(times: Times) -> list[dict[str, Any]]:
 
 
 def _why_not(checked: Checked, cores: Sequence[CpuCore]) -> str:
-    """Return the reason why this run is not rehearsed, as text; empty if it is rehearsed."""
+    """Return the reason why the run `checked` is not rehearsed on `cores`, as text; empty if it is rehearsed."""
     if len(checked.asked_cores) == len(UNITS):
         return "as asked"
     if len(cores) == 1:
@@ -191,7 +194,10 @@ def _kept(
     made_from: Sequence[str],
     say: Callable[[str], None],
 ) -> tuple[Rehearsed, str]:
-    """Return (the time that each unit needs for a frame, when it was measured, UTC)."""
+    """Return (the time that each unit needs for a frame, when it was measured, UTC).
+
+    `made_from`: result of `_made_from`. `rule`: placement that suits any run.
+    """
 
     def measured() -> dict[str, NDArray[Any]]:
         say(MEASURING)
@@ -214,7 +220,7 @@ def _kept(
 
 
 def _made_from(checked: Checked, cores: Sequence[CpuCore], rule: Placement) -> list[str]:
-    """Return everything that the times depend on, as text."""
+    """Return all facts on which the times of a rehearsal depend, as texts."""
     config = checked.config
     said = config.model_dump_json(exclude={"out_dir", "units", "scene", "pace_ns"})
     scene = config.scene.model_dump_json(exclude={"name", "frames", "fps"})

@@ -100,7 +100,7 @@ class LiveWindow:
 
     @classmethod
     def opened(cls, path: Path, height: int, width: int) -> LiveWindow:
-        """Return the window at `path`; raises OSError."""
+        """Return the window at `path` for pictures of `height` x `width` pixels; raises OSError."""
         fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         try:
             return cls(fd, height, width)
@@ -114,7 +114,7 @@ class LiveWindow:
         self._head["looked_ns"] = time.monotonic_ns()
 
     def steer(self, steering: Steering) -> None:
-        """Steer the camera from the next frame on."""
+        """Turn and zoom the run's camera by `steering` from the next frame on."""
         for name, value in zip(Steering._fields, steering, strict=True):
             self._head[name] = value
 

@@ -228,7 +228,7 @@ class JobPipeEnd(NamedTuple):
 
 
 def job_pipe_pair() -> tuple[JobPipeEnd, JobPipeEnd]:
-    """Return the two ends of a new job pipe; raises TrilaneError when this user or process may open no more pipes."""
+    """Return both ends of a new job pipe, which are alike; raises TrilaneError when no more pipes may be opened."""
     fds: list[int] = []
     try:
         for _ in range(2):

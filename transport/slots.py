@@ -137,7 +137,7 @@ class EdgeSlots:
         return bool(self.free) or (self.rule.yields and self._evictable(keeps) >= 0)
 
     def claim(self, frame: int, keeps: Keeps = _keeps_none) -> tuple[int, int | None]:
-        """Claim a slot for `frame`; return the slot and the waiting frame that was evicted from it, or None.
+        """Claim a slot for `frame`; return (slot, waiting frame that was evicted from it, or None).
 
         Without `keeps`, the oldest frame of the last line is evicted first: frames on a bypass wait in that line, and
         no later frame needs them. With `keeps`, the oldest frame of all lines that may be evicted is evicted. Raises
@@ -267,7 +267,7 @@ class EdgeSlots:
         return [self.drop(each) for each in old if keeps is None or not keeps(self.frame[each])]
 
     def _evictable(self, keeps: Keeps) -> int:
-        """Return the slot whose frame `claim` evicts; -1 if no frame may be evicted."""
+        """Return the slot whose frame `claim` evicts; -1 if no frame may be evicted. `keeps`: as in `claim`."""
         found = -1
         for line in reversed(self.lines):
             for slot in line:

@@ -264,7 +264,7 @@ ENDINGS = (".bin", ".txt")
 
 
 def model_in(folder: Path) -> tuple[Path, str] | None:
-    """Return the folder at or below `folder` that holds a model, and the suffix of its files; None without a model."""
+    """Return (folder at or below `folder` that holds a model, suffix of the model's files); None without a model."""
     for below in BELOW:
         for ending in ENDINGS:
             if all((folder / below / f"{name}{ending}").is_file() for name in ("cameras", "images")):

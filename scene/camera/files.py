@@ -251,7 +251,7 @@ def _unevenness(column: F64) -> float:
 
 
 def _of_matrices(path: Path, numbers: F64, up_axis: str, axes: str) -> Guess:
-    """Return the format of a table (N, 12 or 13) of 3x4 matrices: KITTI or ARKit.
+    """Return the format of a table of 3x4 matrices, KITTI or ARKit. `numbers`: (N, 12), or (N, 13) with times.
 
     Cameras of KITTI and ARKit look along opposite axes. Therefore poses that fit both formats raise BadInputError,
     unless the scene states `axes`.
@@ -320,13 +320,13 @@ def _require_row_order(path: Path, matrices: F64, columns: str, kind: str, slack
 
 
 def _signs(matrices: F64, up_axis: str, times: F64 | None) -> dict[str, tuple[str, ...]]:
-    """Return, in words, which features of poses (N, 3, 4) speak for KITTI, and which speak for ARKit, by format.
+    """Return, by format, which features of the poses `matrices` (N, 3, 4) speak for KITTI and for ARKit, in words.
 
     `up_axis`: axis that is up, by the scene. `times` (N,): times of the table; None if it has no times.
 
     KITTI's axes are x right, y down, looking along +Z. If the table has times, two features speak for ARKit, because
     other programs seldom write times before such matrices: the clock of a device, and Y up. A device that is held
-    upright fits both directions of Z, so this feature speaks for ARKit only if the table has no times.
+    upright fits both directions of Z. Therefore an upright device speaks for ARKit only if the table has no times.
     """
     turns, places = matrices[:, :, :3], matrices[:, :, 3]
     ups = ("z", "y") if up_axis == AUTO else (up_axis,)
@@ -459,9 +459,9 @@ def _has_digits(numbers: F64) -> bool:
 
 
 def _astray(turns: F64, places: F64) -> float:
-    """Return how far cameras look away from where they go, or from the point that they go round.
+    """Return how far cameras look away from where they go or from a point that they go round, the less of both.
 
-    A result below 1 means that the cameras look at such a point. The result is infinite if there are too few cameras.
+    A result below 1 means that they look there. The result is infinite if there are too few cameras.
     `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes.
     """
     if len(places) < LEAST_LED:
@@ -533,7 +533,7 @@ BODY_AXES = "forward-left-up"
 
 
 def _require_camera(path: Path, raw: RawCamera, kind: str, spec: CameraSpec) -> None:
-    """Raise BadInputError if the poses more likely belong to a vehicle's body than to a camera.
+    """Raise BadInputError if the poses of `raw` more likely belong to a vehicle's body than to a camera.
 
     Nothing is checked if the scene states axes or up, or if the poses of the format have OpenGL axes.
     """

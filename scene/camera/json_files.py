@@ -104,7 +104,10 @@ def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
 
 
 def _nerf_lenses(path: Path, content: Mapping[str, Any], frames: Sequence[Any]) -> tuple[tuple[Lens, ...], str]:
-    """Return (one lens for all views, or one for each if any view has its own keys; source of the lenses in words)."""
+    """Return (one lens for all views, or one for each if any view has its own keys; source of the lenses in words).
+
+    `content`: the file's object. `frames`: its views.
+    """
     _check_models(path, (content, *frames))
     if not any(key in frame for frame in frames if isinstance(frame, dict) for key in LENS_KEYS):
         lens, source = _nerf_lens(path, content, "")
@@ -138,7 +141,7 @@ def _distortion(
 
 
 def _real(path: Path, content: Mapping[str, Any], key: str) -> float:
-    """Return the number at `key`, 0 if the key is absent. Raises BadInputError when it is not a finite number."""
+    """Return the number at `key` of `content`, 0 without the key. Raises BadInputError if it is not a finite number."""
     value = content.get(key, 0.0)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise BadInputError(f"{path}: {key}", repr(value)[:40], "a number")
@@ -146,7 +149,7 @@ def _real(path: Path, content: Mapping[str, Any], key: str) -> float:
 
 
 def _pictures(frames: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
-    """Return the name of each view's photo, as the file states it; () if any view has no photo."""
+    """Return the name of the photo of each of `frames`, as the file states it; () if any view has no photo."""
     names = tuple(frame.get("file_path") for frame in frames)
     return tuple(str(name) for name in names) if all(isinstance(name, str) and name for name in names) else ()
 
@@ -276,7 +279,7 @@ def load_record3d(path: Path, rate_hz: float | None = None) -> RawCamera:
 
 
 def _array(path: Path, content: Mapping[str, Any], key: str, columns: int) -> F64:
-    """Return the table (N, `columns`) at `key`. Raises BadInputError when it has another shape."""
+    """Return the table (N, `columns`) at `key` of `content`. Raises BadInputError when it has another shape."""
     try:
         array = np.array(content.get(key), dtype=np.float64)
     except (TypeError, ValueError):

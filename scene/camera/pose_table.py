@@ -306,10 +306,9 @@ class TableClock(NamedTuple):
     usual_hz: float = FILM_RATE_HZ
 
     def stated(self, path: Path, unit: str) -> TableClock:
-        """Return this clock with the `unit` that column names state; the scene's own unit is kept.
+        """Return this clock with the `unit` that column names state, unless the scene states a unit itself.
 
-        The scene may say that the times are frame numbers. Raises BadInputError when the scene states another unit than
-        the names.
+        Raises BadInputError when the scene states another unit of time. Frame numbers may have names with any unit.
         """
         if unit != AUTO and self.unit not in (AUTO, FRAMES, unit):
             found = f'column names with times in {unit} and camera.time_unit = "{self.unit}"'
@@ -542,7 +541,10 @@ def _unevenness(column: F64) -> float:
 
 
 def _began(times: F64, unit: str) -> float | None:
-    """Return the first finite time in seconds since 1970; None if the times are not those of a clock."""
+    """Return the first finite time of `times` in seconds since 1970; None if the times are not those of a clock.
+
+    `unit`: unit of `times`, a key of TIME_UNITS or FRAMES.
+    """
     finite = times[np.isfinite(times)]
     if unit not in TIME_UNITS or not len(finite) or not _since_1970(float(finite[0]), unit):
         return None

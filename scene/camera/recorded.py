@@ -112,7 +112,7 @@ def _looked_at_height(turns: F64, places: F64, fov_y_deg: float) -> float | None
 
 
 def _speed(places: F64, times_s: F64) -> float:
-    """Return the median speed, units per second; 0 for a single position."""
+    """Return the median speed between `places` (N, 3) at `times_s` (N,), units per second; 0 for a single position."""
     if len(places) < 2:
         return 0.0
     return float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(times_s)))
@@ -147,7 +147,9 @@ def looked_at_from(turns: F64, places: F64) -> float | None:
 
 
 def meeting_point(turns: F64, places: F64) -> F64 | None:
-    """Return the point (3,) nearest to all lines of sight, before or behind the cameras; None if they are parallel.
+    """Return the point (3,) nearest to all lines of sight, before or behind the cameras; None for parallel lines.
+
+    `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes.
 
     The point x solves the normal equations of the distances: sum (1 - d d') (x - p) = 0 for positions p and unit
     directions d.
@@ -315,7 +317,9 @@ def _guesses(turns: F64, expected: str, prices: _Prices, stated: str) -> list[_G
 
 
 def _is_of_first(turns: F64, best: _Guess) -> bool:
-    """Return whether the world has the axes of the first picture of several, and `best` takes that picture's up as up.
+    """Return whether the world has the axes of the first picture, and the guess `best` takes that picture's up as up.
+
+    `turns` (N, 3, 3): camera axes; False for a single picture.
 
     SLAM maps are such worlds.
     """
@@ -379,7 +383,7 @@ def _note(best: _Guess, usual: str, stated: str) -> str:
 
 
 def _rival(best: _Guess, guesses: list[_Guess], stated: str) -> str:
-    """Return words on the second cheapest guess, if it is nearly as cheap but far from the best; otherwise ""."""
+    """Return words on the second cheapest of `guesses`, if it is nearly as cheap as `best` but far from it; else ""."""
     for guess in guesses:
         if guess.is_nadir and guess.name != best.name:
             return f"; {guess.name.upper()} up fits if it looks straight down: camera.up_axis decides"

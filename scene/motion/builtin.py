@@ -377,7 +377,10 @@ BUILTIN: dict[str, Callable[[], Motion]] = {
 
 
 def _closed(times: F64, poses: F64, places: F64, what: str) -> Motion:
-    """Return a motion that loops: its last frame equals its first. `what`: words for the note."""
+    """Return a motion that loops, because its last frame equals its first. `what`: words for the note.
+
+    `times` (T,): seconds. `poses` (T, 55, 3): axis-angle. `places` (T, 3): positions of the pelvis, metres.
+    """
     times = np.append(times, len(times) / RATE_HZ)
     poses, places = np.concatenate([poses, poses[:1]]), np.concatenate([places, places[:1]])
     notes = (f"built in: {what}, {RATE_HZ} frames/s",)

@@ -418,10 +418,10 @@ def tracks_of(bvh: Bvh, index_of: dict[str, int]) -> tuple[Tracks, NDArray[np.bo
 
 
 def _tip(bvh: Bvh, index: int, turns: F64, places: F64, least: float) -> F64 | None:
-    """Return the positions (T, 3) at which a joint's bone ends: its end site, or the farthest joint directly below it.
+    """Return the positions (T, 3) at which the bone of joint `index` ends.
 
-    A joint at the same place counts as the joint itself; thumbs do not count. The result is None if nothing below is
-    farther than `least`, in the file's unit.
+    The end is the end site, or the farthest joint directly below. A joint at the same place counts as the joint itself;
+    thumbs do not count. The result is None if nothing below is farther than `least`, in the file's unit.
     """
     here, found, reach = {index}, None, max(least, LEAST_LENGTH)
     for k, joint in enumerate(bvh.joints):

@@ -74,7 +74,7 @@ def places_in(array: NDArray[Any]) -> F64 | None:
 
 
 def _sound(places: F64) -> NDArray[np.bool_]:
-    """Return, for each frame (T,), whether all bones have a person's lengths, and nearly the same in all frames.
+    """Return a mask (T,) of the frames in which all bones have a person's lengths, nearly equal in all frames.
 
     `places`: positions (T, 22, 3).
     """
@@ -95,7 +95,10 @@ def _sound(places: F64) -> NDArray[np.bool_]:
 
 
 def _upright_parts(places: F64) -> NDArray[np.bool_]:
-    """Return, for each frame (T,), whether the hips are apart and the trunk is not folded."""
+    """Return a mask (T,) of the frames in which the hips are apart and the trunk is not folded.
+
+    `places`: positions (T, 22, 3).
+    """
     at = {name: places[:, index] for index, name in enumerate(NAMES)}
 
     def way(*names: str) -> F64:

@@ -86,7 +86,7 @@ class Wrap(enum.Enum):
 
 
 def wrapped_time(t_s: float, length_s: float, wrap: Wrap) -> float:
-    """Return the time in [0, length_s] whose frame is shown at `t_s`; 0 if the length is 0."""
+    """Return the time in [0, `length_s`] whose frame is shown at `t_s`; `wrap`: what follows the last frame."""
     if length_s <= 0:
         return 0.0
     if wrap is Wrap.HOLD:
@@ -322,7 +322,7 @@ def _readable(poses: F64, shift: F64) -> NDArray[np.bool_]:
 
 
 def _broken_as(poses: F64, shift: F64) -> str:
-    """Return what is wrong with the unreadable frames, in words."""
+    """Return what is wrong with the unreadable frames, in words. `poses`, `shift`: as in `_readable`."""
     not_finite = not (np.isfinite(poses).all() and np.isfinite(shift).all())
     with np.errstate(invalid="ignore"):
         is_far = bool((np.abs(np.where(np.isfinite(shift), shift, 0.0)) >= MAX_PLACE_M).any())

@@ -228,7 +228,7 @@ def _update(target: Any, items: list[Any]) -> None:
 
 
 def _dict_of(items: list[Any]) -> dict[str, Any]:
-    """Return a dict of alternating keys and values; integer keys become text, and keys of other types are left out."""
+    """Return a dict of `items`, alternating keys and values. Integer keys become text; other keys are left out."""
     keys = ((str(key) if type(key) is int and abs(key) < 1 << 64 else key) for key in items[::2])
     return {key: value for key, value in zip(keys, items[1::2], strict=True) if type(key) is str}
 
@@ -304,7 +304,9 @@ def _build(reader: _Reader, _value: Any) -> None:
 
 
 def _array(reader: _Reader, shape: Any, kind: Any, fortran: Any, raw: Any) -> NDArray[Any] | list[Any]:
-    """Return the array of a state, or the list of items of an array of objects.
+    """Return the array that NumPy stored as `shape`, dtype `kind`, order `fortran` and bytes `raw`.
+
+    For an array of objects, `raw` is the list of items, and so is the result.
 
     Raises ValueError unless `raw` has exactly the bytes that `shape` and `kind` require.
     """

@@ -83,11 +83,11 @@ class Retarget:
     notes: list[str] = field(default_factory=list)
 
     def bone(self, start: str, end: str) -> F64:
-        """Return the direction (3,) of a bone of the avatar at rest, as a unit vector."""
+        """Return the unit vector (3,) from joint `start` to joint `end` of the avatar at rest."""
         return unit(self.rest.bone(start, end)[0])
 
     def above(self, name: str) -> F64:
-        """Return the global rotations (T, 3, 3) of a joint's parent."""
+        """Return the global rotations (T, 3, 3) of the parent of joint `name`."""
         return self.turns[JOINT_NAMES[JOINT_PARENTS[JOINT_INDEX[name]]]]
 
     def lay(self, name: str, bone: F64, recorded: F64, evidence: list[Evidence]) -> None:
@@ -273,7 +273,7 @@ def _steeper(work: Retarget, planted: Sequence[_RecordedFoot]) -> tuple[float, f
 
 
 def _levelled(work: Retarget, name: str, base: F64) -> F64:
-    """Return the file's rotations (T, 3, 3) of a joint after one constant rotation; `base` if the file has none.
+    """Return the file's rotations (T, 3, 3) of joint `name` after one constant rotation; `base` if the file has none.
 
     The constant makes their mean equal to the mean of `base` (T, 3, 3). Means are over frames that stand, or over all
     frames if none stands.

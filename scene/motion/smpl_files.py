@@ -97,7 +97,7 @@ def turns_in(where: str, array: NDArray[Any], widths: Widths) -> JointTurns:
 
 
 def shapes(widths: Widths) -> str:
-    """Return the allowed shapes as text: `(T, 66), (T, 72) or (T, 156)`."""
+    """Return the allowed shapes of `widths` as text, such as `(T, 66), (T, 72) or (T, 156)`."""
     *others, last = [f"(T, {width})" for width in widths]
     return f"{', '.join(others)} or {last}" if others else last
 
@@ -253,7 +253,7 @@ def median_step_rad(poses: NDArray[np.float64]) -> float:
 
 
 def hands_note(poses: NDArray[np.float64]) -> str:
-    """Return a note on whether the fingers are posed."""
+    """Return a note that says whether the fingers are posed in `poses` (T, 55, 3), axis-angle."""
     return "posed (flat-hand zero)" if np.nan_to_num(poses[:, 25:]).any() else "all zero, flat"
 
 
@@ -416,7 +416,7 @@ def motion_of(where: str, source: str, values: Any, there: str = "") -> RawMotio
 
 
 def _layout_of(tables: list[FoundTable]) -> tuple[ArrayLayout, list[FoundTable]] | None:
-    """Return the first layout that any of `tables` has, and all tables that have it; None if no table has a layout."""
+    """Return (first layout that any of `tables` has, all tables that have it); None if no table has a layout."""
     for layout in LAYOUTS:
         found = [table for table in tables if all(table.has(key) for key in layout.needs)]
         if found:

@@ -103,7 +103,7 @@ SAME_SHARE, SAME_LEGS = 0.02, 0.003
 
 
 def standing_frames(tracks: Tracks, trunk: F64) -> NDArray[np.bool_]:
-    """Return, for each frame (T,), whether the person stands as straight as anywhere in the recording.
+    """Return a mask (T,) of the frames in which the person stands as straight as anywhere in the recording.
 
     Thighs must be in line with the vector `trunk` (T, 3), and the knees straight.
     """
@@ -133,9 +133,12 @@ def upward(tracks: Tracks, trunk: F64, stands: NDArray[np.bool_]) -> F64:
 
 
 def planted_frames(tracks: Tracks, side: str, foot: F64, up: F64) -> NDArray[np.bool_]:
-    """Return, for each frame (T,), whether a foot most likely lies flat: it hardly moves, and the leg is below the hip.
+    """Return a mask (T,) of the frames in which a foot most likely lies flat.
 
-    `foot` (T, 3): vector from the ankle to the toes. `up` (3,): up direction of the recording.
+    Such a foot hardly moves, and its leg is below the hip.
+
+    `side`: `left` or `right`. `foot` (T, 3): vector from the ankle to the toes. `up` (3,): up direction of the
+    recording.
     """
     below = angle_between(tracks.bone(f"{side}_ankle", f"{side}_hip"), up) < LEG_BELOW
     if tracks.frames == 1 or not below.any():
@@ -261,6 +264,7 @@ def _twist(held: F64, axis: F64, laid: F64, evidence: Sequence[Evidence]) -> F64
     """Return the rotation (3, 3) about `axis` (3,) that brings the evidence closest to its recorded directions.
 
     `held` (T, 3, 3): rotations before the twist. `laid` (3, 3): rotation that takes the rest bone to `axis`.
+    `evidence`: as in `limb_turns`.
     """
     cosine = sine = 0.0
     inside = transposed(held)

@@ -86,6 +86,7 @@ def engine_of(path: Path, runtime: str, shapes: Shapes, options: RuntimeOptions)
 
     `runtime`: name of the runtime.
     `shapes`: shape of each input by name.
+    `options`: options of the runtime.
 
     Raises BadInputError for a network that the runtime does not load, MissingPartError for an absent runtime.
     """

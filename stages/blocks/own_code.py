@@ -71,7 +71,7 @@ class OwnCode(PortedStage):
             self._guarded(own)
 
     def _write(self, found: object, outputs: Arrays) -> None:
-        """Copy the arrays that the code returned to the output slot. Raises TrilaneError for other values."""
+        """Copy `found`, the arrays that the code returned, to the output slot. Raises TrilaneError for other values."""
         if not isinstance(found, dict):
             found = dict.fromkeys(outputs, found) if len(outputs) == 1 else found
         self._check(found, outputs)

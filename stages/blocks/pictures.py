@@ -69,7 +69,7 @@ class Preparation:
         self._height_in, self._width_in, self._channels_in = picture.shape
 
     def _quantised(self, keys: Mapping[str, Any], where: str) -> tuple[float, float]:
-        """Return (step, zero point) of the network's numbers."""
+        """Return (step, zero point) of the network's numbers. `keys`, `where`: as in `Preparation`."""
         if self._dtype.kind == "f":
             return keys.get("step") or 1.0, float(keys.get("zero_point") or 0)
         if self._dtype.itemsize > 1 and keys.get("step") is None:
@@ -128,7 +128,10 @@ _DEFAULTS: Final = {"mean": 0.0, "sd": 1.0}
 
 
 def _each(values: Sequence[float] | None, channels: int, other: float, where: str) -> NDArray[np.float64]:
-    """Return a value for each channel (channels,). `other`: value of all channels if `values` is None."""
+    """Return a value for each channel (channels,).
+
+    `other`: value of all channels if `values` is None. `where`: place of the stage in its file, for errors.
+    """
     given = [other] if values is None else list(values)
     if len(given) not in (1, channels):
         expected = f"1 or {channels}, one for each channel"
@@ -137,7 +140,10 @@ def _each(values: Sequence[float] | None, channels: int, other: float, where: st
 
 
 def _layout(wanted: PortType, asked: str | None, where: str) -> tuple[str, tuple[int, int, int]]:
-    """Return (layout of a network's input, (height, width, channels) in it). `asked`: layout that the file states."""
+    """Return (layout of a network's input, (height, width, channels) of the picture in it).
+
+    `wanted`: type of the input. `asked`: layout that the file states. `where`: place of the stage in its file.
+    """
     shape = wanted.shape[-3:]
     if len(wanted.shape) not in (3, 4):
         expected = "one that reads pictures, 1xCxHxW or 1xHxWxC"
@@ -236,7 +242,7 @@ class Overlay(PortedStage):
         picture[..., :3] = chosen if where is None else np.where(where[..., None], chosen, picture[..., :3])
 
     def _draw(self, picture: U8, boxes: NDArray[np.float64]) -> None:
-        """Draw the outline of each box. `boxes`: (boxes, 4 or more): x0, y0, x1, y1, maybe score."""
+        """Draw the outlines of `boxes` (boxes, 4 or more) into `picture`: x0, y0, x1, y1, maybe score."""
         boxes = boxes[np.isfinite(boxes[:, :4]).all(axis=1)]
         if boxes.shape[1] > 4:
             boxes = boxes[boxes[:, 4] > 0]
@@ -263,7 +269,7 @@ def _channels(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _classes(mask: NDArray[Any]) -> U8:
-    """Return the class of each pixel (h,w)."""
+    """Return the class of each pixel (h,w) of `mask`, an output of a network."""
     planes = _channels(mask)
     if len(planes) > 1:
         return np.asarray(planes.argmax(axis=0) % CLASSES, np.uint8)

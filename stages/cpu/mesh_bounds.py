@@ -82,8 +82,9 @@ class Outermost:
         return np.concatenate(found) if len(found) == len(sides) else None
 
     def _project(self, vertices: F32, camera: F64, reach: F64) -> F64:
-        """Write the clip coordinates of `vertices`, and return the error bound of each coordinate (4,).
+        """Compute the clip coordinates of `vertices`, and return the error bound of each coordinate (4,).
 
+        `camera`: matrix (4,4) to clip space.
         `reach`: reach of a vertex's sphere along each clip coordinate (4,).
         """
         np.matmul(camera[:, :3].astype(np.float32), vertices.T, out=self._flat)
@@ -344,7 +345,10 @@ class MeshBounds:
         return bool((away < -self.reach_m * np.linalg.norm(planes[:, :3], axis=1)).any())
 
     def may_be_seen(self, posed: Posed, clip: ArrayLike) -> bool:
-        """Return False if the coarse patches show that no part of the mesh is on the screen, otherwise True."""
+        """Return False if the coarse patches show that no part of the mesh is on the screen, otherwise True.
+
+        `clip`: projection @ view (4,4).
+        """
         view = _View.of(posed, clip)
         level = self._levels[0]
         touching, cut = self._sort_out(level, np.arange(len(level.centres)), view, _Extent())

@@ -191,7 +191,10 @@ class ModelledBody:
 
 
 def widened(rect: Rect, error_px: float, output: Shape) -> Rect:
-    """Return `rect` with `error_px` pixels more on every side, clipped to the screen."""
+    """Return `rect` with `error_px` pixels more on every side, clipped to the screen.
+
+    `output`: (height, width) of the picture in pixels.
+    """
     x, y = 2.0 * error_px / output[1], 2.0 * error_px / output[0]
     low = max(rect.x0 - x, SCREEN.x0), max(rect.y0 - y, SCREEN.y0)
     high = min(rect.x1 + x, SCREEN.x1), min(rect.y1 + y, SCREEN.y1)
@@ -401,7 +404,9 @@ class PoseStage:
         return bool(seen)
 
     def _lay_out(self, packet: NDArray[np.void], seen: list[tuple[NDArray[np.void], SeenAvatar]]) -> FramePlan:
-        """Set crop rectangles, `tensor_rect`s and the tensor's shape; with nobody in view, the smallest shape.
+        """Set crop rectangles, `tensor_rect`s and the tensor's shape in the header `packet`.
+
+        With nobody in view, the tensor has the smallest shape.
 
         `seen`: pairs of an avatar's part of the header and its place on the screen.
         """

@@ -156,7 +156,7 @@ class PresentStage:
                 raise UnwrittenError(path, FileNotFoundError(errno.ENOENT, REMOVED)) from error
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
-        """Present `inputs[slot_in]` as frame `frame`. Raises ValueError if `slot_in` is None."""
+        """Present `inputs[slot_in]` as frame `frame`, and return metrics. Raises ValueError if `slot_in` is None."""
         if slot_in is None:
             raise ValueError("the present stage needs an input slot")
         if self._window is not None and self._window.is_looked_at:

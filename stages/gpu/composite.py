@@ -170,7 +170,10 @@ def measured_line(pose: NDArray[np.void], presented_ns: list[int]) -> str:
 
 
 def hud_lines(pose: NDArray[np.void], measured: str) -> list[str]:
-    """Return the three lines of the text display. `measured`: the middle line, from `measured_line`."""
+    """Return the three lines of the text display for the frame with header `pose`.
+
+    `measured`: middle line, from `measured_line`.
+    """
     height, width = pose["tensor_shape"].tolist()
     visible = int(sum(avatar["visible"] for avatar in pose["avatars"][: int(pose["avatar_count"])]))
     return [
@@ -351,7 +354,10 @@ class CompositeStage:
             self._planes.draw(pose["view"], pose["projection"])
 
     def _depth(self, pose: NDArray[np.void], avatar: Any) -> float:
-        """Return the z of the avatar's pelvis in camera space, metres; the most negative is the farthest."""
+        """Return z of the pelvis of an avatar in camera space, metres; the most negative is the farthest.
+
+        `pose`: header of the frame. `avatar`: the avatar's part of it.
+        """
         pelvis = avatar["joints"][0] @ np.append(self._rest[int(avatar["avatar"])][0], 1.0)
         return float(pose["view"][2, :3] @ pelvis + pose["view"][2, 3])
 

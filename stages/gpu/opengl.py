@@ -222,7 +222,7 @@ def build_program(ctx: Any, vertex: str | Path, fragment: str | Path, **defines:
 
 
 def set_uniforms(program: Any, values: dict[str, Any]) -> None:
-    """Set uniforms by name; a uniform that the shader's compiler removed is ignored."""
+    """Set the uniforms `values` by name; a uniform that the shader's compiler removed is ignored."""
     for name, value in values.items():
         if name in program:
             program[name].value = value

@@ -344,7 +344,7 @@ class RasterStage:
             packed.target(shape)
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
-        """Write the tensor (h,w,C) uint8 of each network: drawn if it paints somebody in view, otherwise empty.
+        """Write the tensor (h,w,C) uint8 of each network, empty if the network paints nobody in view. Return metrics.
 
         The metrics are the bytes moved. The least bytes are the pose of the drawn mesh of each visible avatar, and the
         drawn tensors.
@@ -430,7 +430,7 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> RasterStage:
 
 
 def _meshes(ctx: Any, bodies: Sequence[ShapedBody], config: RunConfig) -> list[Mesh]:
-    """Return the meshes of a whole body and of its levels.
+    """Return the meshes of `bodies`: a whole body, then the body of each level of its mesh.
 
     If the whole mesh encloses a volume, each level counts as closed. A level may fold over itself, but its triangles
     that face away are behind others, so it is drawn without them.

@@ -380,7 +380,10 @@ def _prepare(ctx: Any, closed: bool) -> None:
 
 
 def _layout(arrays: MeshArrays, with_source: bool) -> tuple[list[str], list[str], list[NDArray[Any]]]:
-    """Return (names, formats, columns) of the interleaved vertex buffer; the formats are moderngl's."""
+    """Return (names, formats, columns) of the interleaved vertex buffer; the formats are moderngl's.
+
+    `with_source`: whether each vertex has the index of the body's vertex.
+    """
     columns: dict[str, tuple[str, NDArray[Any]]] = {"position": ("3f", arrays.position), "uv": ("2f", arrays.uv)}
     columns |= {name: (f"{values.shape[1]}f", values) for name, values in arrays.surface.items()}
     for group in range(arrays.weights_per_vertex // 4):
@@ -426,7 +429,10 @@ class MeshDraw:
             set_uniforms(program, values)
 
     def draw(self, pose: BodyPose, view: Floats, projection: Floats) -> None:
-        """Draw the mesh in `pose` into the current target, with the depth test and culling that are enabled."""
+        """Draw the mesh in `pose` into the current target, with the depth test and culling that are enabled.
+
+        `view`, `projection`: OpenGL matrices (4,4).
+        """
         clip = target_clip(view, projection)
         self._mesh.upload_pose(pose)
         for program, vertices in self._parts:

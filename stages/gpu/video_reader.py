@@ -67,7 +67,10 @@ def to_srgb(codes: NDArray[np.uint16], transfer: str, is_wide: bool) -> U8:
 
 @cache
 def _eotf(transfer: str) -> F32:
-    """Return the light of STEPS codes from 0 to 1. PQ: light of the display, cd/m2; HLG: light of the scene, 0 to 1."""
+    """Return the light (STEPS,) of STEPS codes from 0 to 1 of `transfer`.
+
+    For PQ, it is the light of the display, cd/m2; for HLG, the light of the scene, 0 to 1.
+    """
     code = np.arange(STEPS) / (STEPS - 1)
     if transfer == PQ:
         return pq_light(code).astype(np.float32)
