@@ -1,8 +1,8 @@
 """A body file in the SMPL-X layout. The reader executes no pickles and checks sizes before it allocates memory.
 
 A `Body` is finite, consistent and read-only. Any fault of the file raises one BadInputError. A body is refused if its
-height at rest is not a person's, because all lengths must be metres. Pose blend shapes are read in chunks. Memory is
-allocated at their first nonzero number, as many files hold 80 MB of zeros.
+height at rest is not a person's, because all lengths must be metres. Pose blend shapes are read in chunks. Many files
+hold 80 MB of zeros, so memory is allocated only at the first nonzero number.
 
 The layout is that of https://smpl-x.is.tue.mpg.de, interpreted as the `smplx` package does. The rest shape is
 `v_template + shapedirs @ [betas, expression]`; the joints are `J_regressor @ rest shape`.
@@ -198,10 +198,11 @@ class Body:
         return ShapedBody(_frozen(rest.astype(np.float32)), _frozen(joints), self)
 
     def full_pose(self, poses: ArrayLike, flat_hand_mean: bool) -> F64:
-        """Return axis-angle `poses` (..., 165) with absolute hand poses.
+        """Return a copy of `poses` whose hand poses are absolute, which means that they contain the mean hand pose.
 
+        `poses` (..., 165): axis-angle, radians.
         `flat_hand_mean`: whether hand poses in `poses` are absolute already; otherwise the mean hand pose is added.
-        Raises BadInputError for another shape.
+        Raises BadInputError if the last axis of `poses` has another length.
         """
         full = np.array(poses, np.float64)
         if full.ndim == 0 or full.shape[-1] != POSE_SIZE:
@@ -300,7 +301,7 @@ def _check_layout(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
 
 
 def _instead_of_body(names: Collection[str]) -> str:
-    """Return a message part that lists the array `names` of a file that is no body, and says if it is a motion."""
+    """Return a part of a message: the array `names` of a file that is no body, and whether the file is a motion."""
     listed = f"arrays that were found: {', '.join(sorted(names)[:MOST_NAMED]) or 'none'}"
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
     motion = ": a motion, which `trilane run --motion` takes" if MOTION_KEYS & set(names) else ""
@@ -357,7 +358,7 @@ def _split_shape(path: Path, dirs: F32) -> tuple[F32, F32]:
 
 
 def _parents(path: Path, table: NDArray[Any]) -> I32:
-    """Return each joint's parent (55,) from the table's first row; the root's parent is always -1.
+    """Return each joint's parent (55,) from the first row of `table`; the root's parent is always -1.
 
     Raises BadInputError when a parent is out of range, or when the joints form a cycle.
     """

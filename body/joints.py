@@ -96,7 +96,7 @@ def rodrigues(rotvec: ArrayLike) -> F64:
 
 @dataclass(frozen=True)
 class Posed:
-    """A skeleton in one pose. The arrays are the skeleton's own buffers: its next `pose` overwrites them.
+    """A skeleton in one pose. The arrays are buffers of the skeleton: the next call of `Skeleton.pose` overwrites them.
 
     `matrices` (55,3,4) float32: skinning matrices; x_world = sum_k w_k (matrices_k @ [x_rest, 1]).
     `joints` (55,3) float64: positions in the world, metres.
@@ -178,7 +178,7 @@ def _require_finite(values: F64, where: str, expected: str) -> None:
 
 
 def _ancestors(parents: NDArray[np.int32]) -> list[NDArray[np.intp]]:
-    """Return an array (J + 1,) for each round k: the 2^k-th ancestor of each joint.
+    """Return an array (J + 1,) for each round k: the 2^k-th ancestor of each joint, by `parents` (J,).
 
     Index J stands for an identity transform above the root; it is its own ancestor.
     """

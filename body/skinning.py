@@ -87,7 +87,7 @@ def joint_distance(shaped: ShapedBody) -> F64:
 
 
 def branch_sums(parents: NDArray[np.int32], values: F64) -> F64:
-    """Return, for each joint, the sum of `values` (..., 55) over that joint and all joints below it: (..., 55).
+    """Return sums of `values` (..., 55): for each joint, the sum over that joint and all joints below it (..., 55).
 
     `parents` (55,): index of each joint's parent, -1 at the root.
     """
@@ -117,7 +117,7 @@ class Detail:
     `name`: description for people.
     `weight_count`: number of skinning weights per vertex; None for all.
     `hands_and_face`: whether joints of hands and face move the mesh; otherwise wrists and head take over their weights.
-    `pose_blend`: whether the body's pose blend shapes, if any, are applied.
+    `pose_blend`: whether pose blend shapes are applied, if the body has them.
     """
 
     name: str
@@ -218,9 +218,9 @@ def _bound(detail: Detail, lever: F64, change: F64, blend: F64) -> float:
 
 
 def _terms(shaped: ShapedBody) -> Arrays:
-    """Return the terms of the bounds, each the largest in one of the G groups of vertices.
+    """Return the terms of the bounds, named as in the module's proof, each the largest of a group of vertices.
 
-    `lever`, `change` (levels,G,54): |E_b| |p - c_b| and |E_b|. `blend` (G,54): r_b.
+    `lever`, `change` (levels,G,54): |E_b| |p - c_b| and |E_b|, for each of G groups. `blend` (G,54): r_b.
     `reach` (55,): as in `DetailBounds`.
     """
     starts, order = _groups(shaped.body.weights)
@@ -253,7 +253,7 @@ def blend_reach(shaped: ShapedBody) -> F64:
 def _groups(weights: F32) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Group vertices by the two joints with the largest weights.
 
-    Return where each group begins in the sorted list of vertices, and that list: vertex indices (V,).
+    Return (first place of each group in the sorted list, sorted list of vertex indices (V,)).
     """
     two = np.sort(np.argsort(-weights, axis=1, kind="stable")[:, :2], axis=1)
     key = two[:, 0] * JOINTS + two[:, 1]
@@ -280,8 +280,8 @@ def blend_matrices(weights: F64, per_joint: F64) -> F64:
 class CpuSkinner:
     """Computes the vertices of one shaped body, pose by pose, in float64.
 
-    `weight_count`: number of skinning weights per vertex, 4, 8 or 12; None for all. `pose_blend`: whether the body's
-    pose blend shapes, if any, are applied.
+    `weight_count`: number of skinning weights per vertex, 4, 8 or 12; None for all.
+    `pose_blend`: whether pose blend shapes are applied, if the body has them.
     """
 
     def __init__(self, shaped: ShapedBody, weight_count: int | None = None, pose_blend: bool = True) -> None:
@@ -330,7 +330,7 @@ class FrameSkinner:
 
     @property
     def constant_bytes(self) -> int:
-        """Bytes that every frame reads besides its pose: rest positions, weights, joint indices, pose blend shapes."""
+        """Bytes of rest positions, weights, joint indices and pose blend shapes, which every frame reads."""
         kept = (self._rest, self._weights, self._joints, *(() if self._blend is None else (self._blend,)))
         return sum(array.nbytes for array in kept)
 

@@ -65,7 +65,7 @@ class Plan:
     `most_fps`: largest rate of shown frames, as if a display had this rate; None for the display of the profile.
     `stretch`: factor on the network's expected time.
     `avatars`: number of avatars in view; they share one tensor.
-    `meshes`: number of their vertices over that of an avatar's whole mesh; None for whole meshes.
+    `meshes`: vertices of all avatars in view divided by those of one whole mesh; None for whole meshes.
 
     Raises BadInputError for a value outside its range.
     """
@@ -163,7 +163,7 @@ def _network_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[st
 
 
 def split_work(work: Work, share: float) -> tuple[Work, Work]:
-    """Return `work` in two parts; the first has the first operators that together do `share` of the products."""
+    """Return (first operators of `work` that together do `share` of its products, the other operators)."""
     macs, cut = 0, 0
     for cut, operator in enumerate(work.operators, 1):  # noqa: B007
         macs += operator.macs
@@ -215,8 +215,8 @@ def _settled(times: StageTimes, variant: Variant, display_ns: int, quick: bool) 
     `times`: time of a job of each stage.
     `variant`: how the stages are connected and scheduled.
     `display_ns`: shortest time between two shown jobs.
-    `quick`: whether to run only QUICK_FRAMES if they are enough. They are enough with one slot between stages. With two
-    slots, frames come faster until the slots are full.
+    `quick`: whether to run only QUICK_FRAMES with one slot between stages. With more slots, frames come faster until
+    the slots are full, so more frames are needed.
     """
     frames = _frames_of(variant, quick)
     report = _simulated(times, variant, settings_of(variant, frames, display_ns)).report
@@ -246,7 +246,12 @@ def settings_of(variant: Variant, frames: int, display_ns: int, *, held: bool = 
 
 
 def _simulated(times: StageTimes, variant: Variant, settings: Settings, *, keep: bool = False) -> Simulation:
-    """Return a simulated run whose jobs take `times`. Raises BadInputError for an unknown edge."""
+    """Return a simulated run whose jobs take `times`. Raises BadInputError for an unknown edge.
+
+    `variant`: its `edge` is the rule of every edge.
+    `settings`: settings of the scheduler.
+    `keep`: whether the run records its steps and jobs.
+    """
     service = {name: ns for name, _, ns in times}
     try:
         graph = chain(((name, unit) for name, unit, _ in times), variant.edge, LATENCY_TO)
@@ -268,7 +273,7 @@ def simulated(profile: Profile, plan: Plan, corners: Corners) -> Simulation:
 
 
 def _rounded(profile: Profile, plan: Plan, corners: Corners) -> StageTimes:
-    """Return the time of a job of each stage in ns, with the units of `workers_of`."""
+    """Return the time of a job of each stage in whole ns, with the unit that `workers_of` gives."""
     worker = workers_of(profile)
     times = stage_times_ms(profile, plan, corners)
     return tuple((name, worker[unit], round(ms * NS_PER_MS)) for (name, unit), ms in times.items())
@@ -312,7 +317,7 @@ def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = Fals
 
 
 def workers_of(profile: Profile) -> dict[UnitName, UnitName]:
-    """Return the unit that stands for each unit in the scheduler.
+    """Return, for each unit, the unit that stands for it in the scheduler.
 
     Units on one core work in turns, so the first unit of a core stands for all of its units.
     """
@@ -349,8 +354,8 @@ def _shares(
 def reference_frame_ms(profile: Profile, plan: Plan, corners: Corners) -> float:
     """Return the mean frame time in ms of the variant `REFERENCE` without the scheduler; fits need it often.
 
-    With one slot between stages, raster, network and composite follow each other, so it is the sum of their times, but
-    at least the display's interval. A test compares the result with the scheduler in virtual time.
+    With one slot between stages, raster, network and composite follow each other. Therefore the frame time is the sum
+    of their times, but at least the display's interval. A test compares the result with the scheduler in virtual time.
     """
     times = stage_times_ms(profile, plan, corners)
     chain = sum(ms for (name, _), ms in times.items() if name not in ("pose", "present"))

@@ -132,7 +132,7 @@ class Calibrated:
 
     `data`: tables of the calibrated profile.
     `numbers`: value and relative spread of each changed key.
-    `rows`: rows with predictions before and after.
+    `rows`: rows with predictions before and after the fit.
     """
 
     data: Mapping[str, Any]
@@ -164,7 +164,7 @@ class Calibrated:
 
 
 def is_own_table(path: Path) -> bool:
-    """Return whether a table lists networks in files; a table of reference networks has a column `encoder` instead."""
+    """Return whether the table `path` lists networks in files. A table of reference networks has a column `encoder`."""
     if not path.is_file():
         return False
     lines = [line for line in read_text(path, "a table of measured rows").splitlines() if not line.startswith("#")]
@@ -240,7 +240,7 @@ def network_file(place: str, name: str, folder: Path, remedy: str = "--networks 
 
 
 def on_chip(profile: Profile, row: OwnRow) -> Profile:
-    """Return the profile whose unit runs in the row's precision and, if it has a tensor engine, the row's runtime."""
+    """Return `profile` with the row's unit in the row's precision, and its tensor engine under the row's runtime."""
     chip = in_precision(profile, row.unit, "not said", row.precision)
     return under_runtime(chip, row.unit, row.runtime) if chip.units[row.unit].engines else chip
 
@@ -252,7 +252,7 @@ def calibrate(name: str | Path, rows: Sequence[OwnRow]) -> Calibrated:
 
 
 def calibrate_tables(data: Mapping[str, Any], path: Path, rows: Sequence[OwnRow]) -> Calibrated:
-    """Fit the tables of a profile to `rows`. `path`: file of the tables, for messages. Raises BadInputError."""
+    """Fit a profile's tables `data` to `rows`. `path`: file of the tables, for messages. Raises BadInputError."""
     profile = parse_profile(data, path)
     for row in rows:
         try:
@@ -294,7 +294,10 @@ def error_scale(told: Sequence[float]) -> float:
 
 
 def _error_scales(profile: Profile, left_out: Sequence[CheckedRow]) -> dict[str, tuple[float, float]]:
-    """Return (value, spread) of each unit's `error_scale`, for units with rows; it multiplies the profile's own."""
+    """Return (value, spread) of the key `error_scale` of each unit with rows, by key.
+
+    The value is the factor that the rows give, times the `error_scale` that the profile states.
+    """
     numbers = {}
     for unit in dict.fromkeys(each.row.unit for each in left_out):
         told, stated = misses(left_out, unit), profile.units[unit].error_scale
@@ -316,7 +319,7 @@ def _predicted(profile: Profile, row: OwnRow) -> tuple[float, Interval]:
 
 
 def _moved(profile: Profile, rows: Sequence[OwnRow]) -> dict[str, tuple[float, float]]:
-    """Return the value and spread of each key that a fit to `rows` changes."""
+    """Return (value, spread) of each key that a fit to `rows` changes."""
     numbers: dict[str, tuple[float, float]] = {}
     for unit in UNITS:
         of_unit = [row for row in rows if row.unit == unit]
@@ -329,7 +332,7 @@ def _moved(profile: Profile, rows: Sequence[OwnRow]) -> dict[str, tuple[float, f
 
 
 def with_numbers(data: Mapping[str, Any], numbers: Mapping[str, tuple[float, float]]) -> dict[str, Any]:
-    """Return a copy of the tables `data` with the fitted `numbers`."""
+    """Return a copy of the tables `data` with `numbers`, the value and spread of each fitted key."""
     moved = copy.deepcopy(dict(data))
     for key, (value, spread) in numbers.items():
         table: Any = moved
@@ -442,7 +445,10 @@ def _derivatives(at: F64, rows: Sequence[_EngineRow], places: Sequence[int], pre
 
 
 def _unit_numbers(profile: Profile, unit: UnitName, rows: Sequence[OwnRow]) -> dict[str, tuple[float, float]]:
-    """Return (value, spread) of the numbers of a unit without a tensor engine: a fit of one factor on its times."""
+    """Return (value, spread) of each number of a unit without a tensor engine, by key.
+
+    The fit has one factor on all times of the unit.
+    """
     own = profile.units[unit]
     noise = max(NOISE, own.model_error_fraction.or_else(0.3))
     misses = np.array([math.log(row.ms / _predicted(profile, row)[0]) for row in rows])

@@ -2,7 +2,8 @@
 
 Every stated error comes from rows whose network was left out of the fit. A chip without rows of an engine gets the
 numbers of a related chip, times the ratio of the two chips on another engine that both have. Such numbers are
-`assumed`. The head of a chip's profile is written by hand and stays; this module writes everything from MARK on.
+`assumed`. The head of a chip's profile, the part before MARK, is written by hand and stays. This module writes
+everything from MARK on.
 """
 
 from __future__ import annotations
@@ -103,8 +104,8 @@ class EngineStudy:
     """The fit of one engine.
 
     `left_out`: rows of the cross-validation.
-    `error`: relative error of the model itself for a network that is wholly unlike the networks of the fit. With it,
-    intervals cover COVERED of the rows.
+    `error`: relative error of the model itself for a network that is wholly unlike the networks of the fit. With this
+    error, intervals cover the share COVERED of the rows.
     """
 
     fitted: Fitted
@@ -120,7 +121,7 @@ class EngineStudy:
 
 @dataclass(frozen=True)
 class Study:
-    """The fits of all engines. `rates`: rates of each chip and engine, by key."""
+    """The fits of all engines. `rates`: six rates of each pair (chip, engine), by the key of a profile."""
 
     engines: Mapping[EngineName, EngineStudy]
     rates: Mapping[tuple[str, EngineName], Mapping[str, ChipRate]]
@@ -140,7 +141,7 @@ def misses_of(rows: Sequence[LeftOut]) -> tuple[F64, F64, F64]:
 
 
 def own_error(rows: Sequence[LeftOut]) -> float:
-    """Return the least `EngineStudy.error` with which the intervals of `rows` cover COVERED of them.
+    """Return the least `EngineStudy.error` with which intervals cover the share COVERED of `rows`.
 
     The error of a row is this error times the unlikeness of its network.
     """
@@ -168,7 +169,11 @@ def study_engines(folder: Path) -> Study:
 
 
 def study_engine(rows: Sequence[Latency], layers: Mapping[str, Layers]) -> EngineStudy:
-    """Fit and cross-validate one engine."""
+    """Fit and cross-validate one engine.
+
+    `rows`: published times of the engine.
+    `layers`: layers of each network, by name.
+    """
     fitted = fit_engine(rows, layers)
     left_out = tuple(cross_validate(rows, layers, fitted.numbers))
     return EngineStudy(fitted, left_out, own_error(left_out))
@@ -181,7 +186,10 @@ def _known(fitted: Fitted, chip: str) -> dict[str, ChipRate]:
 def _assumed(
     rates: Mapping[tuple[str, EngineName], Mapping[str, ChipRate]], engines: Sequence[EngineName]
 ) -> dict[tuple[str, EngineName], dict[str, ChipRate]]:
-    """Return the assumed rates of chips for engines of which they have no row."""
+    """Return the assumed rates, by key, of each pair (chip, engine) without rows.
+
+    `rates`: rates of the pairs with rows.
+    """
     found = {}
     for chip, relative in RELATIVE.items():
         for engine in engines:
@@ -200,7 +208,7 @@ def _assumed(
 def middle(chips: Sequence[Mapping[str, ChipRate]]) -> dict[str, Prior]:
     """Return the geometric mean of the rates of `chips`, by key.
 
-    Its spread contains the differences between the chips and the spread of each chip.
+    The spread of a mean contains the differences between the chips and the spread of each chip.
     """
     result = {}
     for key in chips[0]:
@@ -303,7 +311,7 @@ def profile_texts(study: Study, folder: Path, command: str) -> dict[Path, str]:
 
 
 def head_of(path: Path) -> str:
-    """Return the part of a profile that is written by hand. Raises BadInputError for a file that cannot be read."""
+    """Return the part before MARK of the profile `path`. Raises BadInputError for a file that cannot be read."""
     return read_text(path, "a chip's profile, its head written by hand").partition(MARK)[0].rstrip() + "\n\n"
 
 

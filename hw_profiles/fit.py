@@ -35,7 +35,7 @@ Keys = tuple[str, ...]
 
 
 class TableCell(NamedTuple):
-    """One cell of the table: its row, its column, and its value in milliseconds."""
+    """One measured cell of a table of configurations: its row, its column, and its value in milliseconds."""
 
     row: ConfigurationRow
     column: str
@@ -85,7 +85,7 @@ class ProfileFit:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The measured columns, in the order of the fit."""
+        """The columns of the table that have measurements, in the order of the fit."""
         return tuple(dict.fromkeys(r.column for r in self.residuals))
 
     def median_error(self, column: str, *, left_out: bool = False) -> float:
@@ -122,7 +122,7 @@ def predicted_ms(profile: Profile, measured: TableCell) -> float:
 
 
 def fit_profile(name: str | Path, table: Path) -> ProfileFit:
-    """Fit the profile `name` to the measured rows of `table`. Raises BadInputError, MissingPartError."""
+    """Fit the profile `name` to the measured rows in the file `table`. Raises BadInputError, MissingPartError."""
     data, path = load_tables(name)
     parse_profile(data, path)
     return fit(data, path, read_table(table))
@@ -162,7 +162,7 @@ def fit(data: Mapping[str, Any], path: Path, rows: Sequence[ConfigurationRow]) -
 
 
 def _from_residuals(residuals: Sequence[Residual], rows: Sequence[ConfigurationRow]) -> dict[str, tuple[float, float]]:
-    """Return (value, spread) of the keys for the model's own error and for the range of frame times.
+    """Return (value, spread) of two keys, by key: the model's own error, and the range of frame times.
 
     The model's error comes from predictions of left-out measurements, the range from the measured ranges.
     """
@@ -206,7 +206,7 @@ def _least_squares() -> Callable[..., Any]:
 
 
 def with_factors(data: Mapping[str, Any], free: Sequence[Keys], factors: Sequence[float] | F64) -> dict[str, Any]:
-    """Return a copy of the tables `data`; the values of each group of keys in `free` are multiplied by its factor."""
+    """Return a copy of the tables `data`, with the values of each group of keys in `free` multiplied by its factor."""
     copied = copy.deepcopy(dict(data))
     for keys, factor in zip(free, factors, strict=True):
         for key in keys:

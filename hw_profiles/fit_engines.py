@@ -83,7 +83,7 @@ COLUMNS = ("network", "chip", "hexagon", "precision", "runtime", "ms", "caution"
 class PublishedTime(NamedTuple):
     """A published time and the predicted time, both for the same runtime.
 
-    `independent`: whether no number of the profile comes from this published time.
+    `independent`: True if no number of the profile comes from this published time.
     """
 
     profile: str
@@ -154,7 +154,9 @@ def check_published(name: str, profile: Profile) -> list[PublishedTime]:
 class Latency(NamedTuple):
     """One published time.
 
-    `hexagon`: generation of the engine.
+    `family`: family of the network by `networks.csv`.
+    `hexagon`: generation of the chip's Hexagon.
+    `ms`: time of one inference.
     `anchor`: whether the table marks the row as an anchor. A chip with anchors has only a few rows; its prior comes
     from the chip before it.
     """
@@ -220,8 +222,8 @@ COSTS = ("operator", "job")
 class Numbers(NamedTuple):
     """Logarithms of an engine's numbers.
 
-    `factors`: factors of the terms (terms,).
-    `rates`: seconds per unit of each rate (chips, 6).
+    `factors`: logarithms of the factors of the terms (terms,).
+    `rates`: logarithms of the seconds per unit of each rate (chips, 6).
     """
 
     factors: F64
@@ -241,7 +243,7 @@ class Fitted:
     """The numbers of an engine for `chips`.
 
     `spreads`: spread of each number after the fit.
-    `seen`: shares of the terms in the time of each network of the fit (terms,), as the mean over all chips.
+    `seen`: for each network of the fit, the share of each term in its time (terms,), as the mean over all chips.
     """
 
     engine: EngineName
@@ -251,7 +253,10 @@ class Fitted:
     seen: Mapping[str, F64] = field(default_factory=dict)
 
     def unlike(self, shares: F64) -> float:
-        """Return the distance of `shares` (terms,) from the shares of the nearest network of the fit, 0 to 1."""
+        """Return the distance, 0 to 1, of a network from the nearest network of the fit.
+
+        `shares`: share of each term in the network's time (terms,).
+        """
         return min((float(np.abs(shares - others).sum()) / 2 for others in self.seen.values()), default=1.0)
 
     def rates_of(self, chip: str) -> dict[str, Prior]:
@@ -265,7 +270,7 @@ class Fitted:
 
 
 def as_stated(engine: EngineName, rate: str, seconds: float) -> float:
-    """Return a rate in the unit of a profile. `seconds`: seconds per unit of the rate."""
+    """Return the value of the key `rate` in the unit of a profile. `seconds`: seconds per unit of the rate."""
     unit = KEY_OF_RATE[rate][1]
     return seconds / unit if rate in COSTS else _bytes(engine, rate) / (seconds * unit)
 
@@ -298,7 +303,8 @@ class _Rows:
     def predict(self, numbers: Numbers) -> tuple[F64, F64]:
         """Return (time of each row in ms (rows,), share of each term in this time (rows, terms)).
 
-        A share is the derivative of the time's logarithm by the logarithm of the term's cost. Those of a row sum to 1.
+        A share is the derivative of the time's logarithm by the logarithm of the term's cost. The shares of a row sum
+        to 1.
         """
         seconds = np.exp(numbers.factors + numbers.rates[self.chip][:, RATE_OF_TERM])
         costs = self.table * seconds[self.row]
@@ -336,7 +342,7 @@ def _distinct(layers: Layers, room: int) -> tuple[F64, F64]:
 
 
 def priors(engine: EngineName, chips: Sequence[str]) -> tuple[Numbers, Numbers]:
-    """Return (logarithms of the values, spreads) of an engine's numbers before the fit."""
+    """Return (logarithms of the values, spreads) of an engine's numbers for `chips` before the fit."""
     factors = [factor_prior(engine, name) for name in NAMES]
     rates = [[rate_prior(engine, chip, KEY_OF_RATE[rate][0]) for rate in RATES] for chip in chips]
     values = [[math.log(_seconds(engine, r, p.value)) for r, p in zip(RATES, row, strict=True)] for row in rates]
@@ -399,7 +405,10 @@ def _cost(at: F64, data: _Rows, mean: F64, spread: F64) -> float:
 
 
 def _derivatives(at: F64, data: _Rows, mean: F64, spread: F64, chips: int) -> tuple[F64, F64]:
-    """Return (half the gradient of `_cost`, half its curvature as if `predict` were linear)."""
+    """Return (half the gradient of `_cost`, half its curvature as if `predict` were linear).
+
+    `at`, `mean`, `spread`: logarithms of all numbers, their prior means and prior standard deviations (numbers,).
+    """
     ms, shares = data.predict(_from_flat(at))
     misses = np.log(ms / data.ms) / NOISE
     weights = (NU + 1) / (NU + misses**2)  # rows with a large error count little
@@ -436,7 +445,7 @@ def folds(networks: Sequence[str], seed: int = 0) -> Iterator[frozenset[str]]:
 def cross_validate(
     rows: Sequence[Latency], layers: Mapping[str, Layers], start: Numbers, parts: Sequence[frozenset[str]] | None = None
 ) -> list[LeftOut]:
-    """Return the rows whose network is left out in turn, each with its prediction by a fit without that network.
+    """Return all rows whose network some fit left out, each with its prediction by that fit.
 
     `rows`: rows of one engine.
     `layers`: layers of each network, by name.
@@ -451,7 +460,10 @@ def cross_validate(
 
 
 def predict_rows(fitted: Fitted, rows: Sequence[Latency], layers: Mapping[str, Layers]) -> list[LeftOut]:
-    """Return the rows whose chip `fitted` knows, each with its prediction by `fitted`."""
+    """Return the rows whose chip `fitted` knows, each with its prediction by `fitted`.
+
+    `layers`: layers of each network, by name.
+    """
     known = [row for row in rows if row.chip in fitted.chips]
     data = _Rows(known, layers, fitted.chips)
     ms, shares = data.predict(fitted.numbers)
@@ -544,14 +556,14 @@ STEP = Prior(1.25, 0.15)
 
 
 def rate_prior(engine: EngineName, chip: str, key: str) -> Prior:
-    """Return the prior of the rate `key` of `chip`. A slower chip has lower rates and higher costs."""
+    """Return the prior of the rate `key`, a key of a profile, for `engine` on `chip`."""
     value = RATES_OF_8_GEN_2[key] * (FP16_OVER_INT8.get(key, 1) if engine.startswith("fp16") else 1)
     slower = SLOWER.get(chip, 1)
     return Prior(value * slower if key in ("operator_us", "job_us") else value / slower, RATE_SPREAD)
 
 
 def factor_prior(engine: EngineName, term: str) -> Prior:
-    """Return the prior of a term's factor."""
+    """Return the prior of the factor of `term` on `engine`."""
     if term in UNITS_OF_RATES:
         return Prior(1, 1e-6)
     return (FP16_FACTORS if engine.startswith("fp16") else FACTORS)[term]

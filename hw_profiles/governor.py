@@ -40,7 +40,7 @@ class ThermalState:
 
     `device_c`: temperature of the device's body.
     `junction_c`: temperature of each unit's junction.
-    `rising`: whether the headroom shrank over the last step.
+    `rising`: whether the headroom (`headroom_k`) shrank over the last step.
     """
 
     device_c: float
@@ -74,7 +74,7 @@ def _approach(value: float, goal: float, seconds: float, time_constant: float) -
 
 
 def headroom_k(profile: Profile, thermal_state: ThermalState) -> float:
-    """Return the kelvins that are left to the nearer of the two limits (skin, junction); negative above the limit."""
+    """Return how many kelvins are left to the nearer of two limits, skin and junction; negative above the limit."""
     thermal = profile.thermal
     skin = thermal.skin_limit_c.or_else(45.0) - thermal_state.device_c
     return min(skin, thermal.junction_limit_c.or_else(95.0) - max(thermal_state.junction_c.values()))
@@ -82,7 +82,7 @@ def headroom_k(profile: Profile, thermal_state: ThermalState) -> float:
 
 @dataclass
 class Throttle:
-    """The throttling of the units. `steps`: number of corners that each unit is below its requested corner."""
+    """The throttling of the units. `steps`: by how many corners each unit is below its requested corner."""
 
     steps: dict[UnitName, int] = field(default_factory=lambda: dict.fromkeys(UNITS, 0))
 
@@ -106,7 +106,7 @@ def step_wise(
     requested: Mapping[UnitName, int],
     power_w: Mapping[UnitName, float],
 ) -> None:
-    """Lower a unit if the device is over a limit and still gets warmer, or raise one if it is cool enough.
+    """Lower a unit if the device is over a limit and still gets warmer, or raise a unit if the device is cool enough.
 
     The unit with the most power is lowered. The most lowered unit is raised if the device is below the limits by the
     hysteresis.
@@ -134,7 +134,7 @@ def power_allocator(
     requested: Mapping[UnitName, int],
     power_w: Mapping[UnitName, float],
 ) -> None:
-    """Lower a unit if all units together take more than the granted power, or raise one if they take less.
+    """Lower a unit if all units together take more power than is granted, or raise a unit if they take less.
 
     The granted power is the power that the device can shed, plus a share of the headroom. The unit with the most power
     is lowered. The most lowered unit is raised if its additional power fits into the grant.
@@ -283,7 +283,8 @@ class Governor:
     def _power_w(self, unit: UnitName, busy_ns: int, now_ns: int) -> float:
         """Return the mean power of `unit` since the last tick, in watts. `busy_ns`: its busy time since then.
 
-        A duty stands for a lower clock. Therefore the busy share relates to the time in which the duty let it work.
+        A duty stands for a lower clock. Therefore the busy share is a share of the time in which the duty let the unit
+        work.
         """
         share = busy_ns / max(now_ns - self._last_ns, 1) * FULL_DUTY / self._duty[unit]
         return self._profile.units[unit].power_w(self._corner(unit), min(1.0, share))
@@ -373,7 +374,8 @@ def warm_up(
 ) -> list[Moment]:
     """Return the moments of any load from a cold start, as `over_time` does for an application.
 
-    `at`: function that returns the load's settled state at given corners; it is called once for each combination.
+    `at`: function that returns the load's settled state at given corners; it is called once for each combination. The
+    other parameters and the errors are those of `over_time`.
     """
     name = governor or profile.thermal.governor
     if name not in GOVERNORS:
@@ -413,18 +415,22 @@ def last_fifth(moments: Sequence[Moment]) -> Sequence[Moment]:
 
 
 def ends_of(moments: Sequence[Moment]) -> dict[str, float]:
-    """Return frames a second at the start, and in the settled state: from the mean frame time of the last fifth."""
+    """Return frames a second: `fps_start` at the first moment, `fps_settled` over the last fifth of the moments."""
     last = last_fifth(moments)
     return {"fps_start": 1e3 / moments[0].frame_ms, "fps_settled": 1e3 / (sum(m.frame_ms for m in last) / len(last))}
 
 
 def settled_corners(moments: Sequence[Moment]) -> Corners:
-    """Return the most frequent combination of corners in the last fifth of the time."""
+    """Return the most frequent combination of corners in the last fifth of the moments."""
     return Counter(moment.corners for moment in last_fifth(moments)).most_common(1)[0][0]
 
 
 def temperatures_of(moments: Sequence[Moment]) -> dict[str, float]:
-    """Return temperatures of the device and of its hottest junction in degrees Celsius; empty without moments."""
+    """Return temperatures in degrees Celsius; empty without moments.
+
+    `device_end` and `device_max` are the last and the highest temperature of the device's body, `junction_max` is the
+    highest of any junction.
+    """
     if not moments:
         return {}
     return {
@@ -435,7 +441,10 @@ def temperatures_of(moments: Sequence[Moment]) -> dict[str, float]:
 
 
 def caps_of(moments: Sequence[Moment]) -> dict[str, Any]:
-    """Return the share of the time in which a unit was throttled, and the first such time in seconds."""
+    """Return `throttled_share`, the share of the time in which a unit was throttled, and `first_throttled_s`.
+
+    `first_throttled_s` is the time in seconds of the first throttled moment; None without one.
+    """
     throttled_s = [m.t_s for m in moments if m.throttled]
     return {
         "throttled_share": len(throttled_s) / len(moments) if moments else 0.0,
@@ -444,7 +453,7 @@ def caps_of(moments: Sequence[Moment]) -> dict[str, Any]:
 
 
 def timeline_of(moments: Sequence[Moment]) -> list[dict[str, Any]]:
-    """Return evenly spaced moments, about MOST_SHOWN at most, as JSON values."""
+    """Return every n-th moment as JSON values, with n such that about MOST_SHOWN moments remain."""
     return [_shown(m) for m in moments[:: max(1, len(moments) // MOST_SHOWN)]]
 
 

@@ -74,7 +74,7 @@ def read_graph(path: Path, input_shapes: Mapping[str, Shape] | None = None) -> G
 def _checked(
     data: bytes, folder: Path, given: Sequence[tuple[str, Shape]]
 ) -> tuple[onnx.ModelProto, NumberFormat, Work]:
-    """Return (graph, number format, work) of a file's bytes. Raises UnexpectedValue.
+    """Return (graph, number format, work) of `data`, the bytes of a file. Raises UnexpectedValue.
 
     `folder`: folder of the file.
     `given`: shapes of inputs by name.
@@ -160,8 +160,8 @@ def _tensors(model: onnx.ModelProto) -> Iterator[TensorProto]:
 def _numbers(model: onnx.ModelProto) -> NumberFormat:
     """Return the graph's number format.
 
-    It is `w8a8` if a layer is an integer operator or reads dequantised activations, else `float`. `not said` means that
-    a float layer has a weight that a caller may replace, as the graph lists it as an input.
+    The format is `w8a8` if a layer is an integer operator or reads dequantised activations, else `float`. It is `not
+    said` if the graph lists a float layer's weight as an input, because a caller may replace this weight.
     """
     graph, constants = model.graph, constant_tensors(model.graph)
     dequantised = {

@@ -50,12 +50,15 @@ _KINDS = {"sequence_type": "a sequence", "map_type": "a map", "optional_type": "
 
 
 def type_name(kind: int) -> str:
-    """Return ONNX's name of an element type in small letters, such as `float16`."""
+    """Return ONNX's name of the element type number `kind` in small letters, such as `float16`."""
     return str(TensorProto.DataType.Name(kind)).lower() if kind in TensorProto.DataType.values() else f"type {kind}"
 
 
 def bytes_of(shape: tuple[int, ...], kind: int) -> int:
-    """Return the size of a tensor in bytes. Raises UnexpectedValue if its elements are no numbers."""
+    """Return the size of a tensor in bytes. Raises UnexpectedValue if its elements are no numbers.
+
+    `shape`, `kind`: as in `check_size`.
+    """
     if kind not in _BITS:
         remedy = "leave the part of the graph that handles text to the program"
         raise UnexpectedValue(f"elements of type {type_name(kind)}", "numbers", remedy)
@@ -85,7 +88,7 @@ def check_size(shape: tuple[int, ...], kind: int, what: str) -> None:
 
 
 def forget_data(tensor: TensorProto, folder: Path) -> None:
-    """Check a tensor of a file, and drop its data if it has more than KEPT_ELEMENTS.
+    """Check a tensor of a file, and drop its data if the tensor has more than KEPT_ELEMENTS elements.
 
     `tensor`: tensor of the file; it is changed in place.
     `folder`: folder of the file.
@@ -147,13 +150,13 @@ def _forget(tensor: TensorProto) -> None:
 
 
 def called(node: onnx.NodeProto) -> str:
-    """Return the name of an operator in messages."""
+    """Return the text by which messages name an operator: its type, and its name or first result."""
     kind = f"{node.domain}:{node.op_type}" if node.domain not in ("", "ai.onnx") else node.op_type
     return f"{kind} {node.name!r}" if node.name else f"{kind} that makes {next(iter(node.output), '')!r}"
 
 
 def check_structure(graph: onnx.GraphProto) -> None:
-    """Raise UnexpectedValue for operators with graphs inside, and for tensors that are not made exactly once."""
+    """Raise UnexpectedValue if an operator contains a graph, or if a tensor is missing or made several times."""
     _check_kinds(graph)
     made = Counter(_made(graph))
     twice = [name for name, times in made.items() if times > 1]
@@ -192,7 +195,7 @@ def _made(graph: onnx.GraphProto) -> Iterator[str]:
 
 
 def in_order(graph: onnx.GraphProto) -> None:
-    """Sort the operators so that each comes after the operators that it reads, and drop operators without use.
+    """Sort the operators so that each comes after those whose results it reads, and drop operators that nothing reads.
 
     `graph`: graph that is changed in place; if its operators are in order, their order stays.
 
@@ -283,14 +286,14 @@ def with_shapes(model: onnx.ModelProto, given: Mapping[str, Shape]) -> onnx.Mode
 def _known(
     graph: onnx.GraphProto, inputs: Sequence[onnx.ValueInfoProto], inferred: Mapping[str, onnx.ValueInfoProto]
 ) -> dict[str, Shape]:
-    """Return the static shapes of all tensors that have one, by name."""
+    """Return the static shape of each tensor that has one, by name. `inferred`: result of `_inferred`."""
     shapes = {tensor.name: tuple(tensor.dims) for tensor in graph.initializer}
     values = (*inputs, *inferred.values())
     return shapes | {value.name: sizes for value in values if (sizes := _sizes(value, least=0)) is not None}
 
 
 def _give(graph: onnx.GraphProto, inputs: Sequence[onnx.ValueInfoProto], given: Mapping[str, Shape]) -> None:
-    """Set the shapes of inputs, and drop the file's other shapes, which may then be wrong."""
+    """Set the shapes of `inputs` to `given`, by name, and drop the file's other shapes, which may be wrong now."""
     changed = [value for value in inputs if value.name in given]
     for value in changed:
         kind = value.type.tensor_type
@@ -411,7 +414,7 @@ def _has_schema(node: onnx.NodeProto) -> bool:
 
 
 def _sizes(value: onnx.ValueInfoProto, least: int = 1) -> Shape | None:
-    """Return the static shape of a tensor; None if it has none, or if a size is below `least`."""
+    """Return the static shape of the tensor `value`; None if it has none, or if a size is below `least`."""
     kind = value.type.tensor_type
     if not kind.HasField("shape"):
         return None
@@ -473,7 +476,11 @@ def _results(
     shapes: Mapping[str, tuple[int, ...]],
     opsets: Sequence[onnx.OperatorSetIdProto],
 ) -> list[NDArray[np.generic]]:
-    """Return the results of `node`; an empty list if an input is unknown, or a result may be too large."""
+    """Return the values that `node` computes; an empty list if an input is unknown, or a result may be too large.
+
+    `known`: known values of tensors, by name.
+    `opsets`: versions of the operator sets.
+    """
     if node.domain not in ("", "ai.onnx"):
         return []
     if node.op_type in OF_SHAPES and node.input and node.input[0] in shapes:

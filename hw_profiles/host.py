@@ -88,7 +88,7 @@ def split_cores(cores: tuple[int, ...]) -> dict[str, tuple[int, ...]]:
 
 
 def rule_placement(cores: tuple[int, ...], asked: Mapping[str, tuple[int, ...]] | None = None) -> Placement:
-    """Return the placement by `split_cores`, with a thread for each core. `asked`: chosen cores of some units."""
+    """Return the placement by `split_cores`, with a thread for each core. `asked`: cores that the user chose."""
     split = {**split_cores(cores), **(asked or {})}
     return {unit: Place(own, len(own)) for unit, own in split.items()}
 
@@ -102,7 +102,7 @@ def host_units(cores: tuple[int, ...] | None = None) -> dict[str, UnitSettings]:
 
 
 def settings_of(placement: Placement) -> dict[str, UnitSettings]:
-    """Return the settings of the units of a placement.
+    """Return cores, threads and spinning of each unit of a placement.
 
     Threads spin between jobs only on cores that no other unit shares.
     """
@@ -133,7 +133,7 @@ def asked_cores(texts: Sequence[str]) -> dict[str, tuple[int, ...]]:
 
 
 def _listed(text: str, listed: str) -> tuple[int, ...]:
-    """Return the numbers of a list such as `0,2-5`."""
+    """Return the core numbers in `listed`, such as `0,2-5`. `text`: whole text of the option, for messages."""
     cores: list[int] = []
     for part in listed.split(","):
         ends = re.fullmatch(r"(\d{1,5})(?:-(\d{1,5}))?", part.strip())
@@ -148,7 +148,7 @@ def _listed(text: str, listed: str) -> tuple[int, ...]:
 def host_cores(numbers: Sequence[int]) -> tuple[CpuCore, ...]:
     """Return the cores with these numbers, with their siblings and speeds from the kernel.
 
-    Cores for which the kernel does not state these have no siblings and are equally fast.
+    If the kernel does not state siblings and speed, the cores have no siblings and are equally fast.
     """
     root = machine.here.sys / "devices/system/cpu"
     siblings = {number: _number(root / f"cpu{number}/topology/thread_siblings_list", number) for number in numbers}
@@ -165,7 +165,7 @@ def host_cores(numbers: Sequence[int]) -> tuple[CpuCore, ...]:
 
 
 def _number(file: Path, otherwise: int) -> int:
-    """Return the number at the begin of a file; `otherwise` if there is none."""
+    """Return the number at the beginning of a file; `otherwise` without such a file or number."""
     try:
         found = re.match(r"\d+", file.read_text())
     except OSError:
@@ -199,7 +199,10 @@ def host_tables() -> dict[str, Any]:
 
 
 def network_threads() -> int:
-    """Return the number of threads of the DSP unit in the profile `host`; its peak rates are those of as many cores."""
+    """Return the number of threads of the DSP unit in the profile `host`, which is also its number of cores.
+
+    The peak rates of the unit are those of all its cores.
+    """
     return max(1, len(usable_cores()) - 2)
 
 
@@ -236,7 +239,7 @@ def fastest_runtime(profile: Profile, installed: Sequence[str]) -> tuple[str, st
 
 
 def described(placement: Placement) -> str:
-    """Return the text of a placement, such as `cpu 0, gpu 1, dsp 0,1 (2 threads)`."""
+    """Return the text of a placement: each unit's cores, such as `cpu 0, gpu 1, dsp 0,1 (2 threads)`."""
     return ", ".join(f"{unit} {_cores(place)}" for unit, place in placement.items())
 
 
@@ -248,7 +251,7 @@ def _cores(place: Place) -> str:
 
 
 def unit_rows(placement: Placement) -> dict[str, Any]:
-    """Return `cores` and `threads` of each unit for JSON."""
+    """Return, by unit of `placement`, a row with `cores` and `threads` for JSON."""
     return {unit: {"cores": list(place.cores), "threads": place.threads} for unit, place in placement.items()}
 
 
@@ -258,7 +261,7 @@ def placement_of(rows: Mapping[str, Any]) -> Placement:
 
 
 def predictions(best: Ranked, rule: Ranked, found: Sequence[Ranked]) -> dict[str, Any]:
-    """Return the predictions of a placement as keys of a report.
+    """Return the keys `predicted_ms`, `rule_ms`, `rule` and `alternatives` of a report's `placement`.
 
     `best`: placement that was chosen.
     `rule`: placement that suits any run.

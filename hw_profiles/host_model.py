@@ -1,10 +1,10 @@
 """The profile `host` in a prediction: its units placed on cores, and measured times in place of assumed times.
 
 Units are placed as in a run, but by modelled times. Virtual time can only simulate units with cores of their own, and
-units that take turns on one core. Therefore no unit floats, and no unit with several cores shares a core; only the user
-can choose such cores. A network's measured time, divided by its modelled time, says how much slower its unit is than
-assumed, for each number of threads. If its tensor has another shape, the time changes in proportion to the work. A
-prediction without measurements has no interval.
+units that take turns on one core. Therefore no unit floats, and no unit with several cores shares a core, apart from
+cores that the user chose. A network's measured time, divided by its modelled time, says how much slower its unit is
+than assumed, for each number of threads. If the network's tensor has another shape, the time changes in proportion to
+the work. A prediction without measurements has no interval.
 """
 
 from __future__ import annotations
@@ -78,7 +78,7 @@ class Placed(NamedTuple):
 
     @property
     def facts(self) -> dict[str, Any]:
-        """The key `placement` of a prediction."""
+        """The value of a prediction's key `placement`: `units`, and the keys of `predictions`."""
         return {"units": unit_rows(self.best.placement), **predictions(self.best, self.rule, self.found)}
 
 
@@ -92,7 +92,6 @@ def place_units(
     """Return the placement of the units of `profile` on `cores`, by the times that the model predicts for `plan`.
 
     `corners`: corner of each unit.
-
     `asked`: cores that the user chose for units, all of them among `cores`.
     """
     given = {unit: Place(own, len(own)) for unit, own in (asked or {}).items()}
@@ -105,7 +104,7 @@ def place_units(
 
 
 def on_cores(profile: Profile, placement: Placement) -> Profile:
-    """Return `profile` with its units on the cores of `placement`, and the network's unit with that many threads."""
+    """Return `profile` with its units on the cores of `placement`, and the network's unit with its threads there."""
     units = {}
     for name, unit in profile.units.items():
         place = placement[name]
@@ -149,7 +148,7 @@ def _times(profile: Profile, plan: Plan, corners: Corners, cores: int, given: Pl
 
 
 def with_threads(unit: Unit, threads: int) -> Unit:
-    """Return the network's unit with `threads` threads; its peak rates are in proportion to them."""
+    """Return the network's unit with `threads` threads, and peak rates in proportion to this number."""
     scale = threads / unit.threads
     rates: dict[str, Quantity] = {name: getattr(unit, name) for name in PEAKS}
     scaled = {name: rate.model_copy(update={"value": rate.or_else(0.0) * scale}) for name, rate in rates.items()}
@@ -218,7 +217,7 @@ def _measured(value: float, source: str) -> Quantity:
 
 
 def with_known_intervals(profile: Profile, unit: UnitName, answer: dict[str, Any]) -> dict[str, Any]:
-    """Return `answer`, a prediction for `unit` of this machine, with None for the intervals of unmeasured figures."""
+    """Return `answer`, a prediction for `unit` of this machine, with None for intervals of unmeasured times."""
     if profile.units[unit].measured is not None:
         return _without(answer, OF_POWER)
     known = _without(answer, OF_POWER | OF_TIMES)
@@ -228,7 +227,7 @@ def with_known_intervals(profile: Profile, unit: UnitName, answer: dict[str, Any
 
 
 def _without(found: dict[str, Any], keys: frozenset[str]) -> dict[str, Any]:
-    """Return `found` with None under `keys`, also in the mappings inside it."""
+    """Return `found` with None as the value of each of `keys`, also in the mappings inside it."""
     return {
         key: None if key in keys else _without(value, keys) if isinstance(value, dict) else value
         for key, value in found.items()

@@ -3,9 +3,9 @@
     time = price(profile, work, "dsp", corners_of(profile, "burst"))
     time.total_ms, time.operators[0].bound, interval(profile, work, time).why
 
-`job_ms` is the part that belongs to no operator: the unit wakes, and the input is converted. An operator that the
-runtime folds into another one is not listed. `predict_network` adds power, rates and the course over minutes; other
-units are idle.
+`job_ms` is the part of the time that belongs to no operator: the unit wakes, and the input is converted. An operator
+that the runtime folds into another one is not listed. `predict_network` adds power, rates and the course over minutes;
+other units are idle.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class OperatorTime(NamedTuple):
 
 @dataclass(frozen=True)
 class NetworkTime:
-    """The time of one job.
+    """The time of one job. The whole time, `total_ms`, is the sum of the parts below.
 
     `job_ms`: part that belongs to no operator.
     `operators`: times of the operators, in the order of the file.
@@ -93,7 +93,7 @@ class Interval(NamedTuple):
 
 
 def spread_of(around: Interval) -> float:
-    """Return the standard deviation of the time's logarithm that an interval stands for."""
+    """Return the standard deviation of the time's logarithm for which the 80 % interval `around` stands."""
     return math.log(around.high_ms / around.low_ms) / 2 / NORMAL_80
 
 
@@ -171,7 +171,7 @@ def interval(profile: Profile, work: Work, time: NetworkTime) -> Interval:
 
 
 def _likeness(job: JobTime) -> str:
-    """Return a sentence about the distance of the network from the nearest network of the fit."""
+    """Return a clause that names the network of the fit nearest to the network of `job`, and their distance."""
     if not job.like:
         return "its profile names no network that its numbers were fitted to"
     return f"of those {job.like} is most like it; {job.unlike:.0%} of the time goes into other work"
@@ -244,9 +244,7 @@ class Computes(NamedTuple):
     runtime: EngineRuntime | None = None
 
     def on(self, profile: Profile, unit: UnitName) -> Profile:
-        """Return `profile` with `unit` in the precision and under the runtime of this network.
-
-        Every prediction of a network uses such a profile.
+        """Return `profile` with `unit` in the precision and under the runtime of this network, as predictions need it.
 
         Raises BadInputError as `under_runtime`.
         """
@@ -271,7 +269,7 @@ def predict_network(
     `profile`: hardware profile of the chip, with the unit in the network's precision.
     `graph`: graph of the network, from a file.
     `unit`: unit that runs the network.
-    `performance_profile`: its name; published latencies are assumed to be under `burst`.
+    `performance_profile`: one of PERFORMANCE_PROFILES; published latencies are assumed to be under `burst`.
     `minutes`: virtual time from a cold start, at the wanted rate or else without pause; 0: no course over minutes.
     `governor`: name in GOVERNORS; None for the profile's governor.
     `wanted`: rate to judge, and limit of power.
@@ -334,9 +332,10 @@ def _times(time: NetworkTime, around: Interval) -> dict[str, Any]:
 
 
 def operator_rows(work: Work, time: NetworkTime) -> list[dict[str, Any]]:
-    """Return a row for each operator in the order of the file, with its bound and its share of the network's time.
+    """Return a row for each operator, in the order of the file.
 
-    An operator that the unit's runtime folds into another one has no row.
+    Its keys are `name`, `op_type`, `ms`, `share` of the network's time, `bound`, `macs` and `elements`. An operator
+    that the unit's runtime folds into another one has no row.
     """
     counts = {operator.name: (operator.macs, operator.moved) for operator in work.operators}
     total_ms = time.total_ms
@@ -355,7 +354,7 @@ def operator_rows(work: Work, time: NetworkTime) -> list[dict[str, Any]]:
 
 
 def without_rule(work: Work) -> list[dict[str, Any]]:
-    """Return a row for each type of operators without a rule: their number, and their share of all moved elements."""
+    """Return a row for each operator type without a rule: `op_type`, `count`, `share_of_elements` that it moves."""
     moved = Counter[str]()
     for operator in work.operators:
         if not operator.ruled:

@@ -94,7 +94,7 @@ class Work:
 
     @cached_property
     def table(self) -> NDArray[np.float64]:
-        """The counts of the operators (operators, 5): macs, moved, c_in, c_out, out."""
+        """The counts of the operators (operators, 5), with the columns macs, moved, c_in, c_out, out."""
         rows = [(o.macs, o.moved, o.c_in, o.c_out, o.out) for o in self.operators]
         return np.array(rows, dtype=np.float64).reshape(-1, 5)
 
@@ -136,7 +136,7 @@ def one_after_the_other(works: Sequence[Work]) -> Work:
 class Network(NamedTuple):
     """A network with the input that the raster stage draws for it.
 
-    `facts`: keys that identify it in reports.
+    `facts`: keys that identify the network in reports.
     `height`, `width`, `channels`: size of its input.
     `layout`: `packed` (one tensor) or `split` (one tensor per raster pass).
     `work`: work of one frame.
@@ -184,7 +184,7 @@ def count_work(model: Any) -> Work:
 
 
 def _picture_tensors(graph: Any, inputs: list[str]) -> int:
-    """Return the number of tensors of a picture: all inputs, if only one concatenation reads them; otherwise 1."""
+    """Return the number of inputs that form one picture: all if only one concatenation reads them, otherwise 1."""
     given, readers = set(inputs), []
     for node in graph.node:
         if given.intersection(node.input):
@@ -269,7 +269,7 @@ def _costs_nothing(node: Any, constants: set[str]) -> bool:
 
 
 def _live_counts(graph: Any, shapes: Shapes, constants: set[str]) -> list[int]:
-    """Return for each node the elements of all results so far that later nodes read or that are outputs."""
+    """Return for each node how many elements exist after it, because later nodes read them or they are outputs."""
     last_use = {name: index for index, node in enumerate(graph.node) for name in node.input if name not in constants}
     last_use |= {output.name: len(graph.node) for output in graph.output}
     freed: dict[int, int] = {}
@@ -289,7 +289,7 @@ def _operator(node: Any, shapes: Shapes, constants: set[str], read: set[str]) ->
     """Return the counts of `node`.
 
     `constants`: names of the tensors that do not depend on the input.
-    `read`: names of the tensors that a node reads, and of the outputs.
+    `read`: names of the tensors that any node reads, and of the graph's outputs.
     """
     known = has_rule(node.op_type, node.domain)
     weighted = node.op_type in WEIGHTED and known
@@ -310,7 +310,7 @@ def _operator(node: Any, shapes: Shapes, constants: set[str], read: set[str]) ->
 
 
 def _convolution(node: Any, shapes: Shapes, plain: Operator) -> Operator:
-    """Return the counts of a convolution. `plain`: its counts without products."""
+    """Return the counts of the convolution `node`. `plain`: its counts without products."""
     groups = next((a.i for a in node.attribute if a.name == "group"), 1)
     weight, source, result = (
         shapes[name] for name in (node.input[CONVOLUTIONS[node.op_type]], node.input[0], node.output[0])

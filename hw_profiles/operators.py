@@ -290,7 +290,7 @@ class EngineLayer(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Layers:
-    """The layers of a network, in order. An object equals only itself.
+    """The layers of a network, in order. Two objects are never equal, even with equal content.
 
     `sizes`: elements of each tensor, by name.
     `input`, `output`: elements of the network's inputs and of its outputs.
@@ -311,12 +311,12 @@ class Layers:
         return table
 
     def since(self, name: str, crossing: int) -> Layers:
-        """Return the layers from the layer `name` on. `crossing`: elements that they read from the layers before it."""
+        """Return the layers from the layer `name` on. `crossing`: elements that they read from earlier layers."""
         first = next((i for i, layer in enumerate(self.layers) if layer.name == name), len(self.layers))
         return Layers(self.layers[first:], self.sizes, crossing, self.output)
 
     def named(self, before: str) -> Layers:
-        """Return the same layers with `before` in front of the names of layers and tensors."""
+        """Return the same layers with the text `before` in front of the names of all layers and tensors."""
 
         def renamed(names: tuple[str, ...]) -> tuple[str, ...]:
             return tuple(before + name for name in names)
@@ -352,7 +352,7 @@ class _Graph:
         self._ends = {self.name_of(output.name) for output in graph.output}
 
     def rename(self, name: str, original: str) -> None:
-        """Treat the tensor `name` as the tensor `original` from now on."""
+        """Treat the tensor `name` as another name of the tensor `original` from now on."""
         self._renamed[name] = original
 
     def name_of(self, name: str) -> str:
@@ -372,7 +372,7 @@ class _Graph:
 
 
 def first_result(node: Any) -> str:
-    """Return the name of the first result that `node` makes; a recurrent layer may leave out its first result."""
+    """Return the name of the first result that `node` makes. A recurrent layer may make only a later result."""
     name: str = next(name for name in node.output if name)
     return name
 
@@ -428,7 +428,7 @@ def _folds(before: EngineLayer, names: _Graph) -> bool:
 
 
 def _takes_up(before: EngineLayer, names: _Graph) -> bool:
-    """Return whether a batch normalisation after the layer `before` becomes part of that layer's weights."""
+    """Return whether a batch normalisation after the layer `before` can become part of the weights of `before`."""
     return before.kind in PLAIN_PRODUCTS and names.reads[before.writes] == 1
 
 
@@ -473,7 +473,7 @@ def _movement(node: Any, kind: str, moved: int, names: _Graph) -> Iterator[tuple
 
 
 def _padded(shape: tuple[int, ...], block: int) -> int:
-    """Return the number of elements of a tensor whose channels, the second axis, are rounded up to whole blocks."""
+    """Return the elements of a tensor of `shape` with its channels, the second axis, rounded up to whole blocks."""
     if len(shape) != 4:
         return prod(shape)
     return shape[0] * _up(shape[1], block) * shape[2] * shape[3]
@@ -500,7 +500,7 @@ def _products(node: Any, shapes: Shapes) -> Iterator[tuple[str, float]]:
 
 
 def _padding(count: int, block: int) -> float:
-    """Return the number of channels rounded up to whole blocks, divided by the number of channels."""
+    """Return `count` channels rounded up to whole blocks, divided by `count`."""
     return _up(count, block) / count
 
 
@@ -533,6 +533,7 @@ def _grouped(places: int, c_in: int, c_out: int, groups: int, stride: int) -> It
 
     `places`: number of output positions times number of kernel positions.
     `c_in`, `c_out`: input and output channels of all groups together.
+    `stride`: stride of the kernel.
     """
     if c_in > groups:
         yield "grouped", places * _up(c_in // groups, INPUT_BLOCK) * _up(c_out, OUTPUT_BLOCK)

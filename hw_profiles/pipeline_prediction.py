@@ -87,7 +87,7 @@ class StagePrice:
 
 
 def given_price(file: PipelineFile, name: str) -> StagePrice | None:
-    """Return the time that the file states for stage `name`; None if it states none."""
+    """Return the time that the file states for the stage `name`; None if the file states none."""
     stage = file.stages[name]
     time = stage.own_time
     if time is None:
@@ -178,7 +178,7 @@ def prices_of(
 
 
 def _without_a_time(file: PipelineFile, names: Sequence[str], measured: MeasuredStages) -> BadInputError:
-    """Return the error for stages without a time; its place is the first stage, and it names the others."""
+    """Return the error for the stages `names`, which have no time. Its place is the first; its text names the rest."""
     first = names[0]
     found = f"{file.stages[first].named_kind} without a time"
     if names[1:]:
@@ -197,7 +197,7 @@ def _without_a_time(file: PipelineFile, names: Sequence[str], measured: Measured
 
 
 def factors_at(prices: Mapping[str, StagePrice], end: Ends) -> dict[str, float]:
-    """Return for each stage its time at an end of its interval, divided by its expected time."""
+    """Return, by stage, its time at `end` of its interval, divided by its expected time."""
     found = {}
     for name, each in prices.items():
         at = {"expected": None, "low": each.low_ms, "high": each.high_ms}[end]
@@ -206,7 +206,7 @@ def factors_at(prices: Mapping[str, StagePrice], end: Ends) -> dict[str, float]:
 
 
 def bound_of(file: PipelineFile, prices: Mapping[str, StagePrice]) -> tuple[Graph, PeriodBound]:
-    """Return the scheduler's graph of a file and the bound on its period, from the mean times of its stages."""
+    """Return (scheduler's graph of `file`, lower bound on its period, from the mean times of its stages)."""
     times = {name: each.mean_ns for name, each in prices.items()}
     graph = graph_of(file, edge_rules(file))
     return graph, period_bound(graph, times, in_flight_of(file), source_ns(file), shares_of(file))
@@ -215,7 +215,7 @@ def bound_of(file: PipelineFile, prices: Mapping[str, StagePrice]) -> tuple[Grap
 class Drawn:
     """A function for the virtual clock that returns the time of each job in ns.
 
-    `factors`: factor on each stage's time; 1 for a stage that is missing.
+    `factors`: factor on the time of each stage, by name; 1 for a stage that is not listed.
     """
 
     def __init__(self, prices: Mapping[str, StagePrice], seed: int, factors: Mapping[str, float] | None = None) -> None:
@@ -252,9 +252,12 @@ def _draw_ms(time: StageTime, rng: np.random.Generator) -> NDArray[np.float64]:
 def predict_file(
     file: PipelineFile, prices: Mapping[str, StagePrice], frames: int = 0, seed: int = 0
 ) -> dict[str, Any]:
-    """Return the prediction, with the keys of report.json.
+    """Return the prediction of `file`, with the keys of report.json.
+
+    `prices`: time of each stage, by name.
 
     `frames`: number of frames of the simulated run; 0: the file's number, or 1000 if it has none.
+    `seed`: seed of all random numbers.
     """
     graph, bound = bound_of(file, prices)
     settings = settings_of(file, frames, seed, hang_ns=NEVER_HANGS_NS)
@@ -284,7 +287,7 @@ def predict_file(
 
 
 def _without_intervals(answer: dict[str, Any]) -> dict[str, Any]:
-    """Return the prediction with None for its intervals, because the error of a stage is not known."""
+    """Return the prediction `answer` with None for its intervals, because the error of a stage is not known."""
     for key in ("needs_ms", "frame_time_ms", "latency_ms"):
         answer[key] = {**answer[key], "low": None, "high": None}
     if rate := answer.get("rate"):
@@ -293,7 +296,7 @@ def _without_intervals(answer: dict[str, Any]) -> dict[str, Any]:
 
 
 def _share(file: PipelineFile) -> str:
-    """Return a sentence about the share of frames that are presented, if `every` leaves some out; otherwise ""."""
+    """Return a sentence about the share of presented frames if the key `every` leaves some out; otherwise ""."""
     period = file.periods[file.latency_to]
     return f"; {file.latency_to} has one frame of {period}, by every" if period > 1 else ""
 
@@ -309,7 +312,7 @@ def _row(stage: StagePrice) -> dict[str, Any]:
 
 
 def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], seed: int) -> FrameInterval:
-    """Return the time of a frame if the source is always ready."""
+    """Return the frame time, with its interval, if the source is always ready. `seed`: seed of the simulated runs."""
     (graph, settings), skips = always_fed(file), skips_of(file, seed)
 
     def needs_ms(end: Ends) -> float:
@@ -336,7 +339,7 @@ def always_fed(file: PipelineFile) -> tuple[Graph, Settings]:
 def holding_back(graph: Graph) -> Graph:
     """Return the graph with edges that delay their writers and never drop a frame.
 
-    Such edges are needed to judge a rate, which holds if every frame is presented.
+    A rate is judged with these edges, because it holds only if every frame is presented.
     """
     rules = ((rule, edge_rule(rule)) for rule in graph.edges)
     edges = (f"fifo:{known.slots}" if known.yields else rule for rule, known in rules)
@@ -353,7 +356,7 @@ def fed_bound_ms(file: PipelineFile, times_ms: Mapping[str, float]) -> float:
 
 
 def repeats_after(file: PipelineFile) -> int:
-    """Return the number of frames after which the pattern of their stages repeats."""
+    """Return the number of frames after which the keys `every` and the pattern of the bypass select the same stages."""
     return math.lcm(*file.periods.values(), len(file.bypass[1].pattern or ".") if file.bypass else 1)
 
 
@@ -378,8 +381,9 @@ def steady_ms(run: Simulation, stop_ns: int, repeats: int) -> float:
 def over_ends(ms_at: Callable[[Ends], float], is_unsure: bool = True) -> FrameInterval:
     """Return a time with its interval.
 
-    The ends of the interval are the times that result if all stages have the low ends, or the high ends, of theirs.
-    The errors of all stages count as one error, because they come from one model of one chip, or from one run.
+    The ends of the interval are the times that result if all stages have the low ends, or the high ends, of their
+    intervals. The errors of all stages count as one error, because they come from one model of one chip, or from one
+    run.
 
     `ms_at`: function that returns the time in ms at an end.
     `is_unsure`: whether the ends differ from the expected time.
@@ -396,7 +400,7 @@ def _intervals(
     needs: FrameInterval,
     seed: int,
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the intervals of the mean frame time and of the mean latency, from short simulated runs at both ends.
+    """Return (interval of the mean frame time, interval of the mean latency), from short simulated runs at both ends.
 
     If no frame is dropped, the interval of the frame time comes from `needs` and the period of the source.
     """

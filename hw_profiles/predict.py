@@ -123,7 +123,7 @@ def predict(
 
 
 def _shown_times(profile: Profile, fps: float | None, times: FrameInterval) -> FrameInterval:
-    """Return the times of a frame; at least the display's interval if the rate `fps` is above what it can show."""
+    """Return `times`, raised to the display's interval if the display cannot show `fps` frames a second."""
     display = profile.application.display_ms.or_else(0)
     return times if not fps or display * fps <= 1e3 else FrameInterval(*(max(ms, display) for ms in times))
 
@@ -144,7 +144,8 @@ def what_if(
 ) -> list[dict[str, Any]]:
     """Return a row for the network under each of `ALTERNATIVES` that the unit allows.
 
-    With `fps`, return a row for every policy with every edge, which says whether the rate holds, and at which power.
+    A row has `name`, `policy`, `edge`, `frame_ms`, `fps` and `latency_ms`. With `fps`, return a row of `at_rate` for
+    every policy with every edge instead.
 
     `profile`: hardware profile of the chip.
     `network`: network that runs.
@@ -192,7 +193,7 @@ def predict_table(
 def _settled_on(
     profile: Profile, plan: Plan, performance_profile: str, wanted: Wanted
 ) -> tuple[Profile, Plan, Corners, Placed | None]:
-    """Return (profile, plan at its rate, corners, placement of the units).
+    """Return (profile, plan at the wanted rate, corner of each unit, placement of the units).
 
     For this machine the profile has its units on cores. For a chip the placement is None.
     """
@@ -281,7 +282,7 @@ def _frame_times(profile: Profile, mean_ms: float, frames: Sequence[float]) -> d
 
 
 def ema_range_ms(profile: Profile, mean_ms: float) -> tuple[float, float]:
-    """Return (least, largest) exponential average over 20 frames in ms; not below the display's interval."""
+    """Return (least, largest) exponential average of 20 frame times in ms; neither is below the display's interval."""
     half = profile.application.ema20_half_range_fraction.or_else(0) * mean_ms
     return max(profile.application.display_ms.or_else(0), mean_ms - half), mean_ms + half
 
@@ -311,7 +312,10 @@ def _cells(row: ConfigurationRow) -> dict[str, Any]:
 
 
 def held_to(plan: Plan, fps: float | None) -> Plan:
-    """Return the plan at a rate. A policy that releases frames at a rate uses it; for other policies it is a limit."""
+    """Return `plan` at the rate `fps`, or unchanged if `fps` is None.
+
+    A policy that releases frames at a rate uses `fps`. For any other policy, `fps` limits the rate of shown frames.
+    """
     if fps is None:
         return plan
     if POLICIES[plan.variant.policy].paced:
@@ -326,8 +330,8 @@ def _unheld(plan: Plan) -> Plan:
 def unheld_times(profile: Profile, plan: Plan, corners: Corners, around: Interval, network_ms: float) -> FrameInterval:
     """Return the times of a frame if neither the display nor a rate limits the application.
 
-    Their interval follows from the interval of the network's time. If the other stages were measured together with the
-    network, they have the same relative error.
+    The interval follows from the interval of the network's time. Stages that were measured together with the network
+    have the same relative error.
 
     `profile`: hardware profile of the chip.
     `plan`: application that runs on it.
@@ -390,7 +394,7 @@ def _settled_power_w(profile: Profile, now: Steady, corners: Corners) -> float:
 
 
 def every_variant() -> Iterator[Variant]:
-    """Yield the reference application, then every other combination of a policy and an edge of EDGES."""
+    """Yield the variant `REFERENCE`, then every other combination of a policy and an edge of EDGES."""
     yield REFERENCE
     yield from (Variant(policy, edge) for policy in POLICIES for edge in EDGES if (policy, edge) != REFERENCE[:2])
 
@@ -398,7 +402,7 @@ def every_variant() -> Iterator[Variant]:
 def at_rate(profile: Profile, plan: Plan, corners: Corners, fps: float) -> dict[str, Any]:
     """Return one row of the comparison at a rate.
 
-    Its keys say whether the rate holds, which share of frames is dropped, and how much power the device takes.
+    Besides the keys of `what_if`, the row has `holds`, `dropped` (share of frames) and `power_w` of the device.
 
     `profile`: hardware profile of the chip.
     `plan`: application that runs on it.

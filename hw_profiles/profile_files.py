@@ -51,9 +51,9 @@ def load_profile(name: str | Path) -> Profile:
 
 
 def load_runnable(name: str | Path) -> Profile:
-    """Return the profile `name`.
+    """Return the profile `name`, as `load_profile` does.
 
-    Raises BadInputError as `load_profile`, and for a template, which describes no chip.
+    Raises BadInputError also for a template, which describes no chip.
     """
     profile = load_profile(name)
     if profile.template:
@@ -79,7 +79,7 @@ def parse_profile(data: Mapping[str, Any], path: Path) -> Profile:
 def merged_tables(path: Path, seen: tuple[Path, ...] = ()) -> dict[str, Any]:
     """Return the tables of `path`, merged over the tables of the profile that it extends.
 
-    `seen`: files that extend this one.
+    `seen`: files that extend `path`, directly or through other files.
 
     Raises BadInputError for a cycle or an unreadable file.
     """
@@ -172,7 +172,7 @@ def _short(value: Any) -> str:
 
 
 def _siblings(keys: Sequence[str]) -> Iterator[str]:
-    """Yield the keys that the schema allows in the table of the last of `keys`."""
+    """Yield the keys that the schema allows beside the last of `keys`, a path of keys from the root."""
     model: Any = Profile
     for key in keys[:-1]:
         fields = getattr(model, "model_fields", {})
@@ -181,6 +181,6 @@ def _siblings(keys: Sequence[str]) -> Iterator[str]:
 
 
 def _model_of(annotation: Any) -> Any:
-    """Return `Model` for the annotation `dict[str, Model]`; another annotation is returned unchanged."""
+    """Return `Model` for the annotation `dict[str, Model]`, and any other annotation unchanged."""
     arguments = getattr(annotation, "__args__", ())
     return arguments[-1] if arguments else annotation

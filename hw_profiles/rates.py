@@ -41,10 +41,11 @@ class FrameInterval(NamedTuple):
 
 
 def holding(fps: float, times: FrameInterval, dropped: int = 0, late: int = 0, frames: int = 0) -> dict[str, Any]:
-    """Return whether a rate of `fps` frames a second holds, as keys of a report, also in words.
+    """Return whether a rate of `fps` frames a second holds, as a report's key `rate`.
 
-    The reserve is the share of the time between two frames that is left over. Jitter may drop or delay frames although
-    the mean frame time is short enough.
+    Its keys are `fps`, `holds`, `words`, `sentence`, and `reserve` with its interval. The reserve is the share of the
+    time between two frames that is left over. Jitter may drop or delay frames although the mean frame time is short
+    enough.
 
     `times`: least time between two frames.
     `dropped`, `late`: numbers of frames that a run at this rate drops, or presents too late.
@@ -71,7 +72,7 @@ def holding(fps: float, times: FrameInterval, dropped: int = 0, late: int = 0, f
 
 
 def wanted_drops(dropped: Mapping[str, int]) -> int:
-    """Return the number of dropped frames without the frames that `every` leaves out.
+    """Return the number of dropped frames, apart from those that the key `every` of a pipeline file leaves out.
 
     `dropped`: numbers of dropped frames by place and cause, as in report.json.
     """
@@ -79,7 +80,7 @@ def wanted_drops(dropped: Mapping[str, int]) -> int:
 
 
 def without_interval(rate: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `rate`, a result of `holding`, without intervals; for a frame time whose error is not known."""
+    """Return `rate`, a result of `holding`, without intervals, for a frame time of unknown error."""
     ms = (1 - rate["reserve"]) * 1e3 / rate["fps"]
     holds = f"{'yes' if rate['holds'] else 'no'}; {_short(ms)} ms of {_short(1e3 / rate['fps'])} ms (no interval)"
     said = {"words": rate["words"].partition(",")[0], "sentence": f"holds {rate['fps']:g} fps: {holds}"}
@@ -101,7 +102,7 @@ def _sentence(fps: float, times: FrameInterval, missed: Mapping[str, int], frame
 
 
 def _short(ms: float) -> str:
-    """Return a time with three digits, without an exponent."""
+    """Return `ms` as text with three digits, without an exponent."""
     return f"{ms:.3g}" if ms < 100 else f"{ms:.0f}"
 
 
@@ -118,7 +119,8 @@ class FrameLoad(NamedTuple):
 
 
 def within_power(profile: Profile, requested: Corners, load: FrameLoad, limit_w: float) -> dict[str, Any]:
-    """Return the highest rate at which the device takes at most `limit_w`, and the corners of its units at that rate.
+    """Return `fps`, the highest rate at which the device takes at most `limit_w`, and the units' `corners` at that
+    rate.
 
     `limited_by` is `speed` if the requested corners cannot reach a higher rate, otherwise `power`. `low_fps` and
     `high_fps` are the rates at the two ends of the 80 % interval of the device's power.
@@ -191,7 +193,10 @@ def _by_power(profile: Profile, corners: Corners, load: FrameLoad, limit_w: floa
 
 
 def _allowed(requested: Corners, load: FrameLoad) -> list[Corners]:
-    """Return all combinations of corners up to the requested ones; a unit without work keeps its requested corner."""
+    """Return all combinations of corners in which no unit is above its requested corner.
+
+    A unit that has no work in `load` keeps its requested corner.
+    """
     working = load.work_ms(requested)
 
     def up_to(unit: UnitName, corner: Corner) -> tuple[Corner, ...]:
@@ -231,7 +236,7 @@ class _Watts(NamedTuple):
 def device_power(
     profile: Profile, busy: Mapping[str, float], corners: Corners, busy_error: Mapping[UnitName, float]
 ) -> dict[str, Any]:
-    """Return the power of the whole device, of each unit, and of its base: memory, screen and radio.
+    """Return the power of the whole device, of its `units`, and of its `base`: memory, screen and radio.
 
     `profile`: hardware profile of the chip.
     `busy`: share of the time in which each unit works.
@@ -252,7 +257,10 @@ def device_power(
 
 
 def _unit(profile: Profile, name: UnitName, corners: Corners, busy: float, busy_error: float) -> tuple[float, float]:
-    """Return (mean, standard deviation) of the power of the unit `name` in watts."""
+    """Return (mean, standard deviation) of the power of the unit `name` in watts.
+
+    `busy`, `busy_error`: share of the time in which the unit works, and relative error of this share.
+    """
     unit, corner = profile.units[name], corners[UNITS.index(name)]
     active, idle = unit.power_w(corner, 1.0), unit.power_w(corner, 0.0)
     exponent = unit.power_exponent.or_else(3.0) * unit.power_exponent.relative_error

@@ -124,7 +124,7 @@ def _network_input(b: GraphBuilder, spec: NetworkSpec) -> TensorRef:
 
 
 def _decoder(b: GraphBuilder, features: list[TensorRef]) -> TensorRef:
-    """Return the decoder's features at full size. `features`: features of the encoder, from stride 2 to stride 32."""
+    """Return the decoder's result at full size. `features`: features of the encoder, from stride 2 to stride 32."""
     x, skips = features[-1], [*reversed(features[:-1]), None]
     for width, skip in zip(DECODER, skips, strict=True):
         x = b.upsampled(x)
@@ -170,7 +170,7 @@ class ConfigurationRow:
         return value
 
     def range(self, column: str) -> tuple[float, float] | None:
-        """Return the values of `column`_min and `column`_max; None if one of them is blank. Raises BadInputError."""
+        """Return (value of `column`_min, value of `column`_max); None if a value is blank. Raises BadInputError."""
         low, high = self.number(f"{column}_min"), self.number(f"{column}_max")
         if low is None or high is None:
             return None
@@ -214,7 +214,10 @@ def _row(place: str, header: list[str], cells: list[str]) -> ConfigurationRow:
 
 
 def spec_of(cells: dict[str, str], place: str) -> NetworkSpec:
-    """Return the network that the cells `KEYS` describe; `size` is one side or HEIGHTxWIDTH. Raises BadInputError."""
+    """Return the network that the cells of the columns KEYS describe; `size` is one side or HEIGHTxWIDTH.
+
+    `place`: file and line, for messages. Raises BadInputError.
+    """
     size = cells["size"]
     try:
         height, width = parse_shape(size if "x" in size else f"{size}x{size}")
@@ -243,7 +246,7 @@ def encode(b: GraphBuilder, x: TensorRef, encoder: str) -> list[TensorRef]:
 
 
 def resnet18(b: GraphBuilder, x: TensorRef) -> list[TensorRef]:
-    """Return features at strides 2, 4, 8, 16, 32."""
+    """Return the features of `x` by ResNet18 at strides 2, 4, 8, 16 and 32."""
     x = b.unit(x, RESNET18_STEM, 7, stride=2)
     features = [x]
     pooled = (RESNET18_STEM, x.height // 2, x.width // 2)
@@ -262,7 +265,7 @@ def _basic_block(b: GraphBuilder, x: TensorRef, width: int, stride: int) -> Tens
 
 
 def _squeeze(b: GraphBuilder, x: TensorRef) -> TensorRef:
-    """Append squeeze-and-excitation, and return its result: mean over the picture, two 1x1 convolutions, gate."""
+    """Append squeeze-and-excitation of `x`: mean over the picture, two 1x1 convolutions, gate. Return the result."""
     inner = squeeze_channels(x.channels)
     pooled = b.op("GlobalAveragePool", [x.name], (x.channels, 1, 1))
     hidden = b.same("Relu", b.conv(pooled, inner, 1, bias=True))
@@ -281,7 +284,7 @@ def _inverted_block(b: GraphBuilder, x: TensorRef, row: MobileBlock) -> TensorRe
 
 
 def _inverted_encoder(b: GraphBuilder, x: TensorRef, encoder: MobileEncoder) -> list[TensorRef]:
-    """Return the features before each further halving, and at the end: strides 2, 4, 8, 16, 32."""
+    """Return the features of `x` at strides 2, 4, 8, 16 and 32: the last ones before each halving, and the result."""
     x = b.unit(x, encoder.stem, 3, ACTIVATIONS[encoder.activation], stride=2)
     features: list[TensorRef] = []
     for row in encoder.rows:
@@ -379,7 +382,7 @@ class GraphBuilder:
         return self.op(kind, [x.name, *more], x[1:], **attributes)
 
     def normed(self, x: TensorRef) -> TensorRef:
-        """Append the normalisation `norm`."""
+        """Append the normalisation of `x` that `norm` of the builder names."""
         if self.norm == "batch":
             return x
         scales = [self.weight((x.channels,)), self.weight((x.channels,))]
@@ -399,18 +402,18 @@ class GraphBuilder:
         return y if act is None else self.same(act, y)
 
     def upsampled(self, x: TensorRef) -> TensorRef:
-        """Append a resize to twice the size, by nearest neighbour."""
+        """Append a resize of `x` to twice the size, by nearest neighbour."""
         shape = (x.channels, 2 * x.height, 2 * x.width)
         return self.op("Resize", [x.name, "", self.twice.name], shape, mode="nearest")
 
     def model(self, name: str, outputs: list[TensorRef]) -> Any:
-        """Return everything so far as an `onnx.ModelProto`, opset 21."""
+        """Return the graph so far, with the results `outputs`, as an `onnx.ModelProto` of opset 21."""
         results = [value_info(out.name, (1, *out[1:])) for out in outputs]
         graph = helper.make_graph(self.nodes, name, self.inputs, results, [self.twice], value_info=self.infos)
         return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 21)])
 
     def add(self, x: TensorRef, y: TensorRef) -> TensorRef:
-        """Return the sum of two tensors of one size."""
+        """Append the sum of `x` and `y`, which have the same size."""
         return self.op("Add", [x.name, y.name], x[1:])
 
 

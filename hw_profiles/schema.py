@@ -66,7 +66,7 @@ class Quantity(ProfileTable):
         return SPREAD_OF_KIND[self.kind] if self.spread is None else self.spread
 
     def or_else(self, default: float) -> float:
-        """Return the value, or `default` when it is unknown."""
+        """Return the value, or `default` for an unknown value."""
         return default if self.value is None else self.value
 
 
@@ -94,7 +94,7 @@ Count = Annotated[Quantity, AfterValidator(_Range(1, 1e6))]
 
 
 class Memory(ProfileTable):
-    """The memory that the units share."""
+    """The chip's main memory, which all units share."""
 
     bandwidth_gb_s: Rate = Field(description="Bandwidth of the memory of the whole chip.")
     application_use_fraction: Annotated[Quantity, AfterValidator(_Range(0, 0.95))] = Field(
@@ -134,7 +134,7 @@ ENGINES: tuple[EngineName, ...] = ("int8_tflite", "int8_qnn_dlc", "fp16_tflite",
 
 
 class EngineRates(ProfileTable):
-    """The six numbers of a chip."""
+    """The six rates of a tensor engine of a chip."""
 
     arithmetic_tmac_s: Rate = Field(description="Rate of products.")
     activation_gb_s: Rate = Field(description="Rate of activations that fit on the chip.")
@@ -183,7 +183,7 @@ class Engine(ProfileTable):
         return self
 
     def factor(self, term: str) -> float:
-        """Return how many times as much `term` costs as the term that defines the unit of its rate."""
+        """Return the cost of `term` divided by the cost of the term that defines the unit of its rate."""
         return self.factors[term].or_else(1.0) if term in self.factors else 1.0
 
     def seconds_per_unit(self, rate: str) -> float:
@@ -206,7 +206,7 @@ class Measured(ProfileTable):
 
 
 class Unit(ProfileTable):
-    """One unit.
+    """A unit of the chip: its speeds, errors, clocks, power and thermal resistance.
 
     While a job runs, the unit takes `power_max_w` times the clock's fraction to the power of `power_exponent`.
     """

@@ -1,11 +1,11 @@
 """Predicts several tenants on one chip: avatars, networks and pipeline files, each at its rate, with power and heat.
 
 `tenants.py` computes the times of their jobs, and `trilane.scheduler.shared_units` decides whose job waits. This file
-computes how much a network slows while other jobs use the memory: it has the bandwidth that they leave (Gables, Hill
-and Reddi, 2019). Each avatar's camera, display and composition take `application_use_fraction` of the bandwidth all the
-time. A network on another unit takes the bytes that it moves, spread over its time. Jobs of one unit follow each other
-and never compete. A network that nothing slows has the time of `network_time.price`. Keys of the prediction that mean
-the same as in report.json have the same names.
+computes how much a network slows while other jobs use the memory: the network has the bandwidth that these jobs leave
+(Gables, Hill and Reddi, 2019). Each avatar's camera, display and composition take `application_use_fraction` of the
+bandwidth all the time. A network on another unit takes the bytes that it moves, spread over its time. Jobs of one unit
+follow each other and never compete. A network that nothing slows has the time of `network_time.price`. Keys of the
+prediction that mean the same as in report.json have the same names.
 """
 
 from __future__ import annotations
@@ -96,7 +96,10 @@ def _run(
 ) -> Sequence[Simulation]:
     """Return the simulated runs of `tenants` for `seconds` of virtual time.
 
+    `costs`: times of the tenants' jobs.
+    `turns`: name in TURNS.
     `fed`: index of the tenant whose source is always ready; None: no such tenant.
+    `keep`: whether the steps and jobs of each run are recorded.
     """
     stop = round(NS_PER_S * seconds), Stop()
     cores: dict[str, str] = {name: unit.core for name, unit in profile.units.items() if unit.core}
@@ -130,14 +133,14 @@ def needed(
 
 
 def _busy_s(run: Simulation, tenant: SharingPipeline, unit: str) -> float:
-    """Return the busy time in seconds of the chip's unit `unit` for a tenant."""
+    """Return the busy time in seconds of the chip's unit `unit` in jobs of `tenant`."""
     rows = run.report["units"]
     own = [name for name, hardware in tenant.hardware.items() if hardware == unit and name in rows]
     return float(sum(rows[name]["busy"] for name in own) * run.report["duration_s"])
 
 
 def _seconds(tenants: Sequence[SharingPipeline], costs: _Costs) -> float:
-    """Return the length of the run in virtual seconds."""
+    """Return the length of the simulated runs in virtual seconds."""
     slowest = max(
         max(1 / tenant.fps, sum(means.values()) / 1e3) for tenant, means in zip(tenants, costs.mean_ms, strict=True)
     )
@@ -187,7 +190,7 @@ class _Costs:
         return self.jobs[job.tenant].network_ms(job.network, use)
 
     def _demand(self, job: _Job) -> float:
-        """Return the share of the bandwidth that a network takes while it runs, 0 to 1."""
+        """Return the share of the bandwidth that the network of `job` takes while it runs, 0 to 1."""
         moved = self.jobs[job.tenant].moved_bytes(job.network)
         return moved / (self._ms(job, self._always) / 1e3) / self._bytes_s
 
@@ -316,7 +319,10 @@ def _kept(report: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _settled_ms(moments: Sequence[Moment], at: Callable[[Corners], Together], number: int) -> float | None:
-    """Return the mean frame time of tenant `number` in ms in the last fifth of the moments; None without moments."""
+    """Return the mean frame time of tenant `number` in ms in the last fifth of the moments; None without moments.
+
+    `at`: function that returns the settled state at given corners.
+    """
     last = last_fifth(moments)
     return _mean([at(each.corners).runs[number].report["frame_time_ms"]["mean"] for each in last]) or None
 

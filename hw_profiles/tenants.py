@@ -73,10 +73,13 @@ class Jobs(Protocol):
     def is_known(self) -> bool: ...
 
     def service_ns(self, stage: str, unit: str, frame: int, begin_ns: int) -> int:
-        """Return the time of a job in ns if no other tenant runs."""
+        """Return the time in ns of the job of `stage` for `frame` on `unit`, if no other tenant runs.
+
+        `begin_ns`: virtual time at which the job begins.
+        """
 
     def network(self, stage: str, frame: int) -> Hashable | None:
-        """Return a name for the network that a job computes; None if the job computes none."""
+        """Return a name for the network that the job of `stage` for `frame` computes; None if it computes none."""
 
     def network_ms(self, network: Any, use: float) -> float:
         """Return the time of a job with `network` in ms, while other jobs take the share `use` of the bandwidth."""
@@ -96,7 +99,7 @@ class SharingPipeline(Protocol):
     `repeats`: number of frames after which its jobs are the same again.
     `graph`: its graph for the scheduler.
     `fed`: (graph, settings) for a run whose source is always ready and in which no frame is dropped.
-    `hardware`: unit of the chip for each of its units; a unit without one has its own name.
+    `hardware`: for each unit of the pipeline, the chip's unit that does its jobs, or its own name without one.
     """
 
     @property
@@ -133,24 +136,29 @@ class SharingPipeline(Protocol):
         """
 
     def skips(self, frame: int, is_fresh: bool) -> bool:
-        """Return whether a frame takes the bypass of the graph."""
+        """Return whether a frame takes the bypass of the graph. `is_fresh`: whether its job is fresh."""
 
     def on(self, profile: Profile, corners: Corners, end: Ends, always: float) -> Jobs:
-        """Return the times of its jobs. `always`: share of the bandwidth that is taken all the time, 0 to 1."""
+        """Return the times of its jobs on the chip `profile`.
+
+        `corners`: corner of each unit of the chip.
+        `end`: expected times, or one end of their intervals.
+        `always`: share of the memory's bandwidth that is taken all the time, 0 to 1.
+        """
 
     def facts(self, profile: Profile) -> dict[str, Any]:
-        """Return its keys `unit`, `numbers`, `precision`, `policy` and `edge` of a prediction."""
+        """Return a prediction's keys `unit`, `numbers`, `precision`, `policy` and `edge` for this pipeline."""
 
 
 def check_rate(name: str, fps: float) -> None:
-    """Raise BadInputError for a rate out of range."""
+    """Raise BadInputError if `fps`, frames a second, is out of range. `name`: name of the tenant, for the message."""
     if not LEAST_FPS <= fps <= MOST_FPS:
         raise BadInputError(f"{name}: rate", f"{fps:g}", f"{LEAST_FPS:g} to {MOST_FPS:g} frames a second")
 
 
 @dataclass(frozen=True)
 class Tenant:
-    """An avatar, or a network by itself, as a `Pipeline`.
+    """An avatar, or a network by itself, as a `SharingPipeline`.
 
     `networks`: one network for each combination of tensor shape, number of avatars in view and levels of their meshes.
     `frames`: for each frame, the index of its network in `networks`, or `SKIPS`; after its end the list starts over.
@@ -158,7 +166,7 @@ class Tenant:
     `variant`: how the stages are connected and scheduled.
     `is_bare`: whether it consists only of the network, whose result is due when the next frame comes.
     `avatars`: number of avatars in view for each of `networks`; empty for one avatar each.
-    `meshes`: number of their vertices over that of a whole mesh, for each of `networks`; empty for whole meshes.
+    `meshes`: for each of `networks`, the vertices in view divided by those of one whole mesh; empty for whole meshes.
     `computes`: precision and runtime of the networks.
 
     Raises BadInputError for a unit or a rate out of range.
@@ -220,7 +228,7 @@ class Tenant:
         return run_settings(policy, ENDLESS, shown_ns, shown_ns, **limits)
 
     def plan(self, kind: int, stretch: float = 1.0) -> Plan:
-        """Return the application of a frame with the network `networks[kind]`. `stretch`: factor on its time."""
+        """Return the application with the network `networks[kind]`. `stretch`: factor on the network's time."""
         avatars = self.avatars[kind] if self.avatars else 1
         meshes = self.meshes[kind] if self.meshes else None
         return Plan(self.networks[kind], self.unit, self.variant, avatars=avatars, meshes=meshes, stretch=stretch)
@@ -297,7 +305,7 @@ class _AvatarJobs:
         return {stage: whole * ms for (stage, _), ms in times.items()}
 
     def _stretch(self, work: Work) -> float:
-        """Return the factor on a network's time at this end of its interval."""
+        """Return the factor that turns a network's expected time into the time at the chosen end of its interval."""
         if self._end == "expected":
             return 1.0
         time = price(self._chip, work, self._tenant.unit, self._corners)
@@ -307,7 +315,7 @@ class _AvatarJobs:
 
 @dataclass(frozen=True)
 class FileTenant:
-    """A pipeline file, as a `Pipeline`.
+    """A pipeline file, as a `SharingPipeline`.
 
     `graphs`: graphs of its networks, by the stage's name.
     `precision`: int8, fp16 or fp32 for networks whose stage states none; None: the network and its unit decide.
@@ -372,7 +380,10 @@ class FileTenant:
 
 
 class _Priced(NamedTuple):
-    """A network whose time comes from the chip's model. `factor`: time at the end of its interval / expected time."""
+    """A network whose time comes from the chip's model.
+
+    `factor`: time at the chosen end of its interval, divided by the expected time.
+    """
 
     work: Work
     chip: Profile

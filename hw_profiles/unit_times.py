@@ -164,7 +164,7 @@ class _Chip:
                 self._readers[name].append(index)
 
     def _read(self, names: tuple[str, ...]) -> tuple[str, ...]:
-        """Return the tensors that `names` stand for, each once; a concatenation stands for its parts."""
+        """Return the tensors that hold the data of `names`, each once: the parts in place of a concatenation."""
         return tuple(dict.fromkeys(part for name in names for part in self._parts.get(name, (name,))))
 
     def _next(self, name: str, index: int) -> int:
@@ -209,8 +209,8 @@ class JobTime:
     `parts`: time in ms by part: `fixed`, `input`, `weights`, `fallback` and the operator classes. A tensor engine has
     `arithmetic`, `activation` and `spill` in place of the classes.
     `unsure`: relative error from the spreads of the engine's numbers; None for a roofline.
-    `unlike`: distance of the network from `like`, 0 to 1.
-    `like`: nearest network of the fit of the engine's numbers; empty without one.
+    `unlike`: distance of the network from the network `like`, 0 to 1 (`nearest`).
+    `like`: name of the nearest network of the engine's fit; empty without one.
     """
 
     parts: Mapping[str, float]
@@ -307,12 +307,12 @@ def fallback_ms(unit: Unit, work: Work, batch: int = 1) -> list[tuple[str, float
 
 
 def _permutes_ms(unit: Unit, work: Work) -> float:
-    """Return the additional time in ms if the picture comes in several tensors; otherwise 0."""
+    """Return the fixed time in ms for a picture that comes in several tensors; 0 for a single tensor."""
     return unit.permute_fixed_ms.or_else(0.0) if work.input_tensors > 1 else 0.0
 
 
 def nearest(engine: Engine, shares: F64) -> tuple[float, str]:
-    """Return (distance of a network from the nearest network of the engine's fit, name of the latter).
+    """Return (distance of a network from the nearest network of the engine's fit, name of that nearest network).
 
     The distance is the total variation distance of both networks' shares, 0 to 1. For an engine that names no networks
     the result is (1, "").
@@ -324,7 +324,7 @@ def nearest(engine: Engine, shares: F64) -> tuple[float, str]:
 
 
 def _apart(own: Mapping[str, float], others: Mapping[str, float]) -> float:
-    """Return half the sum of the absolute differences of two networks' shares; a missing term of `others` is 0."""
+    """Return half the sum of the absolute differences of two networks' shares; a term that `others` lacks is 0."""
     # The shares of `own` sum to 1, so the 1 contains the terms that `others` does not name.
     return (1 + sum([abs(own[name] - share) - own[name] for name, share in others.items()])) / 2
 
@@ -353,7 +353,7 @@ class UnitNumbers:
     `input`: time of an element of the network's input.
     `permute`: additional time if the input comes as several tensors.
     `fallback`: ONNX types of the operators that run on the CPU.
-    `fallback_job`, `fallback_element`: fixed time of such an operator, and time of an element of its result.
+    `fallback_job`, `fallback_element`: fixed time of an operator on the CPU, and time of an element of its result.
     """
 
     arithmetic: NDArray[np.float64]
@@ -371,7 +371,7 @@ class UnitNumbers:
 
 
 def machine_of(unit: Unit, memory: Memory, clock_fraction: float = 1.0, contended: bool = False) -> UnitNumbers:
-    """Return the numbers of a unit; for a measured unit, all are slower by the measured factor.
+    """Return the numbers of a unit; for a measured unit, all times and rates are slower by the measured factor.
 
     `unit`: unit of a profile.
     `memory`: memory of the same profile.
@@ -400,7 +400,11 @@ def machine_of(unit: Unit, memory: Memory, clock_fraction: float = 1.0, contende
 
 
 def job_time(work: Work, machine: UnitNumbers, batch: int = 1) -> JobTime:
-    """Return the time of one job of `batch` frames; fixed costs and weights count once per job."""
+    """Return the time of one job of `batch` frames; fixed costs and weights count once per job.
+
+    `work`: work of one frame.
+    `machine`: numbers of the unit.
+    """
     classes, counts = work.classes, work.table
     on_cpu = np.array([o.op_type in machine.fallback for o in work.operators], dtype=bool)
     seconds = np.where(on_cpu, 0.0, _operator_seconds(counts, classes, machine))

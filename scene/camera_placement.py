@@ -7,8 +7,9 @@ does not look down on people. The tilt is left out if it would hide people. Plac
 seconds, whatever the length and rate of a run. Therefore a frame of a scene shows the same picture in every run.
 
 A built-in camera is a formula of time for a person at the origin. The camera goes along with the avatars if they would
-leave the picture: its place moves by the mean of their ways over the floor. A way repeats as its motion does, so no
-frame depends on earlier frames. Steps and sways are smoothed out of a way, because they would shake the camera.
+leave the picture: its place moves by the mean of the avatars' ways. A way is an avatar's smoothed path over the floor.
+A way repeats as its motion does, so no frame depends on earlier frames. Steps and sways are smoothed out of a way,
+because they would shake the camera.
 
 A person who steers turns the view about the vertical through a pivot, then about the level axis to the camera's right.
 The camera stays upright, above the floor and off the pole. If the scene's own camera is beyond these limits, steering
@@ -118,7 +119,7 @@ class PlacedCamera:
         return view_from_pose(self.turn @ turn @ self.mount, at)
 
     def reach(self) -> tuple[F64, F64]:
-        """Return the lowest and the highest coordinates (3,) of the camera in the scene, ways included."""
+        """Return the (lowest, highest) coordinates (3,) of the camera in the scene, metres, over its whole movement."""
         places = self.path.places @ self.turn.T + self.shift
         low, high = places.min(axis=0), places.max(axis=0)
         if self.ways:
@@ -139,8 +140,8 @@ def steered(view: F64, pivot: F64, azimuth_deg: float, elevation_deg: float, zoo
     """Return `view` after the camera is turned about `pivot` (3,) and moved towards it.
 
     `view` and the result: transform (4, 4) from world to camera.
-    `azimuth_deg`: turn to the right about the vertical.
-    `elevation_deg`: turn upwards.
+    `azimuth_deg`: turn of the camera to the right about the vertical, degrees.
+    `elevation_deg`: turn of the camera upwards, degrees.
     `zoom`: factor by which the camera comes nearer, above 0.
     """
     if azimuth_deg == 0.0 and elevation_deg == 0.0 and zoom == 1.0:
@@ -157,9 +158,10 @@ def steered(view: F64, pivot: F64, azimuth_deg: float, elevation_deg: float, zoo
 
 
 def _turn(arm: F64, azimuth_deg: float, elevation_deg: float) -> F64:
-    """Return the rotation (3, 3) that steers a camera at `arm` (3,) from the pivot.
+    """Return the rotation (3, 3) that steers a camera at `arm` (3,) from the pivot. Angles are as in `steered`.
 
-    The elevation stays between LOWEST_DEG and HIGHEST_DEG, or the camera's own elevation if that is beyond.
+    The elevation stays between LOWEST_DEG and HIGHEST_DEG. If the camera's own elevation is outside this range, the
+    range is widened to it.
     """
     level = float(np.hypot(arm[0], arm[2]))
     if level < LEAST_LEVEL_M:
@@ -232,8 +234,8 @@ def _going_along(
 def _judged(path: CameraPath, movers: Sequence[Mover], ways: Sequence[Way]) -> F64:
     """Return the moments (F,), seconds, at which a built-in camera is judged.
 
-    They cover one cycle, with the moment at which each way is farthest from the origin. If a motion holds its end, one
-    cycle of the camera after that end is covered too.
+    The moments cover one cycle, and contain the moment at which each way is farthest from the origin. If a motion holds
+    its end, one cycle of the camera after that end is covered too.
     """
     after = [path.duration_s if mover.motion.wrap is Wrap.HOLD else 0.0 for mover in movers]
     cycles = (way_cycle_s(mover) + more for mover, more in zip(movers, after, strict=True))
@@ -272,7 +274,7 @@ def _placed(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Seq
 
 
 def _far(places: F64, points: F64, spec: CameraSpec) -> tuple[float, tuple[str, ...]]:
-    """Return a distance of the far clip plane, metres, that cuts off none of `points`, and a note if it is increased.
+    """Return (distance of the far clip plane, metres, that cuts off none of `points`; a note if it is increased).
 
     `places` (N, 3): positions of the camera. `points` (F, P, 3): points of the bodies, in the same world.
     """
@@ -285,10 +287,10 @@ def _far(places: F64, points: F64, spec: CameraSpec) -> tuple[float, tuple[str, 
 
 
 def _from_the_middle(path: CameraPath) -> tuple[CameraPath, F64, F64]:
-    """Return `path` moved to have its middle at the origin and to look along -Z at first, and this movement.
+    """Return (path, rotation, middle): `path` moved to have its middle at the origin and to look along -Z at first.
 
-    The movement is a rotation (3, 3) about the vertical and the middle (3,): new = rotation @ (old - middle). It makes
-    the search for a place independent of the origin and the heading of the file's world.
+    The movement is new = rotation @ (old - middle), with a rotation (3, 3) about the vertical and the middle (3,). This
+    makes the search for a place independent of the origin and the heading of the file's world.
     """
     ahead = path.pose(0.0)[0][:, 2]
     level = about(1, -np.arctan2(ahead[0], ahead[2]))
@@ -298,6 +300,9 @@ def _from_the_middle(path: CameraPath) -> tuple[CameraPath, F64, F64]:
 
 
 def _tilt_deg(path: CameraPath, times: F64) -> float:
-    """Return the angle, degrees, by which the camera is tilted up so that its median line of sight is in SIGHT_DEG."""
+    """Return the angle, degrees, by which the camera is tilted up to bring its median line of sight into SIGHT_DEG.
+
+    `times` (F,): moments of the median, seconds.
+    """
     sight = float(np.median([np.degrees(np.arcsin(np.clip(-path.pose(float(t))[0][1, 2], -1, 1))) for t in times]))
     return float(np.clip(np.clip(sight, *SIGHT_DEG) - sight, -LARGEST_TILT_DEG, LARGEST_TILT_DEG))

@@ -60,10 +60,10 @@ SCREEN = Rect(-1.0, -1.0, 1.0, 1.0)
 
 
 def choose_bucket(rect: Rect, output: Shape, buckets: Sequence[Shape]) -> tuple[Shape, Rect]:
-    """Return the tensor shape that wastes the least area on `rect`, and `rect` grown to that shape's aspect ratio.
+    """Return (tensor shape that wastes the least area on `rect`, `rect` grown to the aspect ratio of that shape).
 
-    The grown rectangle contains `rect`. It is moved onto the screen if it fits there. If a side is longer than the
-    screen, it extends beyond both edges of the screen by the same length. Of two shapes that waste the same area, the
+    The grown rectangle contains `rect`, and is moved onto the screen if it fits there. A side that is longer than the
+    screen extends beyond both edges of the screen by the same length. Of two shapes that waste the same area, the
     larger one is chosen.
 
     `rect`: rectangle of the mesh.
@@ -88,7 +88,7 @@ def choose_bucket(rect: Rect, output: Shape, buckets: Sequence[Shape]) -> tuple[
 
 
 def grow(low: float, high: float, length: float) -> tuple[float, float]:
-    """Return the ends of an interval of `length` about the middle of [low, high].
+    """Return the (lower, upper) end of an interval of `length` about the middle of [`low`, `high`], NDC.
 
     The interval is moved into [-1, 1] if it fits; otherwise it is centred on 0.
     """
@@ -132,7 +132,7 @@ def _grow_from_pixel(low: float, high: float, length: float, side: int) -> tuple
 
 
 def crop_projection(projection: ArrayLike, rect: Rect) -> F64:
-    """Return `projection` (4,4) followed by the map from `rect` to the whole screen; depth does not change.
+    """Return `projection` (4,4), followed by the map that stretches `rect` to the whole screen; depth does not change.
 
     In NDC, x' = (2 x - (x0 + x1)) / (x1 - x0). In clip space, X' = (2 X - (x0 + x1) W) / (x1 - x0), which is linear.
     Therefore the crop is exact for any projection.
@@ -287,17 +287,17 @@ def lay_out_at(
 
 
 def by_network(networks: Sequence[int]) -> list[list[int]]:
-    """Return a list of the avatars' indices for each network. `networks`: number of each visible avatar's network."""
+    """Return, for each network, the indices of its avatars. `networks`: number of each visible avatar's network."""
     return [[place for place, one in enumerate(networks) if one == network] for network in sorted(set(networks))]
 
 
 def apart(
     rects: Sequence[Rect], networks: Sequence[int], lay: Callable[[Sequence[Rect]], DenseLayout | None]
 ) -> DenseLayout | None:
-    """Return a layout with a separate tensor for the avatars of each network; None if the avatars of any do not fit.
+    """Return a layout with a separate tensor for the avatars of each network; None if a tensor has too little room.
 
     `rects`, `networks`: mesh rectangle of each visible avatar, and number of its network.
-    `lay`: lays out the avatars of one network, always in a tensor of one shape.
+    `lay`: function that lays out the avatars of one network, always in a tensor of one shape.
     The density of the result is the least density of these tensors.
     """
     groups = by_network(networks)
@@ -349,8 +349,8 @@ def _no_room(rects: Sequence[Rect], buckets: Sequence[Shape]) -> BadInputError:
 def tight_shape(rects: Sequence[Rect], output: Shape, density: float = 1.0, margin_px: int = MARGIN_PX) -> Shape:
     """Return the shape of least area with room for the avatars at `density`; sides are multiples of `BUCKET_STEP`.
 
-    For several avatars, shapes whose longer side exceeds `MOST_ASPECT` times the shorter side are taken only if all
-    arrangements have such shapes. The other parameters are those of `lay_out_at`.
+    For several avatars, a shape whose longer side exceeds `MOST_ASPECT` times the shorter is taken only if every
+    arrangement has such a shape. The other parameters are those of `lay_out_at`.
     """
     whole = [_pixels(on_grid(rect, output), output) for rect in rects]
     sizes = [(math.ceil(height * density), math.ceil(width * density)) for height, width in whole]
@@ -366,7 +366,7 @@ def covered(rect: Rect, output: Shape) -> int:
 
 
 def _pixels(rect: Rect, output: Shape) -> tuple[int, int]:
-    """Return (height, width) in pixels of a rectangle on the pixel grid of a picture of `output`."""
+    """Return (height, width) in pixels of `rect`, a rectangle on the pixel grid of a picture of `output`."""
     return round(rect.height * output[0] / 2), round(rect.width * output[1] / 2)
 
 
@@ -398,7 +398,10 @@ def _arrangements(
 
 
 def _rows(sizes: Sequence[tuple[float, float]]) -> Iterator[tuple[tuple[int, ...], ...]]:
-    """Yield the avatars' indices, tallest avatar first, divided into one row, two rows, and so on."""
+    """Yield the avatars' indices, tallest avatar first, divided into one row, two rows, and so on.
+
+    `sizes`: (height, width) of each avatar.
+    """
     order = sorted(range(len(sizes)), key=lambda k: -sizes[k][0])
     for count in range(1, len(order) + 1):
         each = math.ceil(len(order) / count)

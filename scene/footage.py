@@ -51,7 +51,7 @@ class Film:
     `times_s`: time at which each picture is first shown, from 0.
     `period_s`: time after which the film starts again.
     `rate`: notes on the rate of the pictures and on missing pictures.
-    `began_s`: time of the first picture, seconds since 1970; None where names do not state it.
+    `began_s`: time of the first picture, seconds since 1970; None if the names do not state it.
     """
 
     times_s: tuple[float, ...]
@@ -72,7 +72,7 @@ def in_order(names: Sequence[str]) -> list[str]:
 def film_of(names: Sequence[str], fps: float) -> Film:
     """Return the times of a folder's pictures.
 
-    `names`: file names in order, at least one. `fps`: rate of numbered pictures; ignored if the names are times.
+    `names`: file names in order, at least one. `fps`: pictures a second; ignored if the names are times.
     """
     clock = _clock(names)
     if clock:
@@ -110,7 +110,7 @@ def _film_by_clock(clock: Sequence[float]) -> Film:
 
 
 def _numbers(names: Sequence[str]) -> list[int]:
-    """Return the last number in each name, or [] if the names differ in more than that number and their endings."""
+    """Return the last number in each name; [] if the names also differ elsewhere, apart from their endings."""
     parts = [LAST_NUMBER.match(name.rpartition(".")[0]) for name in names]
     found = [part for part in parts if part]
     if len(found) < len(names) or len({(part[1], part[3]) for part in found}) > 1:
@@ -162,7 +162,7 @@ class Stored:
     turned: int = 0
 
     def shown(self, turned: int | None = None) -> Shape:
-        """Return (height, width) after `turned` quarter turns, or after those that the file prescribes if None."""
+        """Return (height, width) after `turned` quarter turns; None: after the turns that the file prescribes."""
         return self.shape[::-1] if (self.turned if turned is None else turned) % 2 else self.shape
 
 
@@ -170,12 +170,12 @@ class Stored:
 class Footage:
     """A background that the user brings.
 
-    `what`, `rate`: notes on what it is and on its frame rate.
+    `what`, `rate`: notes on the kind of background and on its frame rate.
     `stored`: the video or the picture; for a folder, each of its pictures.
     `files`: file names of the pictures, in the order of `stored`; empty for a video.
     `folder`: folder of the files.
     `period_s`: time after which the background starts again; 0 for a single picture.
-    `clock_s`: time of each picture, seconds since 1970, increasing; empty where names do not state it.
+    `clock_s`: time of each picture, seconds since 1970, increasing; empty if the names do not state it.
     """
 
     what: tuple[str, ...]
@@ -188,7 +188,7 @@ class Footage:
 
 
 def filmed(path: CameraPath, footage: Footage | None, output: Shape) -> tuple[CameraPath, tuple[str, ...]]:
-    """Return `path` as the camera that filmed `footage`, and notes on the background.
+    """Return (`path` as the camera that filmed `footage`, notes on the background).
 
     `footage`: None for a drawn background. `output`: (height, width) of the shown picture.
     """
@@ -213,7 +213,7 @@ def filmed(path: CameraPath, footage: Footage | None, output: Shape) -> tuple[Ca
 def _over_all(
     path: CameraPath, footage: Footage, output: Shape, notes: tuple[str, ...]
 ) -> tuple[CameraPath, tuple[str, ...]]:
-    """Return the camera that filmed the whole footage, and the notes on the background.
+    """Return (camera that filmed the whole footage, notes on the background).
 
     The footage is a video, a picture, or pictures that are not matched to poses; the first picture's shape stands for
     all.
@@ -234,9 +234,9 @@ def _over_all(
 
 
 def _turned(path: CameraPath, stored: tuple[Stored, ...]) -> tuple[CameraPath, tuple[str, ...]]:
-    """Return `path` with the shape of each picture and the quarter turns that make it agree with the camera; and notes.
+    """Return (`path` with the shape of each picture and the turns that make it fit the camera, notes).
 
-    If the turns that the files state all agree, and the path is not held, no turns are set and those of the files hold.
+    No turns are set if all of them agree with the turns that the files state, and the path is not held.
     `stored`: one picture for all samples of the path, or one for each.
     """
     lenses = path.optics.lenses
@@ -256,9 +256,9 @@ def _turn(lens: Lens, quarter: int, stored: Stored, is_own: bool) -> int:
     """Return the number of quarter turns clockwise after which `stored` is seen upright through `lens`.
 
     `quarter`: quarter turns of the lens. `is_own`: whether the camera's file measured the lens on this photo. Such a
-    photo was measured either as stored or as its file displays it; the shape of the lens decides. For any other photo,
-    its file's turn holds, with one exception: the stored pixels have the shape of a measured lens, but lie across it
-    when displayed.
+    photo was measured either as stored or as its file displays it; the shape of the lens decides. Any other photo has
+    the turn that its file states, with one exception: stored pixels have the shape of a measured lens, but lie across
+    it when displayed.
     """
     measured = lens.turned(-quarter)
     if is_own and lens.known is Known.ALL:
@@ -269,7 +269,7 @@ def _turn(lens: Lens, quarter: int, stored: Stored, is_own: bool) -> int:
 
 
 def _once(values: tuple[T, ...]) -> tuple[T, ...]:
-    """Return `values`, reduced to a single one if all are equal."""
+    """Return `values`, reduced to one value if all are equal."""
     return values[:1] if len(set(values)) == 1 else values
 
 
@@ -278,8 +278,8 @@ def _with_photos(
 ) -> tuple[tuple[CameraPath, tuple[Stored, ...]] | None, tuple[str, ...]]:
     """Match the poses of `path` to photos of `footage` by name.
 
-    Return the path without the poses whose photo is missing, with the matching photos, and notes; None in place of path
-    and photos if no photo matches.
+    Return ((path, photos), notes), with the path without the poses whose photo is missing. If no photo matches, None
+    takes the place of (path, photos).
     """
     if not path.pictures or not footage.files:
         return None, ()
@@ -312,8 +312,8 @@ def _by_clock(
 ) -> tuple[tuple[CameraPath, tuple[Stored, ...]], tuple[str, ...]] | None:
     """Match the pictures of `footage` to times of `path` by their clocks.
 
-    Return the path sampled at the times of the pictures that were taken during it, with those pictures, and notes. None
-    if there are no such pictures.
+    Return ((path, pictures), notes), with the path sampled at the times of the pictures that were taken during it. The
+    result is None if there are no such pictures.
     """
     if path.began_s is None:
         return None

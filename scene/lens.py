@@ -1,9 +1,9 @@
 """A pinhole lens in pixels of its picture, and what scaling, cutting and turning the picture does to the lens.
 
-When a picture is scaled, cut or turned, the lens's method of that name does the same to the lens. A point of the world
-then stays on its pixel. Pixel coordinates start at the picture's top left corner, x to the right and y down: the centre
-of the first pixel is (0.5, 0.5), as in COLMAP (https://colmap.github.io/cameras.html). `of_opencv` is for formats that
-count from the centre of the first pixel.
+When a picture is scaled, cut or turned, the lens's method `scaled`, `cropped` or `turned` changes the lens accordingly.
+A point of the world then stays at the same place in the picture. Pixel coordinates start at the picture's top left
+corner, x to the right and y down: the centre of the first pixel is (0.5, 0.5), as in COLMAP
+(https://colmap.github.io/cameras.html). `of_opencv` is for formats that count from the centre of the first pixel.
 
 Pictures are drawn without distortion. `distortion_note` says how far distortion would move points of the picture's
 border, by the models of OpenCV and COLMAP. A person can then judge whether it matters.
@@ -30,7 +30,7 @@ ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX = 640.0, 480.0
 class Known(Enum):
     """What is known of a lens: everything (ALL), or only the angle over one side of a picture of unknown shape.
 
-    LONG is the longer side of the picture, whichever that is.
+    WIDTH, HEIGHT and LONG name this side; LONG is the longer side of the picture.
     """
 
     ALL = "all"
@@ -66,7 +66,8 @@ def cover(picture: Shape, output: Shape) -> PictureCut:
 class Lens:
     """A lens without distortion: x = `cx` + `fx` X / Z, y = `cy` + `fy` Y / Z, with Y down and Z ahead.
 
-    `width_px`, `height_px`: size of the picture. All numbers are in its pixels. `known`: what is known of the lens.
+    `width_px`, `height_px`: size of the picture. `fx`, `fy`, `cx`, `cy`: numbers of pixels of this picture.
+    `known`: what is known of the lens.
     """
 
     width_px: float
@@ -78,7 +79,7 @@ class Lens:
     known: Known = Known.ALL
 
     def lies_across(self, picture: Shape) -> bool:
-        """Return whether one of the lens's picture and `picture` (height, width) is upright and the other is wide."""
+        """Return whether the lens's picture is upright and `picture` (height, width) is wide, or the reverse."""
         is_known = self.known in (Known.ALL, Known.LONG)
         return is_known and (self.height_px - self.width_px) * (picture[0] - picture[1]) < 0
 
@@ -159,7 +160,7 @@ class Lens:
         return whole.cropped((whole.width_px - width) / 2, 0.0, width, height)
 
     def between(self, other: Lens, fraction: float) -> Lens:
-        """Return the lens at `fraction` of the way from this lens to `other`, whose picture has the same size."""
+        """Return the lens at `fraction`, 0 to 1, of the way to `other`, whose picture has the same size."""
 
         def mix(a: float, b: float) -> float:
             return a + (b - a) * fraction
@@ -185,23 +186,29 @@ class Lens:
 
 
 def centred(width_px: float, height_px: float, focal_px: float, known: Known = Known.ALL) -> Lens:
-    """Return a lens with square pixels, whose principal point is the middle of its picture."""
+    """Return a lens with square pixels, whose principal point is the middle of its picture.
+
+    `focal_px`: both focal lengths, pixels. The other parameters are those of `Lens`.
+    """
     return Lens(width_px, height_px, focal_px, focal_px, width_px / 2, height_px / 2, known)
 
 
 def of_opencv(width_px: float, height_px: float, fx: float, fy: float, cx: float, cy: float) -> Lens:
-    """Return a lens from numbers of OpenCV or Kalibr, which count `cx` and `cy` from the centre of the first pixel."""
+    """Return a lens from numbers of OpenCV or Kalibr, which count `cx` and `cy` from the centre of the first pixel.
+
+    The parameters are otherwise those of `Lens`.
+    """
     return Lens(width_px, height_px, fx, fy, cx + 0.5, cy + 0.5)
 
 
 def of_fov_y(fov_y_deg: float) -> Lens:
-    """Return a lens of which only the field of view over the picture's height is known, degrees."""
+    """Return a lens of which only the field of view over the picture's height is known: `fov_y_deg` degrees."""
     focal = ASSUMED_HEIGHT_PX / 2 / math.tan(math.radians(fov_y_deg) / 2)
     return centred(ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX, focal, Known.HEIGHT)
 
 
 def of_fov_x(fov_x_deg: float) -> Lens:
-    """Return a lens of which only the field of view over the picture's width is known, degrees."""
+    """Return a lens of which only the field of view over the picture's width is known: `fov_x_deg` degrees."""
     focal = ASSUMED_WIDTH_PX / 2 / math.tan(math.radians(fov_x_deg) / 2)
     return centred(ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX, focal, Known.WIDTH)
 
@@ -262,7 +269,10 @@ def distortion_note(lenses: Iterable[Bent]) -> tuple[str, ...]:
 
 
 def largest_px(lens: Lens, parameters: Mapping[str, float], is_fisheye: bool = False) -> float:
-    """Return the largest displacement, in pixels, by distortion, of a point on the picture's border."""
+    """Return the largest distance, pixels, by which distortion moves a point on the picture's border.
+
+    `parameters`, `is_fisheye`: as in `Bent`.
+    """
     part = np.linspace(0.0, 1.0, BORDER_STEPS)
     zero, one = np.zeros(BORDER_STEPS), np.ones(BORDER_STEPS)
     border = np.column_stack([np.concatenate([part, part, zero, one]), np.concatenate([zero, one, part, part])])

@@ -35,7 +35,7 @@ DIRECTIONS: F64 = np.array(_SIGNS, dtype=np.float64) / np.linalg.norm(_SIGNS, ax
 
 @dataclass(frozen=True)
 class BodyOutline:
-    """The K outermost vertices of a body.
+    """K vertices of a body that represent its outside.
 
     `points` (K, 4): positions at rest, metres, with a 1 appended.
     `joints`, `weights` (K, W): indices of the joints that move each vertex, and their weights.
@@ -65,7 +65,9 @@ class BodyOutline:
 
 
 def outline(body: ShapedBody, joints: Collection[str] = JOINT_NAMES) -> BodyOutline:
-    """Return the outline of `body`: of the vertices that each joint moves most, the outermost in each of DIRECTIONS.
+    """Return the outline of `body`: for each joint, the outermost vertex in each of DIRECTIONS.
+
+    Only vertices that no other joint moves more count for a joint.
 
     `joints`: names of the joints whose vertices are taken.
     """
@@ -195,7 +197,7 @@ class Mover:
 
 
 def make_mover(spec: AvatarSpec, motion: Motion, body: ShapedBody) -> Mover:
-    """Return the mover that puts `motion` on the floor for `body`, at the position and heading of `spec`."""
+    """Return the mover that puts `motion`, performed by `body`, on the floor at the position and heading of `spec`."""
     leg = rest_leg_m(body.joints)
     scale = leg / motion.leg_m if motion.leg_m else 1.0
     shift = -body.joints[0]

@@ -68,7 +68,7 @@ def usable_samples(
     place_of: PlaceOf = by_number,
     broken_as: str = "not finite or no rotation",
 ) -> tuple[NDArray[np.intp], tuple[str, ...]]:
-    """Return the indices of the usable samples, and notes on left-out samples and on gaps in time.
+    """Return (indices of the usable samples, notes on left-out samples and on gaps in time).
 
     `where`: file, for messages.
     `times_s` (T,): times of the samples.
@@ -98,7 +98,7 @@ def usable_samples(
 
 
 def _strictly_increasing(times_s: F64) -> NDArray[np.bool_]:
-    """Return whether each time (T,) is later than all times before it, as an array (T,)."""
+    """Return a mask (T,) of the times that are later than all times before them."""
     highest = np.maximum.accumulate(times_s)
     later = np.ones(len(times_s), dtype=bool)
     later[1:] = times_s[1:] > highest[:-1]

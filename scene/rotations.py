@@ -1,7 +1,7 @@
 """Conversions of rotations: quaternions `w, x, y, z`, axis-angle vectors in radians, 3x3 matrices for column vectors.
 
-Rule: unless a shape is fixed, every function accepts any leading axes. All compute in float64 and are exact at angles
-of 0 and pi.
+Rule: unless a shape is fixed, every function accepts any leading axes. All functions compute in float64 and are exact
+at angles of 0 and pi.
 """
 
 from __future__ import annotations

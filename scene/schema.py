@@ -61,7 +61,7 @@ class Table(StrictModel):
 
 
 class OutputSpec(Table):
-    """The picture that is shown."""
+    """The size of the shown picture."""
 
     width: int = Field(
         default=640, ge=64, le=MAX_SIDE, multiple_of=2, description="Width of the shown picture, pixels."
@@ -72,7 +72,7 @@ class OutputSpec(Table):
 
 
 class AvatarSpec(Table):
-    """One avatar."""
+    """An avatar, with its place and its motion."""
 
     name: str | None = Field(
         default=None,
@@ -157,7 +157,7 @@ AXES_EXPECTED = (
 def axes_of(text: str) -> tuple[tuple[int, int, int], ...] | None:
     """Return the directions of x, y and z that `text` names, such as `forward-left-up`, as vectors of DIRECTIONS.
 
-    Return None if they are not right-handed axes.
+    The result is None unless they form right-handed axes.
     """
     words = text.split("-")
     if len(words) != 3 or not set(words) <= set(DIRECTIONS):
@@ -178,7 +178,7 @@ FILE_KEYS = ("format", "up_axis", "metres_per_unit", "rate_hz", "time_unit", "ax
 
 
 class CameraSpec(Table):
-    """The camera."""
+    """The camera, with its source, lens and place."""
 
     source: str = Field(default="builtin:orbit", description="`builtin:NAME`, a file or a folder.")
     format: Literal["auto", "arkit", "colmap", "euroc", "kitti", "nerf", "record3d", "stray", "tum"] = Field(
@@ -259,7 +259,7 @@ class CameraSpec(Table):
 
 
 class PlaneSpec(Table):
-    """A detected plane to show: a rectangle."""
+    """A plane to show, such as one that a phone has detected: a rectangle."""
 
     centre: Annotated[tuple[Finite, Finite, Finite], LISTED] = Field(
         default=(0.0, 0.0, 0.0), description="Centre of the rectangle in the world: x, y, z in metres."
@@ -299,7 +299,7 @@ def _scene_size(size: str) -> str:
 
 
 class Scene(Table):
-    """A scene."""
+    """The content of a scene: what its pictures show, and how they are drawn."""
 
     name: str = Field(default="scene", min_length=1, max_length=80, pattern=NAME, description="Name of the scene.")
     fps: float = Field(
@@ -382,7 +382,7 @@ class Scene(Table):
 
     @property
     def plans_tensor(self) -> bool:
-        """Whether the planner chooses the tensor's shapes, as `size` is `auto`."""
+        """Whether the planner chooses the tensor's shapes, which `size = "auto"` asks for."""
         return self.size == AUTO
 
 
@@ -411,7 +411,7 @@ BUILT_IN = ("room", "default", "hiker")  # names of a background and of two avat
 
 
 def bad_input(where: str | Path, error: ValidationError) -> BadInputError:
-    """Return a BadInputError about the first defect in `error`; its place is `where` with the key."""
+    """Return a BadInputError about the first defect in `error`. Its place is the file `where` with the key."""
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"])
     place = f"{where}: {key}" if key else str(where)
@@ -452,12 +452,12 @@ def _remedy(first: Mapping[str, Any]) -> str:
 
 
 def _keys_beside(loc: tuple[int | str, ...]) -> list[str]:
-    """Return the keys of the table that holds the key at `loc`."""
+    """Return the keys that are allowed in the table of the key at `loc`, pydantic's path of a key."""
     return list(_table_of(loc).model_fields)
 
 
 def _choices(loc: tuple[int | str, ...]) -> list[str]:
-    """Return the words that the key at `loc` allows, if it allows only fixed words."""
+    """Return the words that the key at `loc` allows; empty if it allows other values too."""
     return [str(word) for word in get_args(_field(loc).annotation)]
 
 
@@ -467,7 +467,7 @@ def _field(loc: tuple[int | str, ...]) -> FieldInfo:
 
 
 def _table_of(loc: tuple[int | str, ...]) -> type[BaseModel]:
-    """Return the model of the table that holds the key at `loc`."""
+    """Return the model of the table of the key at `loc`, pydantic's path of a key."""
     table: type[BaseModel] = Scene
     for key in loc[:-1]:
         if isinstance(key, str):
@@ -478,7 +478,7 @@ def _table_of(loc: tuple[int | str, ...]) -> type[BaseModel]:
 
 
 def scene_from(where: str | Path, values: Mapping[str, Any]) -> Scene:
-    """Return `values` as a Scene. Raises BadInputError that names `where` and the key."""
+    """Return the Scene of `values`, the content of a scene file. Raises BadInputError with `where` and the key."""
     try:
         return Scene.model_validate(values)
     except ValidationError as error:
@@ -524,7 +524,7 @@ def load_scene(path: Path) -> dict[str, Any]:
 
 
 def located(source: str, base: Path) -> str:
-    """Return `source` unchanged if it names something built in, otherwise as a path that starts at `base`.
+    """Return `source` unchanged if it names something built in, otherwise as a path resolved from the folder `base`.
 
     Raises BadInputError for an empty text.
     """

@@ -7,8 +7,8 @@ every mover and the camera sample to the same bits; notes are not transferred. A
 
 `require_person` refuses a recorded camera that does not show the person. No file states for certain the axes of a
 robot's poses, the up direction of a map or its unit of length. If one is wrong, the camera looks past the person
-wherever it is placed. The refusal tries each likely value and names the one that shows the person most; only the user
-knows if it is true.
+wherever it is placed. The refusal tries each likely value and names the one that shows the person most. Only the user
+knows whether this value is true.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def staged_to_arrays(staged: Staged) -> Arrays:
 def staged_from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Staged:
     """Return the scene that `staged_to_arrays` stored, without its notes.
 
-    `arrays`: may be read-only; the scene keeps them. Raises KeyError when one is missing.
+    `arrays`: arrays by name, perhaps read-only; the scene keeps them. Raises KeyError when an array is missing.
     """
     movers = tuple(_mover(_below(arrays, f"mover.{index}.")) for index in range(int(arrays["movers"])))
     return Staged(movers, _camera(_below(arrays, "camera.")), ())
@@ -232,7 +232,7 @@ def _is_enough(share: float) -> bool:
 def _shares(
     camera: PlacedCamera, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]
 ) -> tuple[float, float]:
-    """Return the share of the frames in which the camera shows the bodies, and the mean height of the bodies.
+    """Return (share of the frames in which `camera` shows the bodies, mean height of the bodies).
 
     The height is a share of the picture's height.
     """
@@ -262,7 +262,7 @@ def _remedy(scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], base: Pa
 
 
 def _variants(spec: CameraSpec, path: CameraPath, base: Path) -> Iterator[tuple[str, Any]]:
-    """Yield each (key, value) of the camera that may be right in place of the present value; stated keys stay."""
+    """Yield each (key, value) of the camera to try in place of the present value; stated axes and up stay."""
     if spec.place == "none":
         yield "place", "auto"
         return

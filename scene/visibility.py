@@ -102,7 +102,7 @@ def seen_at(
 
 
 def _shown(clip: F64) -> tuple[float, float, float]:
-    """Return the share of points (K, 4), clip space, in the view volume, and their lowest and highest visible y in NDC.
+    """Return (share of the points `clip` (K, 4), clip space, in the view volume; lowest, highest visible y in NDC).
 
     If all points are beyond one plane, the lowest y is 1 and the highest is -1.
     """
@@ -243,7 +243,7 @@ class Filming:
     nearest_m: float = NEAREST_M
 
     def every(self, step: int) -> Filming:
-        """Return every `step`-th moment, beginning with the first."""
+        """Return the `Filming` of every `step`-th moment, beginning with the first."""
         return Filming(self.eyes[::step], self.turns[::step], self.lenses[::step], self.points[::step], self.nearest_m)
 
 
@@ -277,7 +277,7 @@ class PlaceMerits:
 
     @property
     def score(self) -> F64:
-        """Score (S,) that decides between places."""
+        """Score of each place (S,); the place with the highest score is the best."""
         return np.asarray(self.whole + SIZE_WEIGHT * self.well)
 
 
@@ -352,7 +352,7 @@ def _reaches(film: Filming, rows: F64) -> tuple[F32, F32]:
 
 
 def facing(film: Filming, places: F64) -> F64:
-    """Return, for each of `places` (S, 3), the angle (S,), radians, by which the scene is turned about +Y.
+    """Return the angle (S,), radians, by which the scene is turned about +Y at each of `places` (S, 3).
 
     At this angle the scene's +Z points to the first eye.
     """
@@ -361,7 +361,7 @@ def facing(film: Filming, places: F64) -> F64:
 
 
 def best_place(film: Filming) -> tuple[F64, float]:
-    """Return the best place (3,) for the scene's origin, in the recording's world, and its score."""
+    """Return (best place (3,) for the scene's origin, in the recording's world; its score)."""
     judge = PlaceJudge(film)
     climbers = _apart(film, _seeds(film))
     random = np.random.default_rng(0)
@@ -390,7 +390,7 @@ def highest_floor(film: Filming) -> float:
 
 
 def _seeds(film: Filming) -> F64:
-    """Return candidate places (S, 3) on rays where the camera looks, best first."""
+    """Return candidate places (S, 3) on rays through the camera's pictures, best first."""
     picked = slice(None, None, RAYS_EVERY)
     x, y = (axis.ravel() for axis in np.meshgrid(RAYS_AT, RAYS_AT))
     lenses, turns, eyes = film.lenses[picked], film.turns[picked], film.eyes[picked]
@@ -420,8 +420,7 @@ def _filling_depth(film: Filming) -> float:
 
 
 def _looked_at(film: Filming) -> F64:
-    """Return the point (3,) nearest to all lines of sight; of several such points, the nearest to the middle of the
-    eyes.
+    """Return the point (3,) nearest to all lines of sight; if several are, the one nearest to the middle of the eyes.
 
     The point x solves the normal equations of the distances: sum (1 - d d') (x - p) = 0 for eyes p and directions d.
     """
@@ -445,6 +444,6 @@ def _apart(film: Filming, places: F64) -> F64:
 
 
 def _distances(film: Filming, places: F64) -> F64:
-    """Return, for each of `places` (S, 3), its median distance (S,) from the eyes."""
+    """Return the median distance (S,) of each of `places` (S, 3) from the eyes."""
     some = film.eyes[::RAYS_EVERY]
     return np.asarray(np.median(np.linalg.norm(some[None] - places[:, None], axis=2), axis=1))

@@ -1,7 +1,7 @@
 """The avatar's stages, one folder per unit, with their packets, assets, configuration and pipeline.
 
 It may use `scene/`, `avatars/`, `hw_profiles/`, `pipeline/` and the layers below them. This file imports nothing, so
-that the fork server gets the names below before a slow import.
+that the fork server reads the names below without waiting for a slow import.
 """
 
 #: Factory of each stage; all parts of a network that is cut have the same one.

@@ -50,14 +50,14 @@ class AvatarData:
 
 
 def load_avatar(bundle: Bundle) -> AvatarData:
-    """Return the content of `bundle` that a run needs. Raises BadInputError."""
+    """Load the content of `bundle` that a run needs. Raises BadInputError."""
     shaped = bundle.shaped_body()
     texture, network, levels = bundle.read_texture(), bundle.read_network(), bundle.read_levels()
     return AvatarData(bundle, shaped, texture, network, levels, bundle.read_mesh_levels(shaped))
 
 
 def networks_of_avatars(avatars: Sequence[AvatarData]) -> list[int]:
-    """Return the number of the network that paints each of `avatars`.
+    """Return, for each of `avatars`, the number of the network that paints it.
 
     Avatars share a network, and therefore a tensor, if its file and the encoding of its input are the same.
     """
@@ -67,7 +67,7 @@ def networks_of_avatars(avatars: Sequence[AvatarData]) -> list[int]:
 
 
 def pack_assets(avatars: Sequence[AvatarData], staged: Staged) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a run by name: of each distinct avatar in order, of each distinct network, of the scene."""
+    """Return all arrays of a run by name. `avatars`: content of each distinct bundle. `staged`: scene of the run."""
     arrays: dict[str, NDArray[Any]] = {}
     for number, avatar in enumerate(avatars):
         body, scale = avatar.shaped.body, avatar.bundle.manifest.network.input
@@ -88,7 +88,7 @@ def pack_assets(avatars: Sequence[AvatarData], staged: Staged) -> dict[str, NDAr
 
 
 def with_network(assets: Assets, network: NetworkFile) -> dict[str, NDArray[Any]]:
-    """Return `assets` with `network` for all avatars, and with the scale and zero point of its input.
+    """Return `assets` in which `network` and the scale and zero point of its input replace those of all avatars.
 
     Raises BadInputError if the assets have several networks.
     """
@@ -116,7 +116,7 @@ def distinct(config: RunConfig) -> list[Path]:
 
 
 def shaped_body(assets: Assets, number: int) -> ShapedBody:
-    """Return the body of the distinct avatar `number`."""
+    """Return the shaped body of the distinct avatar `number`."""
     own = _with_prefix(assets, f"body{number}/")
     arrays: dict[str, Any] = {name: own.get(name) for name in BODY_ARRAYS}  # `posedirs` and `offsets` may be None
     hands = (own[HANDS[0]], own[HANDS[1]])

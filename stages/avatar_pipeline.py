@@ -91,7 +91,7 @@ FRAMES = 12  # frames of a rehearsal, spread evenly over the scene; the first tw
 
 
 def thread_counts(cores: int, rule: Placement) -> dict[str, list[int]]:
-    """Return the numbers of threads, apart from 1, with which each unit is measured.
+    """Return, by unit, the numbers of threads besides 1 with which the unit is measured.
 
     Each unit is measured with its number in `rule`. The network's unit is also measured with 2 to 4 threads, and with a
     thread for half of the cores, for all but two, for all but one, and for all cores.
@@ -110,7 +110,7 @@ def measured_times(checked: Checked, cores: Sequence[CpuCore], rule: Placement, 
     `checked`: run to measure.
     `cores`: available cores.
     `rule`: placement whose numbers of threads are measured too.
-    `starter`: fork server.
+    `starter`: unit starter.
 
     Raises TrilaneError if a unit cannot start or a stage fails, KeyboardInterrupt if interrupted.
     """
@@ -139,13 +139,13 @@ def tried(
     limit_s: float = math.inf,
     least: int = 1,
 ) -> list[Round]:
-    """Return the measured rounds of `placements`, which run in turns. Raises as `measured_times` does.
+    """Return measured rounds. In a round, each of `placements` runs once. Raises as `measured_times` does.
 
     `checked`: run to measure.
     `rounds`: number of rounds, on frames spread over the scene.
-    `starter`: fork server.
-    `limit_s`: time in seconds after which no further round begins.
-    `least`: number of rounds that are done in any case.
+    `starter`: unit starter.
+    `limit_s`: time in seconds after which no round begins, apart from the first `least` rounds.
+    `least`: number of rounds that take place in any case.
     """
     # Placements with equal threads differ only in cores, so the same processes serve all of them.
     groups: dict[tuple[tuple[int, bool], ...], list[int]] = {}
@@ -173,7 +173,7 @@ def tried(
 
 @contextmanager
 def _thrown_away(checked: Checked) -> Iterator[RunConfig]:
-    """Yield the configuration of `checked` with a single tensor shape and a temporary run folder.
+    """Yield the configuration of `checked` with one tensor shape and a run folder that is removed afterwards.
 
     A single shape is prepared faster than many. No shape of the same size has more than 25/16 of its area.
     """
@@ -184,7 +184,7 @@ def _thrown_away(checked: Checked) -> Iterator[RunConfig]:
 
 
 def _spinning(placement: Placement, cores: int) -> dict[str, Any]:
-    """Return settings in which a unit's threads spin if there are enough cores for the unit to share none in the run.
+    """Return each unit's settings in `placement`. Threads spin if there are so many cores that no unit shares one.
 
     `cores`: number of available cores.
     """

@@ -179,7 +179,7 @@ class RunConfig(StrictModel):
         return units
 
     def opened_window(self) -> LiveWindow | None:
-        """Map the window and return it, if any. Raises OSError if its maker is gone."""
+        """Map and return the window; None without one. Raises OSError if the process that made it has ended."""
         output = self.scene.output
         return None if self.window is None else LiveWindow.opened(self.window, output.height, output.width)
 
@@ -195,7 +195,7 @@ class RunConfig(StrictModel):
 
     @property
     def budget_px(self) -> float:
-        """The largest error of a vertex on the picture in pixels; 0 if everything is modelled."""
+        """The largest permitted error of a vertex on the picture, pixels; 0 if everything is modelled."""
         return self.scene.error_budget_px if self.scene.plan == "planned" else 0.0
 
     @property
@@ -227,7 +227,7 @@ class RunConfig(StrictModel):
 
 
 def network_parts(payload: U8, networks: int, shapes: Sequence[Shape], channels: int) -> list[U8]:
-    """Return the part of a slot that belongs to each network, as views.
+    """Return views of the parts of a slot's `payload`, one part for each network.
 
     `networks`: number of networks.
     `shapes`: shapes that a tensor may have; each part has room for the largest.

@@ -49,10 +49,10 @@ class Checked:
     """A configuration that can be run.
 
     `assets`: arrays that were loaded to check the configuration, in the form that units take.
-    `notes`: sentences about its sources and choices, for a person.
+    `notes`: sentences for a person about the sources of the configuration and the choices in it.
     `accuracy`: result of `accuracy_of` for each avatar, by its name.
     `asked_cores`: cores that the options request for units.
-    `placement`: facts from `trilane.stages.placing` about the units' cores; None before.
+    `placement`: facts from `trilane.stages.placing` about the units' cores; None before the cores are chosen.
     `losses`: measured image error of each distinct avatar in smaller tensors.
     """
 
@@ -72,8 +72,9 @@ class Checked:
 def requested_scene(options: RunOptions) -> Scene:
     """Return the scene of the scene file, changed by the options. Raises BadInputError.
 
-    An option that is a key of the scene replaces its value. A motion or camera from the options drops the format that
-    the scene states for its own file. A built-in camera drops all keys that the scene states about its camera file.
+    An option that is a key of the scene replaces its value. If an option replaces a motion or camera, the format that
+    the scene states for its own file is left out. If the new camera is built-in, all keys about the scene's camera file
+    are left out.
     """
     values = load_scene(find_scene(options.scene))
     here = Path.cwd()
@@ -96,9 +97,9 @@ def requested_scene(options: RunOptions) -> Scene:
 
 
 def _camera(values: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """Return the camera's keys for another `source`.
+    """Return the keys `values` of a scene's camera after `source` has replaced its source.
 
-    A built-in camera drops all of FILE_KEYS from `values`, another file drops only the format.
+    For a built-in camera, all of FILE_KEYS are left out; for a file, only the format.
     """
     dropped = FILE_KEYS if source.startswith(BUILT_IN_PREFIX) else ("format",)
     return {key: value for key, value in values.items() if key not in dropped} | {"source": source}
@@ -186,7 +187,7 @@ def configure(
 
 
 def requested_runtime(asked: str) -> tuple[str, str]:
-    """Return (runtime, reason): the requested one, or for `auto` the fastest installed one.
+    """Return (runtime, reason): the runtime `asked`, or for `auto` the fastest installed runtime.
 
     Raises BadInputError, MissingPartError.
     """
@@ -231,7 +232,9 @@ def _check_pictures(scene: Scene, staged: Staged) -> None:
 
 
 def _accuracy(avatars: Sequence[tuple[AvatarData, int]], drawn: DrawnAs) -> dict[str, Any]:
-    """Return the result of `accuracy_of` for each avatar by its name; for equal names the key contains the folder.
+    """Return the result of `accuracy_of` for each avatar, by its name.
+
+    If several avatars have the same name, the key also contains the folder.
 
     `avatars`: pairs of an avatar and the number of avatars that share its tensor.
     `drawn`: how the run draws avatars.
@@ -247,7 +250,7 @@ def _accuracy(avatars: Sequence[tuple[AvatarData, int]], drawn: DrawnAs) -> dict
 
 
 def skinning_unit(asked: str, gl: GlFacts = gl_facts) -> tuple[str, str]:
-    """Return (`cpu` or `gpu`, reason): the requested unit, or for `auto` the GPU if the driver is hardware.
+    """Return (`cpu` or `gpu`, reason): the unit `asked`, or for `auto` the GPU if its driver is hardware.
 
     Raises BadInputError for another word.
     """
@@ -261,7 +264,7 @@ def skinning_unit(asked: str, gl: GlFacts = gl_facts) -> tuple[str, str]:
 
 
 def required_machine(gl: GlFacts = gl_facts) -> dict[str, Any]:
-    """Return facts about this machine.
+    """Return `machine_facts` of this machine. `gl`: function that returns facts about the OpenGL driver.
 
     Raises MissingPartError if no OpenGL context can be made, TrilaneError if memory is short.
     """

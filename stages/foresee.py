@@ -201,6 +201,7 @@ def _foreseen(
     `looks`: examined frames.
     `output`: (height, width) of the picture.
     `shapes`: shapes that are prepared anyway.
+    `budget`: budget of the tensors.
     `networks`: network of each avatar; empty if one paints all.
     `room`: (most further shapes, most pixels of all of them together).
     """
@@ -235,7 +236,10 @@ def foreseen_rects(
 
 
 def bytes_per_pixel(network: NetworkFile) -> float:
-    """Return the bytes of memory of the prepared `network` per pixel of its tensor: COPIES of all its byte tensors."""
+    """Return the bytes of memory per pixel of its tensor that the prepared `network` takes.
+
+    There are COPIES copies of each of the network's byte tensors.
+    """
     _, height, width, _ = network.shape
     if not network.model.graph.value_info:
         network = reshaped(network, height + STRIDE, width)

@@ -1,4 +1,4 @@
-"""Facts about the machine that made a measurement. Every reported number has them beside it.
+"""Facts about the machine that made a measurement. Every reported number has these facts beside it.
 
 Rule: a fact was read or tried on this machine. A fact that could not be read is absent; none is guessed.
 """
@@ -51,7 +51,7 @@ def package_version(name: str) -> str | None:
 
 
 def versions_with(package: str) -> list[str]:
-    """Return name and version of each package that measured times depend on, also of `package`, a runtime's."""
+    """Return name and version of each package on which measured times depend. `package`: package of the runtime."""
     return [f"{name} {package_version(name)}" for name in dict.fromkeys(("trilane", *PACKAGES, package))]
 
 
@@ -68,7 +68,7 @@ def cpu_facts() -> dict[str, Any]:
 
 
 def open_gl() -> dict[str, Any]:
-    """Open an OpenGL context in this process and describe it. Raises MissingPartError if none can be opened."""
+    """Open an OpenGL context in this process, and return facts about its driver and limits. Raises MissingPartError."""
     from trilane.stages.gpu.opengl import describe, open_context
 
     context = open_context()
@@ -85,7 +85,7 @@ def open_gl() -> dict[str, Any]:
 
 @cache
 def gl_facts() -> dict[str, Any] | None:
-    """Return facts about the OpenGL driver that EGL gives; None if no driver works.
+    """Return the facts of `open_gl` about the driver that EGL gives; None if no driver works.
 
     A process of its own tries the driver, because a driver may crash.
     """
@@ -99,7 +99,7 @@ def gl_facts() -> dict[str, Any] | None:
 
 
 def runtime_facts() -> dict[str, Any]:
-    """Return the installed inference runtimes and what each can run on."""
+    """Return, by package of an installed runtime, the devices or providers on which it can run."""
     import onnxruntime
 
     facts: dict[str, Any] = {"onnxruntime": list(onnxruntime.get_available_providers())}

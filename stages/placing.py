@@ -6,8 +6,8 @@ frames. Both results are kept for the next run with the same network, shapes, ru
 `trilane.hw_profiles.host` places a run that is too short to gain by a rehearsal or is held to a chip's pace.
 
 Nothing is tried while other programs use the cores: a floating unit avoids these programs, but a pinned unit waits for
-them, so frame times would depend more on the programs than on the placements. The prediction then decides, a note says
-so, and the next run looks again.
+them, so frame times would depend more on the programs than on the placements. In this case the prediction decides, a
+note says so, and the next run may try placements again.
 """
 
 from __future__ import annotations
@@ -75,9 +75,9 @@ def placed(
 
     `checked`: run to place.
     `policy`: policy of the run.
-    `starter`: fork server.
+    `starter`: unit starter.
     `driver`: OpenGL driver, which the times depend on.
-    `say`: is called with a message before work that takes seconds.
+    `say`: function that is called with a message before a measurement that takes seconds.
     Raises TrilaneError if a unit cannot start or a stage fails, KeyboardInterrupt if interrupted.
     """
     asked = {unit: Place(own, len(own)) for unit, own in checked.asked_cores.items()}
@@ -114,7 +114,7 @@ def placed(
 
 
 def considered(cores: Sequence[CpuCore], asked: Placement) -> list[CpuCore]:
-    """Return the cores to place units on: all `cores`, or some of them if there are more than MOST_LOGICAL.
+    """Return the cores on which units may be placed: all `cores`, or some of them if there are more than MOST_LOGICAL.
 
     Placements on more cores would be too many to list. Only one logical core of each physical core then stays, and only
     the first MOST_CORES of these. Cores of the `asked` placement always stay.
@@ -129,7 +129,10 @@ def considered(cores: Sequence[CpuCore], asked: Placement) -> list[CpuCore]:
 
 
 def times_rows(times: Times) -> list[dict[str, Any]]:
-    """Return the measured times as rows, one for each unit and number of threads. Times are in ms."""
+    """Return a row for each unit and number of threads, with the measured times of a frame.
+
+    Its keys are `unit`, `threads`, `ms`, and `core_ms`, the CPU time of all threads.
+    """
     return [
         {"unit": unit, "threads": threads, "ms": work.serial_ns / NS_PER_MS, "core_ms": work.core_ns / NS_PER_MS}
         for unit, works in times.items()
@@ -138,7 +141,7 @@ def times_rows(times: Times) -> list[dict[str, Any]]:
 
 
 def _why_not(checked: Checked, cores: Sequence[CpuCore]) -> str:
-    """Return why nothing is measured for this run; empty if it is measured."""
+    """Return the reason why the run `checked` is not rehearsed on `cores`, as text; empty if it is rehearsed."""
     if len(checked.asked_cores) == len(UNITS):
         return "as asked"
     if len(cores) == 1:
@@ -191,7 +194,10 @@ def _kept(
     made_from: Sequence[str],
     say: Callable[[str], None],
 ) -> tuple[Rehearsed, str]:
-    """Return (the time that each unit needs for a frame, when it was measured, UTC)."""
+    """Return (the time that each unit needs for a frame, when it was measured, UTC).
+
+    `made_from`: result of `_made_from`. `rule`: placement that suits any run.
+    """
 
     def measured() -> dict[str, NDArray[Any]]:
         say(MEASURING)
@@ -214,7 +220,7 @@ def _kept(
 
 
 def _made_from(checked: Checked, cores: Sequence[CpuCore], rule: Placement) -> list[str]:
-    """Return everything that the times depend on, as text."""
+    """Return all facts on which the times of a rehearsal depend, as texts."""
     config = checked.config
     said = config.model_dump_json(exclude={"out_dir", "units", "scene", "pace_ns"})
     scene = config.scene.model_dump_json(exclude={"name", "frames", "fps"})
@@ -267,9 +273,9 @@ def choice(
     `checked`: run to place.
     `cores`: available cores.
     `candidates`: placements to compare, the one with the shortest predicted frames first.
-    `starter`: fork server.
-    `say`: is called with a message before work that takes seconds.
-    `kept`: returns what its argument makes, from a cache or by calling it.
+    `starter`: unit starter.
+    `say`: function that is called with a message before a measurement that takes seconds.
+    `kept`: function that returns the result of its argument, from a cache or by calling its argument.
     Raises TrilaneError if a unit cannot start or a stage fails, KeyboardInterrupt if interrupted.
     """
     if len(candidates) == 1:

@@ -52,7 +52,7 @@ def calibration_of(text: str) -> tuple[str, int] | None:
 
 
 def _cores(value: object) -> object:
-    """Return the texts of the option, also for a mapping such as {"dsp": [0, 1]}, which programs give."""
+    """Return `value` of the option `cores` as texts. Programs may give a mapping such as {"dsp": [0, 1]} instead."""
     if not isinstance(value, Mapping):
         return texts_of(value)
     return tuple(f"{unit}={','.join(map(str, own))}" for unit, own in value.items())

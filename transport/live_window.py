@@ -100,7 +100,7 @@ class LiveWindow:
 
     @classmethod
     def opened(cls, path: Path, height: int, width: int) -> LiveWindow:
-        """Return the window at `path`; raises OSError."""
+        """Return the window at `path` for pictures of `height` x `width` pixels; raises OSError."""
         fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         try:
             return cls(fd, height, width)
@@ -110,16 +110,19 @@ class LiveWindow:
     # for viewers
 
     def look(self) -> None:
-        """Ask for pictures for the next `LOOKED_NS`."""
+        """Ask the run to copy its pictures into the window for the next `LOOKED_NS` nanoseconds."""
         self._head["looked_ns"] = time.monotonic_ns()
 
     def steer(self, steering: Steering) -> None:
-        """Steer the camera from the next frame on."""
+        """Turn and zoom the run's camera by `steering` from the next frame on."""
         for name, value in zip(Steering._fields, steering, strict=True):
             self._head[name] = value
 
     def newest(self, had: int) -> ShownPicture | None:
-        """Return the newest picture; None if there is none, if it shows frame `had`, or if it changes at each try."""
+        """Return the newest picture; None if there is none, or if it changes during each try to copy it.
+
+        `had`: number of the frame that the caller has already; the result for this frame is None too.
+        """
         for _ in range(TRIES):
             side = int(self._head["newest"][0]) & 1
             number = int(self._head["number"][0, side])
@@ -143,7 +146,7 @@ class LiveWindow:
         return Steering(*(float(self._head[name][0]) for name in Steering._fields))
 
     def show(self, frame: int, media_s: float, sampled_ns: int, pixels: NDArray[np.uint8]) -> None:
-        """Make `pixels` (height, width, 3) uint8 the newest picture."""
+        """Make `pixels` (height, width, 3) uint8 the newest picture. Parameters are as in `ShownPicture`."""
         side = 1 - (int(self._head["newest"][0]) & 1)
         number = int(self._head["number"][0, 1 - side])
         # Marked first: a reader that still copies this buffer then finds its number changed.

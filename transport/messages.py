@@ -88,9 +88,10 @@ class Done(NamedTuple):
     `t_sampled_ns`: time at which the pipeline's first stage sampled the frame's input; 0 for other stages.
     `preempted_ns`: duration of the job's parts in which the unit had no core.
     `asleep_ns`: duration of the job's parts in which the unit slept and no device worked for it.
-    `preempted_before_ns`: duration without a core between the previous job and this job.
+    `preempted_before_ns`: duration between the previous job and this job in which the unit had no core.
     `skips`: 1 when the frame takes the pipeline's bypass, else 0.
-    `cpu_ns`, `cpu_before_ns`: CPU time of all threads of the unit in this job, and between the previous job and it.
+    `cpu_ns`, `cpu_before_ns`: CPU time of all threads of the unit in this job, and between the previous job and this
+    job.
     `metrics`: numbers that the stage itself reports about the job, by name.
     """
 
@@ -143,7 +144,7 @@ class _Form(NamedTuple):
 
     `code`: first byte of the message.
     `integers`: format of the integer fields.
-    `rest`: type of the last field if that is no integer; else None.
+    `rest`: type of the last field if this field is no integer; else None.
     """
 
     kind: Any
@@ -227,7 +228,7 @@ class JobPipeEnd(NamedTuple):
 
 
 def job_pipe_pair() -> tuple[JobPipeEnd, JobPipeEnd]:
-    """Return the two ends of a new job pipe; raises TrilaneError when this user or process may open no more pipes."""
+    """Return both ends of a new job pipe, which are alike; raises TrilaneError when no more pipes may be opened."""
     fds: list[int] = []
     try:
         for _ in range(2):
@@ -263,7 +264,7 @@ class JobPipe:
     def send(self, message: Message) -> None:
         """Send `message` without waiting. If the other end is closed or the pipe is full, drop `message`.
 
-        The scheduler learns of such a unit from the end of its process or from a missed deadline.
+        The scheduler learns of a lost or stuck unit from the end of the unit's process or from a missed deadline.
         """
         try:
             os.write(self._writes, pack(message))
@@ -271,8 +272,9 @@ class JobPipe:
             return
 
     def receive(self) -> Message | None:
-        """Return the next message; None when the other end is closed. An end that does not wait also returns None
-        if no message has come.
+        """Return the next message; None when the other end is closed.
+
+        An end that does not wait also returns None if no message has come.
 
         Raises MessageError for bytes that are no message.
         """
@@ -303,7 +305,7 @@ class SocketFolder:
             os.close(self._lock)
 
     def _is_made(self, base: str) -> bool:
-        """Make a folder and lock it. Return False if another process locks or removes the folder before."""
+        """Make and lock a folder in `base`; return False if another process locks or removes the folder first."""
         self.path = Path(tempfile.mkdtemp(prefix=PREFIX, dir=base))
         self._lock = os.open(self.path / LOCK, os.O_CREAT | os.O_RDWR | os.O_CLOEXEC, 0o600)
         with contextlib.suppress(BlockingIOError):
@@ -363,11 +365,11 @@ class HeartbeatSocket:
         self.socket.setsockopt(zmq.RCVHWM, HIGH_WATER)
 
     def bind(self, endpoint: str) -> None:
-        """Bind the socket to `endpoint`, where the unit's heartbeats arrive from now on (the scheduler's end)."""
+        """Bind the scheduler's end to the ZeroMQ address `endpoint`, where the unit's heartbeats arrive from now on."""
         self.socket.bind(endpoint)
 
     def connect(self, endpoint: str) -> None:
-        """Connect the socket to `endpoint`, where heartbeats go from now on (the unit's end)."""
+        """Connect the unit's end to the ZeroMQ address `endpoint`, where its heartbeats go from now on."""
         self.socket.connect(endpoint)
 
     @property
@@ -406,7 +408,7 @@ def context_on_cores(cores: Sequence[int]) -> zmq.Context[zmq.Socket[bytes]]:
 
 
 class Link(HeartbeatSocket):
-    """One end of a unit's connection: the heartbeat socket and the `job_pipe`. Each keeps the order of its messages."""
+    """One end of a unit's connection: the heartbeat socket and the `job_pipe`. Both keep messages in order."""
 
     def __init__(self, context: zmq.Context[zmq.Socket[bytes]], job_pipe: JobPipe, linger_ms: int = 0) -> None:
         """Take over `job_pipe`, which `close` closes. `context`, `linger_ms`: as for `HeartbeatSocket`."""

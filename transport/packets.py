@@ -90,8 +90,8 @@ class RegionLayout:
 def create_region(name: str, layout: RegionLayout) -> int:
     """Return a descriptor of new, zeroed shared memory for `layout`. `name` appears in /proc/PID/maps and nowhere else.
 
-    All pages are reserved here: without memory for a page, a later write would end the process by a signal. Raises
-    TrilaneError when there is too little memory.
+    All pages are reserved here. Otherwise a later write to a page could end the process by a signal, if memory is
+    short. Raises TrilaneError when there is too little memory.
     """
     free = machine.here.free_bytes()
     if layout.total_bytes > free:

@@ -44,8 +44,8 @@ class EdgeRule:
     """The rule of an edge.
 
     `slots`: number of slots.
-    `mailbox`: whether a commit replaces the waiting frames.
-    `yields`: whether a claim may replace the oldest waiting frame.
+    `mailbox`: whether a new complete frame replaces the waiting frames.
+    `yields`: whether a claim without a free slot may evict the oldest waiting frame.
     """
 
     name: str
@@ -137,7 +137,7 @@ class EdgeSlots:
         return bool(self.free) or (self.rule.yields and self._evictable(keeps) >= 0)
 
     def claim(self, frame: int, keeps: Keeps = _keeps_none) -> tuple[int, int | None]:
-        """Claim a slot for `frame`; return the slot and the waiting frame that was evicted from it, or None.
+        """Claim a slot for `frame`; return (slot, waiting frame that was evicted from it, or None).
 
         Without `keeps`, the oldest frame of the last line is evicted first: frames on a bypass wait in that line, and
         no later frame needs them. With `keeps`, the oldest frame of all lines that may be evicted is evicted. Raises
@@ -159,7 +159,7 @@ class EdgeSlots:
 
         The slot is free again at once if no reader takes its frame.
 
-        `to`: numbers of the lines in which the slot waits from now on.
+        `to`: indices of the lines in which the slot waits from now on.
         `keeps`: function that says which frames must not be replaced.
         """
         self._move("commit", slot)
@@ -187,7 +187,7 @@ class EdgeSlots:
                 self._leave(held)
 
     def take(self, slot: int, line: int = 0) -> None:
-        """Take the slot out of `line`: from now on, a job of that line's reader reads it."""
+        """Take the slot out of line number `line`: from now on, a job of that line's reader reads the slot."""
         if not self._reading[slot] or slot not in self.lines[line]:
             self._move("take", slot)
         if self._is_shared:
@@ -195,7 +195,10 @@ class EdgeSlots:
         self.lines[line].remove(slot)
 
     def take_newest(self, reader: int) -> int:
-        """Let a job read the slot that `reader` of the newest frame holds, and return it; -1 before the first frame."""
+        """Let a job read the slot of the newest frame, and return the slot; -1 before the first frame.
+
+        `reader`: index in `newest` of the reader that does the job.
+        """
         slot = self.newest[reader]
         if slot >= 0:
             if not self._reading[slot]:
@@ -205,7 +208,7 @@ class EdgeSlots:
         return slot
 
     def release(self, slot: int) -> None:
-        """Note that a job has read the slot. The slot becomes free if no other reader needs it."""
+        """Note that a job has read the slot. The slot becomes free if no further reader needs it."""
         if not self._is_shared:
             self._move("release", slot)
             self._empty(slot)
@@ -264,7 +267,7 @@ class EdgeSlots:
         return [self.drop(each) for each in old if keeps is None or not keeps(self.frame[each])]
 
     def _evictable(self, keeps: Keeps) -> int:
-        """Return the slot whose frame `claim` evicts; -1 if no frame may be evicted."""
+        """Return the slot whose frame `claim` evicts; -1 if no frame may be evicted. `keeps`: as in `claim`."""
         found = -1
         for line in reversed(self.lines):
             for slot in line:

@@ -80,8 +80,9 @@ class ColmapCamera:
 class ColmapImage(NamedTuple):
     """A view.
 
-    `name`: name of its photo. `quat` (w, x, y, z), `shift`: transform from world to camera. `camera`: number of its
-    camera.
+    `name`: name of its photo.
+    `quat` (w, x, y, z), `shift` (x, y, z): transform from world to camera, in units of the map.
+    `camera`: number of its camera.
     """
 
     name: str
@@ -95,7 +96,7 @@ def checked_camera(
 ) -> ColmapCamera:
     """Return a camera of `model` with the parameters `values`. `size`: (width, height) in pixels.
 
-    Raises BadInputError about `where` when the numbers are not plausible.
+    Raises BadInputError about `where`, the place in the file, when the numbers are not plausible.
     """
     if len(values) != len(model.parameters):
         raise BadInputError(where, f"{len(values)} parameters", f"{len(model.parameters)} of {model.name}")
@@ -198,7 +199,7 @@ class _Reader:
         return form.unpack(self._file.read(form.size))
 
     def entries(self, least: int, what: str) -> Iterator[int]:
-        """Return an iterator over the indices of the entries, whose number is read from the file.
+        """Read the number of entries from the file, and return an iterator over their indices.
 
         `least`: least size of an entry, bytes. `what`: entries in words. Raises BadInputError when the file is too
         short.
@@ -263,7 +264,7 @@ ENDINGS = (".bin", ".txt")
 
 
 def model_in(folder: Path) -> tuple[Path, str] | None:
-    """Return the folder at or below `folder` that holds a model, and the suffix of its files; None without a model."""
+    """Return (folder at or below `folder` that holds a model, suffix of the model's files); None without a model."""
     for below in BELOW:
         for ending in ENDINGS:
             if all((folder / below / f"{name}{ending}").is_file() for name in ("cameras", "images")):
@@ -309,7 +310,7 @@ def _read(folder: Path, ending: str) -> tuple[dict[int, ColmapCamera], list[Colm
 def _lenses(
     where: Path, views: Sequence[ColmapImage], cameras: Mapping[int, ColmapCamera]
 ) -> tuple[tuple[Lens, ...], tuple[str, ...]]:
-    """Return one lens for all views, or one for each, without distortion; and notes on the distortion.
+    """Return (one lens for all views or one for each, without distortion; notes on the distortion).
 
     `where`: file of images, for messages. Raises BadInputError when the camera of a view does not exist.
     """

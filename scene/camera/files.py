@@ -2,8 +2,8 @@
 
 The scene may state the format. Otherwise a folder is recognised by the names of its files. A text is recognised by its
 column names, or else by the number of columns and their content. A file that fits a second format, or another order of
-columns, is refused. The message then names both possibilities, and the key that decides. A note gives the reason of
-each guess.
+columns, is refused. The message names both possibilities, and the scene's key that decides between them. A note gives
+the reason of each guess.
 """
 
 from __future__ import annotations
@@ -143,8 +143,7 @@ OF_FILES = (
 def detect(path: Path, up_axis: str = AUTO, axes: str = AUTO) -> Guess:
     """Return the format of `path`. Raises BadInputError for an unknown format, or when two formats fit.
 
-    `up_axis`: axis that is up, by the scene, or `auto`. `axes`: directions of x, y and z of a pose, by the scene, or
-    `auto`.
+    `up_axis`, `axes`: keys of the scene's camera: the axis that is up, and the directions of x, y and z of a pose.
     """
     if path.is_dir():
         return _of_folder(path)
@@ -183,7 +182,7 @@ def _of_folder(path: Path) -> Guess:
 
 
 def _has_matrices(folder: Path) -> bool:
-    """Return whether `folder` has several text files, the first of which holds a 4x4 matrix."""
+    """Return whether `folder` has at least two text files and the first of them holds a 4x4 matrix."""
     files = sorted(folder.glob("*.txt"))
     try:
         return len(files) > 1 and read_table(files[0], 4, EXPECTED).numbers.shape == (4, 4)
@@ -214,7 +213,7 @@ def _of_table(path: Path, layout: TableLayout, up_axis: str, axes: str) -> Guess
 
 
 def _require_pose(path: Path, layout: TableLayout) -> None:
-    """Raise BadInputError if column names include a part of a quaternion, but not the whole pose."""
+    """Raise BadInputError if the column names of `layout` include a part of a quaternion, but not the whole pose."""
     if any(name in layout.names for name in ("qw", "qx", "qy", "qz")):
         missing = ", ".join(name for name in POSE if name not in layout.names)
         raise BadInputError(path, f"column names without {missing}", f"names of {', '.join(POSE)} in any order")
@@ -242,7 +241,7 @@ def _require_clock(path: Path, numbers: F64, others: Iterable[int]) -> None:
 def _unevenness(column: F64) -> float:
     """Return the median deviation of the steps of `column` (N,) from their median, as a share of the median.
 
-    It is infinite if the column does not grow.
+    The result is infinite if the column does not grow.
     """
     steps = np.diff(column)
     middle = float(np.median(steps))
@@ -252,9 +251,9 @@ def _unevenness(column: F64) -> float:
 
 
 def _of_matrices(path: Path, numbers: F64, up_axis: str, axes: str) -> Guess:
-    """Return the format of a table (N, 12 or 13) of 3x4 matrices: KITTI or ARKit.
+    """Return the format of a table of 3x4 matrices, KITTI or ARKit. `numbers`: (N, 12), or (N, 13) with times.
 
-    Cameras of KITTI and ARKit look along opposite axes, so BadInputError is raised if the poses fit both formats,
+    Cameras of KITTI and ARKit look along opposite axes. Therefore poses that fit both formats raise BadInputError,
     unless the scene states `axes`.
     """
     matrices = numbers[:, -MATRIX:].reshape(-1, 3, 4)
@@ -287,7 +286,7 @@ def _require_row_order(path: Path, matrices: F64, columns: str, kind: str, slack
     """Raise BadInputError if `matrices` (N, 3, 4) of the format `kind` fit better with their numbers in another order.
 
     `columns`: the table's columns, in words.
-    `slack`: another order is possible if its `_astray` is less than that of the present order plus this.
+    `slack`: another order is possible if its `_astray` is less than the `_astray` of the present order plus `slack`.
 
     People hold a camera level while it pans. With transposed matrices or exchanged axes, the picture swings, the camera
     looks up, or the camera looks away from where it goes. KITTI's first pose is the identity, so KITTI's poses are as
@@ -321,13 +320,13 @@ def _require_row_order(path: Path, matrices: F64, columns: str, kind: str, slack
 
 
 def _signs(matrices: F64, up_axis: str, times: F64 | None) -> dict[str, tuple[str, ...]]:
-    """Return, in words, which features of poses (N, 3, 4) speak for KITTI, and which speak for ARKit, by format.
+    """Return, by format, which features of the poses `matrices` (N, 3, 4) speak for KITTI and for ARKit, in words.
 
     `up_axis`: axis that is up, by the scene. `times` (N,): times of the table; None if it has no times.
 
     KITTI's axes are x right, y down, looking along +Z. If the table has times, two features speak for ARKit, because
     other programs seldom write times before such matrices: the clock of a device, and Y up. A device that is held
-    upright fits both directions of Z, so this feature speaks for ARKit only if the table has no times.
+    upright fits both directions of Z. Therefore an upright device speaks for ARKit only if the table has no times.
     """
     turns, places = matrices[:, :, :3], matrices[:, :, 3]
     ups = ("z", "y") if up_axis == AUTO else (up_axis,)
@@ -378,7 +377,7 @@ def _along(turns: F64, places: F64) -> float:
 
 
 def _meet(turns: F64, places: F64) -> bool:
-    """Return whether cameras look at one point that they go round.
+    """Return whether the cameras go round a point and look at this point.
 
     `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes.
     """
@@ -460,11 +459,10 @@ def _has_digits(numbers: F64) -> bool:
 
 
 def _astray(turns: F64, places: F64) -> float:
-    """Return how far cameras look away from where they go, or from the point that they go round.
+    """Return how far cameras look away from where they go or from a point that they go round, the less of both.
 
-    Below 1, the cameras look there. The result is infinite if there are too few cameras. The poses `turns` (N, 3, 3)
-    and
-    `places` (N, 3) are camera to world, with OpenGL axes.
+    A result below 1 means that they look there. The result is infinite if there are too few cameras.
+    `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes.
     """
     if len(places) < LEAST_LED:
         return math.inf
@@ -499,7 +497,7 @@ OPENGL_KINDS = ("arkit", "nerf", "record3d")
 
 
 def _read(kind: str, path: Path, spec: CameraSpec) -> RawCamera:
-    """Return the content of `path`, a file of the format `kind`, in the axes of its poses.
+    """Return the content of `path`, a file of the format `kind`, in the axes of its poses. `spec`: camera of the scene.
 
     Raises BadInputError, also when the scene states a unit of times for a file without times.
     """
@@ -536,7 +534,7 @@ BODY_AXES = "forward-left-up"
 
 
 def _require_camera(path: Path, raw: RawCamera, kind: str, spec: CameraSpec) -> None:
-    """Raise BadInputError if the poses more likely belong to a vehicle's body than to a camera.
+    """Raise BadInputError if the poses of `raw` more likely belong to a vehicle's body than to a camera.
 
     `raw`: file of the format `kind` as its reader returned it. Nothing is checked if the scene states axes or up, or if
     the poses of the format have OpenGL axes.
@@ -553,7 +551,7 @@ def _require_camera(path: Path, raw: RawCamera, kind: str, spec: CameraSpec) -> 
 
 
 def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
-    """Load the camera that `spec.source` names. `base`: folder at which a relative path starts.
+    """Load the camera that `spec.source` names. `base`: folder from which a relative path is resolved.
 
     Raises BadInputError when there is no such camera, or when the file is unusable.
     """

@@ -104,7 +104,10 @@ def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
 
 
 def _nerf_lenses(path: Path, content: Mapping[str, Any], frames: Sequence[Any]) -> tuple[tuple[Lens, ...], str]:
-    """Return one lens for all views, or one for each view if any view has its own keys; and the source in words."""
+    """Return (one lens for all views, or one for each if any view has its own keys; source of the lenses in words).
+
+    `content`: the file's object. `frames`: its views.
+    """
     _check_models(path, (content, *frames))
     if not any(key in frame for frame in frames if isinstance(frame, dict) for key in LENS_KEYS):
         lens, source = _nerf_lens(path, content, "")
@@ -128,7 +131,7 @@ def _check_models(path: Path, tables: Sequence[Mapping[str, Any]]) -> None:
 def _distortion(
     path: Path, content: Mapping[str, Any], frames: Sequence[Any], lenses: Sequence[Lens]
 ) -> tuple[str, ...]:
-    """Return a note on the largest distortion of `lenses`, which is left out; empty below LEAST_BEND_PX."""
+    """Return a note on the largest distortion of `lenses`, which is left out; () below LEAST_BEND_PX pixels."""
     bent = []
     for lens, frame in zip(lenses, frames, strict=False):  # a single lens stands for all frames
         keys = {**content, **frame}
@@ -138,7 +141,7 @@ def _distortion(
 
 
 def _real(path: Path, content: Mapping[str, Any], key: str) -> float:
-    """Return the number at `key`, 0 if the key is absent. Raises BadInputError when it is not a finite number."""
+    """Return the number at `key` of `content`, 0 without the key. Raises BadInputError if it is not a finite number."""
     value = content.get(key, 0.0)
     if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
         raise BadInputError(f"{path}: {key}", repr(value)[:40], "a number")
@@ -146,7 +149,7 @@ def _real(path: Path, content: Mapping[str, Any], key: str) -> float:
 
 
 def _pictures(frames: Sequence[Mapping[str, Any]]) -> tuple[str, ...]:
-    """Return the name of each view's photo, as the file states it; () if any view has no photo."""
+    """Return the name of the photo of each of `frames`, as the file states it; () if any view has no photo."""
     names = tuple(frame.get("file_path") for frame in frames)
     return tuple(str(name) for name in names) if all(isinstance(name, str) and name for name in names) else ()
 
@@ -184,7 +187,7 @@ def _is_singular(matrix: NDArray[np.float64]) -> bool:
 
 
 def _nerf_lens(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, str]:
-    """Return the lens of a view or of the file, and its source in words.
+    """Return (lens of a view or of the file, its source in words).
 
     `content`: keys of the lens. `of`: prefix of the keys in messages, such as `frames[3].`; "" for the file.
     """
@@ -212,7 +215,7 @@ def _measured(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, st
 def _by_angle(
     width: float | None, height: float | None, angle_x: float | None, angle_y: float | None
 ) -> tuple[Lens, str]:
-    """Return the lens of a file without focal lengths, and the source of its angles in words.
+    """Return (lens of a file without focal lengths, source of its angles in words).
 
     `width`, `height`: size of the picture, pixels. `angle_x`, `angle_y`: fields of view, radians. Each is None if the
     file does not state it.
@@ -276,7 +279,7 @@ def load_record3d(path: Path, rate_hz: float | None = None) -> RawCamera:
 
 
 def _array(path: Path, content: Mapping[str, Any], key: str, columns: int) -> F64:
-    """Return the table (N, `columns`) at `key`. Raises BadInputError when it has another shape."""
+    """Return the table (N, `columns`) at `key` of `content`. Raises BadInputError when it has another shape."""
     try:
         array = np.array(content.get(key), dtype=np.float64)
     except (TypeError, ValueError):
@@ -287,7 +290,7 @@ def _array(path: Path, content: Mapping[str, Any], key: str, columns: int) -> F6
 
 
 def _times(path: Path, content: Mapping[str, Any], count: int, rate_hz: float | None) -> tuple[F64, str]:
-    """Return times (N,), seconds, of the poses, and their source in words. `count`: number N of poses."""
+    """Return (times of the poses (N,), seconds; their source in words). `count`: number N of poses."""
     if rate_hz is None and content.get("frameTimestamps"):
         values = content["frameTimestamps"]
         rows = {"frameTimestamps": [[value] for value in values] if isinstance(values, list) else None}
@@ -302,7 +305,7 @@ def _times(path: Path, content: Mapping[str, Any], count: int, rate_hz: float | 
 
 
 def _lenses(path: Path, content: Mapping[str, Any], count: int) -> tuple[tuple[Lens, ...], str]:
-    """Return one lens for all poses or one for each, and their source in words. `count`: number of poses."""
+    """Return (one lens for all poses or one for each; their source in words). `count`: number of poses."""
     width, height = (_side(path, content, key) for key in ("w", "h"))
     if content.get("perFrameIntrinsicCoeffs"):
         rows = _array(path, content, "perFrameIntrinsicCoeffs", 4)

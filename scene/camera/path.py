@@ -94,8 +94,8 @@ class Optics:
     def lens(self, i: int, j: int, fraction: float, output: Shape) -> Lens:
         """Return the lens for a picture of `output` (height, width), a `fraction` of the way from sample `i` to `j`.
 
-        If the camera filmed the background, the lens is cut as the background is. Otherwise the picture keeps the
-        vertical field of view of the camera.
+        If the camera filmed the background, its picture is cut in the same way as the background. Otherwise the picture
+        keeps the vertical field of view of the camera.
         """
         first = self._shown(i, output)
         is_one = len(self.lenses) == 1 and len(self.filmed) <= 1
@@ -125,9 +125,9 @@ class CameraPath:
     `quats` (N, 4), `places` (N, 3): rotations and positions, from camera to world, metres.
     `optics`: lenses of the samples.
     `notes`: how the source was read, for people.
-    `wrap`: what follows the last sample.
+    `wrap`: what follows the last sample: the path loops or runs backwards.
     `recorded`: whether the path comes from a recording, which has to be placed in the scene.
-    `detected`: facts about its file.
+    `detected`: facts about the camera's file.
     `pictures`: name of the photo of each sample; empty if the file names none.
     `quarter`: number of quarter turns clockwise of the camera's picture.
     `is_held`: whether each sample holds until halfway to its neighbours, as its photo does.
@@ -171,12 +171,15 @@ class CameraPath:
         return turn, self.places[i] + (self.places[j] - self.places[i]) * fraction
 
     def nearest(self, t_s: float) -> int:
-        """Return the index of the sample nearest to `t_s`."""
+        """Return the index of the sample nearest to the time `t_s`, seconds."""
         i, j, fraction = self._bracket(t_s)
         return i if fraction < HALFWAY else j
 
     def _between(self, t_s: float) -> tuple[int, int, float]:
-        """Return the indices of two samples, and how far `t_s` is from the first to the second, 0 to 1."""
+        """Return (i, j, share): the samples between which the pose at `t_s` lies, and its share of the way from i to j.
+
+        The share is from 0 to 1. If samples are held, i and j are the nearest sample.
+        """
         if not self.is_held:
             return self._bracket(t_s)
         held = self.nearest(t_s)
@@ -215,8 +218,8 @@ HEAD_AND_SHOULDERS = "head and shoulders"
 class Orbit:
     """A camera that swings by `swing_deg` to either side around `target`, and moves from `far_m` to `near_m` and back.
 
-    `what`: description for people. `height_m`: height of the camera. `far_m`, `near_m`: horizontal distances.
-    `period_s`: duration of a cycle.
+    `what`: description for people. `target`: point (x, y, z), metres. `height_m`: height of the camera.
+    `far_m`, `near_m`: horizontal distances from the target. `period_s`: duration of a cycle.
     """
 
     what: str
@@ -267,7 +270,7 @@ class Stand:
     period_s: float = 1.0
 
     def places(self, phase: F64) -> F64:
-        """Return the camera's position, metres, once for each of `phase` (N,): (N, 3)."""
+        """Return the camera's position, metres, repeated for each of `phase` (N,): (N, 3)."""
         return np.tile(self.place, (len(phase), 1))
 
 
@@ -294,7 +297,7 @@ def _pace(camera: Orbit | Descent | Stand) -> str:
 def load_builtin(name: str, spec: CameraSpec) -> CameraPath | None:
     """Return the built-in camera `name`; None if there is no such camera.
 
-    `spec`: its field of view and clip planes are used.
+    `spec`: camera of the scene, of which field of view and clip planes are used.
     """
     camera = BUILTIN.get(name)
     if camera is None:

@@ -1,9 +1,9 @@
 """Text tables of camera poses: one pose per line, numbers separated by blanks or commas, `#` for comments.
 
-All lines must have the same number of columns; the error names the first line that has not. An empty field between two
-commas is NaN; empty fields at the end of a line are ignored. Column names, in a comment or in the first line, override
-the order of the format. Columns that seldom hold a quaternion of length 1 are refused, as another order of columns
-would give a camera that looks in arbitrary directions.
+All lines must have the same number of columns; the error names the first other line. An empty field between two commas
+is NaN; empty fields at the end of a line are ignored. Column names, in a comment or in the first line, override the
+order of the format. Columns that seldom hold a quaternion of length 1 are refused, as another order of columns would
+give a camera that looks in arbitrary directions.
 """
 
 from __future__ import annotations
@@ -110,7 +110,7 @@ class TableLayout(NamedTuple):
 
     @property
     def has_pose(self) -> bool:
-        """Whether the names say which columns hold time, position and quaternion."""
+        """Whether the column names say which columns hold time, position and quaternion."""
         return all(name in self.names for name in POSE)
 
 
@@ -134,7 +134,7 @@ def read_table(path: Path, columns: int, expected: str) -> NumberTable:
 
 
 def head_of(path: Path, columns: int, expected: str) -> NDArray[np.float64]:
-    """Return the numbers (N, `columns`) among the first HEAD rows; N may be 0.
+    """Return the numbers (N, `columns`) of the usable rows among the first HEAD rows; N may be 0.
 
     Rows with another number of columns, or with NaN or infinity, are left out. Raises BadInputError when the file is
     unreadable.
@@ -258,7 +258,7 @@ def _first_other(found: Sequence[str]) -> int:
 
 
 def elapsed(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
-    """Return the times (N,) since the first finite one, and the median step between finite times.
+    """Return (times (N,) since the first finite time, median step between finite times), in the unit of `times`.
 
     NaN stays NaN. The step is 0 if there are fewer than two finite times.
     """
@@ -306,10 +306,9 @@ class TableClock(NamedTuple):
     usual_hz: float = FILM_RATE_HZ
 
     def stated(self, path: Path, unit: str) -> TableClock:
-        """Return this clock with the `unit` that column names state; the scene's own unit is kept.
+        """Return this clock with the `unit` that column names state, unless the scene states a unit itself.
 
-        The scene may say that the times are frame numbers. Raises BadInputError when the scene states another unit than
-        the names.
+        Raises BadInputError when the scene states another unit of time. Frame numbers may have names with any unit.
         """
         if unit != AUTO and self.unit not in (AUTO, FRAMES, unit):
             found = f'column names with times in {unit} and camera.time_unit = "{self.unit}"'
@@ -333,7 +332,8 @@ class ColumnTimes(NamedTuple):
 def times_of(where: str | Path, column: NDArray[np.float64], clock: TableClock) -> ColumnTimes:
     """Return the times in `column` (N,), or the times of its frame numbers.
 
-    `where`: table, for messages. Raises BadInputError when several units are likely, or when no unit fits the steps.
+    `where`: table, for messages. `clock`: what the scene and the format say about the times. Raises BadInputError when
+    several units are likely, or when no unit fits the steps.
     """
     units = units_of(column) if clock.unit == AUTO else (clock.unit,)
     since, step = elapsed(column)
@@ -408,7 +408,7 @@ class PoseTable:
     """The poses of a table with quaternions.
 
     `times_s` (N,): times from 0.
-    `turns` (N, 3, 3), `places` (N, 3): rotations and positions, as the file has them.
+    `turns` (N, 3, 3), `places` (N, 3): rotations and positions, with the file's axes and unit.
     `time`: unit of the file's times. `rate`: rate for notes, such as `, 30/s`.
     `order`: source of the order of columns, in words.
     `names`: content of each column of `table`.
@@ -476,7 +476,7 @@ class MatrixTable(NamedTuple):
     """The poses of a table with matrices.
 
     `times`: times of the poses; None if the table has no times.
-    `turns` (N, 3, 3), `places` (N, 3): rotations and positions, as the file has them.
+    `turns` (N, 3, 3), `places` (N, 3): rotations and positions, with the file's axes and unit.
     `lengths`: unit of the positions by the column names; "" if they state no unit.
     """
 
@@ -488,7 +488,7 @@ class MatrixTable(NamedTuple):
 
 
 def read_matrix_table(path: Path, clock: TableClock, expected: str) -> MatrixTable:
-    """Return the poses of `path`: 3x4 matrices row by row, each of which may follow a time or a frame number.
+    """Return the poses of `path`: a 3x4 matrix per line, row by row, perhaps after a time or a frame number.
 
     `clock`: what the scene says about the times. `expected`: expected content in words. Raises BadInputError with the
     line.
@@ -518,7 +518,7 @@ def _require_row_order(path: Path, table: NumberTable) -> None:
 
 
 def _require_times(path: Path, times: F64, places: F64) -> None:
-    """Raise BadInputError if a column of `places` (N, 3) looks like a clock and `times` (N,) do not.
+    """Raise BadInputError if `times` (N,) do not look like a clock, but a column of `places` (N, 3) does.
 
     The steps of a clock are equal. No camera moves so evenly along an axis while it is sampled at uneven times.
     """
@@ -533,7 +533,7 @@ def _require_times(path: Path, times: F64, places: F64) -> None:
 def _unevenness(column: F64) -> float:
     """Return the largest deviation of the steps of `column` (N,) from their median, as a share of the median.
 
-    It is infinite if the column does not grow.
+    The result is infinite if the column does not grow.
     """
     steps = np.diff(column)
     median = float(np.median(steps))
@@ -541,7 +541,10 @@ def _unevenness(column: F64) -> float:
 
 
 def _began(times: F64, unit: str) -> float | None:
-    """Return the first finite time in seconds since 1970; None if the times are not those of a clock."""
+    """Return the first finite time of `times` in seconds since 1970; None if the times are not those of a clock.
+
+    `unit`: unit of `times`, a key of TIME_UNITS or FRAMES.
+    """
     finite = times[np.isfinite(times)]
     if unit not in TIME_UNITS or not len(finite) or not _since_1970(float(finite[0]), unit):
         return None
@@ -549,7 +552,7 @@ def _began(times: F64, unit: str) -> float | None:
 
 
 def _require_quats(path: Path, quats: F64, table: NumberTable) -> None:
-    """Raise BadInputError when most of `quats` (N, 4) do not have length 1. `table`: their table, for the message."""
+    """Raise BadInputError if most of `quats` (N, 4) have another length than 1. `table`: their table, for messages."""
     off = is_off(quats)
     if 2 * np.count_nonzero(off) <= len(off):
         return
@@ -563,7 +566,7 @@ def _require_quats(path: Path, quats: F64, table: NumberTable) -> None:
 
 
 def is_off(quats: F64, most: float = MOST_OFF) -> NDArray[np.bool_]:
-    """Return, for each of `quats` (N, 4), whether the length differs from 1 by more than `most`: (N,).
+    """Return a mask (N,) of the quaternions `quats` (N, 4) whose length differs from 1 by more than `most`.
 
     A quaternion that is 0 or not finite does not count as off.
     """

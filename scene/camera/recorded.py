@@ -61,7 +61,7 @@ class LengthUnit(Enum):
 
 
 def near_origin(places: F64) -> tuple[F64, tuple[str, ...]]:
-    """Return `places` (N, 3) without the offset of a map, such as that of UTM coordinates, and a note on the offset."""
+    """Return (`places` (N, 3) without the offset of a map, such as that of UTM coordinates; a note on the offset)."""
     finite = np.isfinite(places).all(axis=1)
     middle = np.median(places[finite], axis=0) if finite.any() else np.zeros(3)
     if np.abs(middle).max() <= MAP_M:
@@ -74,7 +74,7 @@ def near_origin(places: F64) -> tuple[F64, tuple[str, ...]]:
 def metres_per_unit(
     turns: F64, places: F64, times_s: F64, fov_y_deg: float, unit: LengthUnit, spec: CameraSpec
 ) -> tuple[float, tuple[str, ...]]:
-    """Return the number of metres per unit of the map, and notes on it.
+    """Return (number of metres per unit of the map, notes on this number).
 
     `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes.
     `times_s` (N,): times.
@@ -112,14 +112,17 @@ def _looked_at_height(turns: F64, places: F64, fov_y_deg: float) -> float | None
 
 
 def _speed(places: F64, times_s: F64) -> float:
-    """Return the median speed, units per second; 0 for a single position."""
+    """Return the median speed between `places` (N, 3) at `times_s` (N,), units per second; 0 for a single position."""
     if len(places) < 2:
         return 0.0
     return float(np.median(np.linalg.norm(np.diff(places, axis=0), axis=1) / np.diff(times_s)))
 
 
 def _fitting(turns: F64, places: F64, fov_y_deg: float) -> tuple[float, str]:
-    """Return a scale that depends only on the shape of the path and where the cameras look, and its effect in words."""
+    """Return (metres per unit of the map, reason in words), from the path's shape and the lines of sight alone.
+
+    `fov_y_deg`: field of view over the picture's height, degrees.
+    """
     height = _looked_at_height(turns, places, fov_y_deg)
     if height is not None:
         return PERSON_M / SHARE / height, f"a person fills {SHARE:.0%} of the picture's height where the cameras look"
@@ -130,7 +133,7 @@ def _fitting(turns: F64, places: F64, fov_y_deg: float) -> tuple[float, str]:
 
 
 def looked_at_from(turns: F64, places: F64) -> float | None:
-    """Return the median distance of the cameras from the point that is nearest to all their lines of sight.
+    """Return the median distance of the cameras from the point nearest to all lines of sight, in units of `places`.
 
     The result is None if the lines are nearly parallel, or if they meet behind the cameras.
     """
@@ -144,7 +147,9 @@ def looked_at_from(turns: F64, places: F64) -> float | None:
 
 
 def meeting_point(turns: F64, places: F64) -> F64 | None:
-    """Return the point (3,) nearest to all lines of sight, before or behind the cameras; None if they are parallel.
+    """Return the point (3,) nearest to all lines of sight, before or behind the cameras; None for parallel lines.
+
+    `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes.
 
     The point x solves the normal equations of the distances: sum (1 - d d') (x - p) = 0 for positions p and unit
     directions d.
@@ -222,7 +227,8 @@ LEAST_SKYWARDS = 0.34
 class Upright:
     """The up direction of a world, and how the device was held.
 
-    `up` (3,): unit vector. `quarter`: number of quarter turns of the picture. `note`: how they were found, for people.
+    `up` (3,): unit vector. `quarter`: number of clockwise quarter turns of the picture.
+    `note`: how both were found, for people.
     """
 
     up: F64
@@ -240,7 +246,7 @@ class _Guess:
 
 
 def find_upright(turns: F64, usual: str, is_levelled: bool, stated: str = AUTO) -> Upright:
-    """Return the up direction of a world and the quarter turns of the picture.
+    """Find the up direction of a camera's world, and the quarter turns of the camera's picture.
 
     `turns` (N, 3, 3): camera axes, camera to world, OpenGL.
     `usual`: axis that is usually up in the format.
@@ -311,7 +317,9 @@ def _guesses(turns: F64, expected: str, prices: _Prices, stated: str) -> list[_G
 
 
 def _is_of_first(turns: F64, best: _Guess) -> bool:
-    """Return whether the world has the axes of the first of several pictures, and up is that picture's own up.
+    """Return whether the world has the axes of the first picture, and the guess `best` takes that picture's up as up.
+
+    `turns` (N, 3, 3): camera axes; False for a single picture.
 
     SLAM maps are such worlds.
     """
@@ -325,7 +333,7 @@ def _why_without(stated: str) -> str:
 
 
 def _ups_and_rights(turns: F64, quarter: int) -> tuple[F64, F64]:
-    """Return the directions up and right (N, 3) of pictures after `quarter` quarter turns."""
+    """Return (up directions, right directions), (N, 3) each, of pictures after `quarter` quarter turns."""
     x, y = turns[:, :, 0], turns[:, :, 1]
     return ((y, x), (-x, y), (-y, -x), (x, -y))[quarter]
 
@@ -344,10 +352,11 @@ def _price(turns: F64, up: F64, quarter: int) -> float | None:
 
 
 def _between(turns: F64, dearer: float) -> list[_Guess]:
-    """Return a guess whose up may be between the axes; [] if it is not believed.
+    """Return one guess whose up direction may be between the axes; [] if this guess is not believed.
 
-    This up is most nearly perpendicular to the right axes of all pictures, so the horizons are most nearly level.
-    `dearer`: additional cost.
+    This direction is most nearly perpendicular to the right axes of all pictures, so the horizons are most nearly
+    level.
+    `dearer`: additional cost of the guess.
     """
     ups, rights = _ups_and_rights(turns, 0)
     spread, directions = np.linalg.eigh(rights.T @ rights / len(rights))
@@ -374,7 +383,7 @@ def _note(best: _Guess, usual: str, stated: str) -> str:
 
 
 def _rival(best: _Guess, guesses: list[_Guess], stated: str) -> str:
-    """Return words on the second cheapest guess, if it is nearly as cheap but far from the best; otherwise ""."""
+    """Return words on the second cheapest of `guesses`, if it is nearly as cheap as `best` but far from it; else ""."""
     for guess in guesses:
         if guess.is_nadir and guess.name != best.name:
             return f"; {guess.name.upper()} up fits if it looks straight down: camera.up_axis decides"
@@ -392,7 +401,7 @@ FILM_STEP_DEG = 6.0
 
 
 def times_without(turns: F64, rate_hz: float | None) -> tuple[F64, str]:
-    """Return times (N,), seconds, of views without times, and words on their rate.
+    """Return (times (N,), seconds, for views without times; words on their rate).
 
     `turns` (N, 3, 3): camera axes, OpenGL or optical. `rate_hz`: views a second by the scene; None if the scene does
     not say. Without a rate, views that are less than FILM_STEP_DEG apart are a film, and other views are stills.
@@ -497,7 +506,7 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
 
 
 def _in_metres(raw: RawCamera, where: str, spec: CameraSpec) -> tuple[F64, CameraSpec, tuple[str, ...]]:
-    """Return positions (N, 3), the camera of the scene, and a note, after a unit of the column names is applied.
+    """Return (positions (N, 3), camera of the scene, notes) after the unit that column names state is applied.
 
     If the names state another unit than metres, the positions are converted, and `metres_per_unit` of the camera
     becomes None. If the names state metres, nothing changes and `metres_per_unit` of the scene counts: programs write
@@ -514,7 +523,10 @@ def _in_metres(raw: RawCamera, where: str, spec: CameraSpec) -> tuple[F64, Camer
 
 
 def _optics(raw: RawCamera, usable: NDArray[np.intp], quarter: int, spec: CameraSpec) -> tuple[Optics, str]:
-    """Return the lenses of the poses with indices `usable`, for a picture after `quarter` quarter turns, and a note."""
+    """Return (lenses of the poses with the indices `usable`, source of the lenses in words).
+
+    The lenses are those of the picture after `quarter` quarter turns.
+    """
     if spec.fov_y_deg is not None:
         optics = one_lens(spec.fov_y_deg, spec.near_m, spec.far_m)
         return optics, f"field of view {spec.fov_y_deg:.4g} degrees high, as given"
@@ -527,7 +539,7 @@ def _optics(raw: RawCamera, usable: NDArray[np.intp], quarter: int, spec: Camera
 
 
 def _faults(times_s: F64, turns: F64, places: F64) -> dict[str, NDArray[np.bool_]]:
-    """Return, for each fault in words, which poses (N,) have it; a pose has at most one fault."""
+    """Return, by fault in words, a mask (N,) of the poses with this fault; a pose has at most one fault."""
     finite = np.isfinite(times_s) & np.isfinite(turns).all(axis=(1, 2)) & np.isfinite(places).all(axis=1)
     safe, near = np.where(finite[:, None, None], turns, 0.0), np.where(finite[:, None], places, 0.0)
     rotation = are_rotations(safe)
@@ -536,7 +548,7 @@ def _faults(times_s: F64, turns: F64, places: F64) -> dict[str, NDArray[np.bool_
 
 
 def are_rotations(matrices: F64, skew: float = SKEW) -> NDArray[np.bool_]:
-    """Return, for each of `matrices` (N, 3, 3), whether it is a rotation: (N,).
+    """Return a mask (N,) of the `matrices` (N, 3, 3) that are rotations.
 
     The entries of |R^T R - 1| must be below `skew`, and the determinant above 0.
     """

@@ -95,7 +95,9 @@ def load_kitti(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
 
 
 def _kitti_times(path: Path, read: MatrixTable, clock: TableClock) -> tuple[F64, str]:
-    """Return times (N,), seconds, of the poses, and their source: the file, `times.txt`, the scene or the usual rate.
+    """Return (times of the poses (N,), seconds; their source in words).
+
+    The source is the file, `times.txt`, the scene or the usual rate.
 
     Raises BadInputError when `times.txt` has another number of times than there are poses.
     """
@@ -113,7 +115,7 @@ def _kitti_times(path: Path, read: MatrixTable, clock: TableClock) -> tuple[F64,
 
 
 def _counted(path: Path, clock: TableClock) -> TableClock:
-    """Return the clock of poses without times: it counts frames.
+    """Return the clock of poses without times, which counts frames.
 
     Raises BadInputError when the scene states a unit of times.
     """
@@ -216,7 +218,7 @@ def _sensor_distortion(lens: Lens, numbers: Mapping[str, F64]) -> tuple[str, ...
 
 
 def _sensor(path: Path) -> dict[str, F64]:
-    """Return the numbers of a `sensor.yaml`, by the keys of SENSOR_KEYS; each value is a list in brackets.
+    """Return the numbers of a `sensor.yaml` by key of SENSOR_KEYS. In the file, each value is a list in brackets.
 
     Raises BadInputError when numbers are missing or not plausible.
     """
@@ -273,7 +275,7 @@ def load_stray(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
 
 
 def _stray_lenses(file: Path, poses: PoseTable) -> tuple[tuple[Lens, ...], str]:
-    """Return one lens for all poses or one for each, and their source in words."""
+    """Return (one lens for all poses or one for each; their source in words)."""
     parts = ("fx", "fy", "cx", "cy")
     if all(name in poses.names for name in parts):
         table = np.column_stack([poses.column(name) for name in parts])

@@ -27,7 +27,8 @@ from trilane.scene.rotations import about, matrix_from_quat, normalised, quat_fr
 class Build:
     """Measures of the legs that walk, metres.
 
-    `hip`, `knee`, `ankle`, `ball`: left side at rest, each as an offset from the joint before; `hip` from the pelvis.
+    `hip`, `knee`, `ankle`, `ball`: position of each joint of the left leg at rest, (x, y, z) from the joint before it.
+    The hip's position is from the pelvis.
     `ankle_height`: height of the ankle above the sole. `heel_behind`: distance of the heel behind the ankle.
     `feet_apart`: distance between the feet.
     """
@@ -46,7 +47,7 @@ class Build:
         return float(np.linalg.norm(self.knee) + np.linalg.norm(self.ankle))
 
     def side(self, offset: tuple[float, float, float], side: int) -> F64:
-        """Return `offset` (3,), which is given for the left side, for `side` +1 (left) or -1 (right)."""
+        """Return `offset` (3,), a vector of the left side, mirrored if `side` is -1 (right)."""
         return np.array([offset[0] * side, offset[1], offset[2]])
 
 
@@ -124,8 +125,7 @@ class Walker:
     def _step(self, swings: list[Swing], k: int, times_s: F64) -> tuple[NDArray[np.bool_], F64]:
         """Return the part of a foot's track from the start of swing `k` to the start of the next swing.
 
-        It consists of which times are in that part (T,), and a table (T, 6) with ankle x, y, z, heading, pitch and
-        load.
+        The result is (mask of the times in that part (T,), table (T, 6) of ankle x, y, z, heading, pitch and load).
         """
         swing, after = swings[k], swings[(k + 1) % len(swings)]
         before = swings[k - 1]
@@ -155,9 +155,9 @@ class Walker:
         return local < until_next, table
 
     def _print(self, swing: Swing, after: Swing) -> tuple[float, float, float]:
-        """Return the footprint between swing `swing` and the next swing `after`.
+        """Return the footprint between swing `swing` and the next swing `after`, as (x, z, heading).
 
-        It consists of x and z of the point below the ankle, metres, and the heading, radians.
+        x and z are those of the point below the ankle, metres; the heading is in radians.
         """
         stance = (after.start_s - swing.end_s) % self.period_s
         middle = np.array([(swing.end_s + stance / 2) % self.period_s])
@@ -328,7 +328,7 @@ WAVES_PER_S = 1.7
 
 
 def walk_wave_turn() -> Motion:
-    """Return ten seconds of a person who walks to the viewer, waves, turns, walks back and turns again."""
+    """Return the motion, ten seconds long, of a person who walks to the viewer, waves, turns and walks back."""
     times = np.arange(int(PERIOD_S * RATE_HZ)) / RATE_HZ
     walker = Walker(BUILD, _route, SWINGS, PERIOD_S)
     left, right = walker.foot(1, times), walker.foot(-1, times)
@@ -336,7 +336,7 @@ def walk_wave_turn() -> Motion:
 
 
 def there_and_back() -> Motion:
-    """Return fifteen seconds of a person who walks five metres along z, turns, walks back and turns again."""
+    """Return the motion, fifteen seconds long, of a person who walks five metres along z, turns and walks back."""
     times = np.arange(int(FAR_PERIOD_S * RATE_HZ)) / RATE_HZ
     walker = Walker(BUILD, _far_route, far_swings(), FAR_PERIOD_S)
     left, right = walker.foot(1, times), walker.foot(-1, times)
@@ -354,7 +354,7 @@ def far_swings() -> tuple[Swing, ...]:
 
 
 def idle() -> Motion:
-    """Return eight seconds of a person who stands, breathes, shifts the weight and looks about."""
+    """Return the motion, eight seconds long, of a person who stands, breathes, shifts the weight and looks about."""
     times = np.arange(8 * RATE_HZ) / RATE_HZ
     tracks = [_standing(side, len(times)) for side in (1, -1)]
     poses, places = _body(times, tracks[0], tracks[1], wave=False, shift_m=0.018 * np.sin(np.pi * times / 4))
@@ -377,7 +377,10 @@ BUILTIN: dict[str, Callable[[], Motion]] = {
 
 
 def _closed(times: F64, poses: F64, places: F64, what: str) -> Motion:
-    """Return a motion that loops: its last frame equals its first. `what`: words for the note."""
+    """Return a motion that loops, because its last frame equals its first. `what`: words for the note.
+
+    `times` (T,): seconds. `poses` (T, 55, 3): axis-angle. `places` (T, 3): positions of the pelvis, metres.
+    """
     times = np.append(times, len(times) / RATE_HZ)
     poses, places = np.concatenate([poses, poses[:1]]), np.concatenate([places, places[:1]])
     notes = (f"built in: {what}, {RATE_HZ} frames/s",)
@@ -393,9 +396,9 @@ def _far_route(times: F64) -> tuple[F64, F64, F64]:
 
 
 def _along_z(times: F64, start_m: float, walks: Changes, turns: Changes) -> tuple[F64, F64, F64]:
-    """Return the route along z that begins at `start_m`, in metres, and changes by the tables `walks` and `turns`.
+    """Return (x, z, heading) at `times` (T,) of a route along z that begins at `start_m`, metres; x is 0.
 
-    The result has the form of `Route`.
+    `walks`, `turns`: tables of the changes of z, metres, and of the heading, radians.
     """
     z = start_m + sum(far * _eased((times - start) / (end - start)) for start, end, far in walks)
     heading = sum(angle * smooth_step((times - start) / (end - start)) for start, end, angle in turns)
@@ -451,7 +454,7 @@ def _body(
 
 
 def blurred_heading(left: FootTrack, right: FootTrack) -> F64:
-    """Return the heading (T,) of the pelvis: midway between the feet's headings, smoothed.
+    """Return the heading (T,) of the pelvis, radians: midway between the feet's headings, smoothed.
 
     Over a cycle, the heading may change by whole turns.
     """

@@ -59,6 +59,7 @@ class BvhJoint:
 class Bvh:
     """The content of a BVH file.
 
+    `joints`: joints in file order, each after its parent.
     `frames` (T, columns): value of each channel, in file units or degrees. `frame_time_s`: seconds per frame.
     """
 
@@ -252,7 +253,7 @@ HUMAN_LEG = (0.6, 1.6)
 
 
 def unit_of(leg: float, units: str) -> tuple[str, float]:
-    """Return a note on the unit of lengths, and the unit in metres.
+    """Return (note on the unit of lengths, unit in metres).
 
     `leg`: length of a leg in the file's unit. `units`: a key of UNITS_M, or `auto` to find it by the leg.
     """
@@ -273,7 +274,7 @@ CHAINS = (("shoulder", "elbow"), ("elbow", "wrist"), ("hip", "knee"), ("knee", "
 
 
 def leading_t_pose(tracks: Tracks, trunk: F64) -> tuple[int, tuple[str, ...]]:
-    """Return the number of frames in a T pose before the motion jumps away from it, and a note on that T pose.
+    """Return (number of frames in a T pose before the motion jumps away from it, a note on that T pose).
 
     `trunk` (T, 3): vector along the trunk. The number is 0 if there is no T pose, or if the motion moves on without a
     jump.
@@ -292,7 +293,7 @@ def leading_t_pose(tracks: Tracks, trunk: F64) -> tuple[int, tuple[str, ...]]:
 
 
 def _in_t(tracks: Tracks, trunk: F64, bones: F64) -> NDArray[np.bool_]:
-    """Return whether the body is in a T pose, for each frame (T,).
+    """Return a mask (T,) of the frames in which the body is in a T pose. `trunk` (T, 3): vector along the trunk.
 
     `bones` (8, T, 3): vectors along the bones of CHAINS.
     """
@@ -357,7 +358,7 @@ def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MA
 
 
 def _without_partner(index_of: Collection[str]) -> tuple[str, ...]:
-    """Return a note on the joints of the body, without the hands, that are not in `index_of`."""
+    """Return a note on the joints of the body, apart from hands, that are not in `index_of`."""
     missing = [name for name in BODY_JOINTS if name not in index_of]
     if not missing:
         return ()
@@ -367,10 +368,10 @@ def _without_partner(index_of: Collection[str]) -> tuple[str, ...]:
 def _person(
     path: Path, joints: Sequence[BvhJoint], joint_map: Mapping[str, str]
 ) -> tuple[str, dict[str, int], tuple[str, ...]]:
-    """Return the family of joint names, the index of each joint by SMPL-X name, and a note if there are several roots.
+    """Return (family of joint names, index of each joint by SMPL-X name, a note if there are several roots).
 
     If several roots are persons, the person with the most matched joints is taken, the first among equals. If no root
-    is one, all roots together are matched as one person. Raises BadInputError as `match_names` does.
+    is a person, all roots together are matched as one person. Raises BadInputError as `match_names` does.
     """
     names = [joint.name for joint in joints]
     roots = [index for index, joint in enumerate(joints) if joint.parent < 0]
@@ -401,7 +402,7 @@ def feet_of(tracks: Tracks) -> F64:
 
 
 def tracks_of(bvh: Bvh, index_of: dict[str, int]) -> tuple[Tracks, NDArray[np.bool_]]:
-    """Return the joints of `index_of` over the readable frames, and which of all frames (T,) are readable."""
+    """Return (joints of `index_of` over the readable frames, mask of the readable frames among all frames (T,))."""
     turns, places = bvh.forward()
     with np.errstate(invalid="ignore"):
         readable = np.asarray((np.abs(places) < FARTHEST).all(axis=(1, 2)) & np.isfinite(turns).all(axis=(1, 2, 3)))
@@ -417,10 +418,10 @@ def tracks_of(bvh: Bvh, index_of: dict[str, int]) -> tuple[Tracks, NDArray[np.bo
 
 
 def _tip(bvh: Bvh, index: int, turns: F64, places: F64, least: float) -> F64 | None:
-    """Return the positions (T, 3) at which a joint's bone ends: its end site, or the farthest joint directly below it.
+    """Return the positions (T, 3) at which the bone of joint `index` ends.
 
-    A joint at the same place counts as the joint itself; thumbs do not count. The result is None if nothing below is
-    farther than `least`, in the file's unit.
+    The end is the end site, or the farthest joint directly below. A joint at the same place counts as the joint itself;
+    thumbs do not count. The result is None if nothing below is farther than `least`, in the file's unit.
     """
     here, found, reach = {index}, None, max(least, LEAST_LENGTH)
     for k, joint in enumerate(bvh.joints):

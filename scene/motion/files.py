@@ -2,13 +2,13 @@
 
 The suffix of a file decides which reader is used; the reader's errors name the file. A key that a format does not use
 is refused, not ignored. `start_s` and `end_s` are times of the motion itself, before `speed`. A part of a motion is
-placed like a whole motion: at first it faces +Z, and it is centred on the ground that it covers.
+placed like a whole motion: its first frame faces +Z, and the ground that it covers is centred.
 
 Files of NumPy hold poses, dicts of arrays, or only positions of joints. Positions, as in HumanML3D, are (T, 22, 3) in
 the order of SMPL's joints. Poses may have the same shape, so the content decides. An array holds positions if its
 bones, apart from the legs, are as long as a person's, alike on both sides, and rigid. Also, the hips must be on either
-side of the pelvis, and the trunk must not be folded. `retarget.py` computes rotations from positions. What positions do
-not determine is chosen: a limb twists as its bend and the toes suggest, and the head turns as the neck does.
+side of the pelvis, and the trunk must not be folded. `retarget.py` computes rotations from positions. Positions do not
+determine twists. Therefore a limb twists as its bend and the toes suggest, and the head turns as the neck does.
 
 HumanML3D: https://github.com/EricGuo5513/HumanML3D (`new_joints`: 20 frames a second, metres, Y up).
 """
@@ -74,7 +74,7 @@ def places_in(array: NDArray[Any]) -> F64 | None:
 
 
 def _sound(places: F64) -> NDArray[np.bool_]:
-    """Return, for each frame (T,), whether all bones have a person's lengths, and nearly the same in all frames.
+    """Return a mask (T,) of the frames in which all bones have a person's lengths, nearly equal in all frames.
 
     `places`: positions (T, 22, 3).
     """
@@ -95,7 +95,10 @@ def _sound(places: F64) -> NDArray[np.bool_]:
 
 
 def _upright_parts(places: F64) -> NDArray[np.bool_]:
-    """Return, for each frame (T,), whether the hips are apart and the trunk is not folded."""
+    """Return a mask (T,) of the frames in which the hips are apart and the trunk is not folded.
+
+    `places`: positions (T, 22, 3).
+    """
     at = {name: places[:, index] for index, name in enumerate(NAMES)}
 
     def way(*names: str) -> F64:
@@ -107,7 +110,7 @@ def _upright_parts(places: F64) -> NDArray[np.bool_]:
 
 
 def _within(ratios: F64, times: float) -> bool:
-    """Return whether all `ratios` are between 1 / `times` and `times`."""
+    """Return whether all `ratios` are between 1 / `times` and `times`, a factor of 1 or more."""
     return bool(((ratios < times) & (ratios > 1 / times)).all())
 
 
@@ -301,6 +304,6 @@ def _of_no_reader(path: Path) -> BadInputError:
 
 
 def _check_named(spec: AvatarSpec, motion: str | Path) -> None:
-    """Raise BadInputError if `spec` maps joints of a `motion` whose joints have no names."""
+    """Raise BadInputError if `spec` has a `joint_map`, but the joints in the file `motion` have no names."""
     if spec.joint_map and Path(motion).suffix.lower() not in NAMED:
         raise BadInputError(motion, "joint_map", f"none: only joints of {', '.join(NAMED)} files have names")

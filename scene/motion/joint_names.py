@@ -39,7 +39,7 @@ def _named(names: str, joints: str) -> dict[str, str]:
 
 
 def _limbs(names: str) -> dict[str, str]:
-    """Return {name: joint} for `names` of a leg, from hip to toes, and of an arm, from collar to wrist."""
+    """Return {name: joint without side} for `names` of a leg, from hip to toes, and of an arm, from collar to wrist."""
     return _named(names, "hip knee ankle foot collar shoulder elbow wrist")
 
 
@@ -54,9 +54,9 @@ def _family(
 
     `trunk`: names of pelvis, three joints of the spine, neck and head.
     `limbs`: joint by name, without a side.
-    `sides`: marks of the left and the right side, which come before these names.
+    `sides`: marks of the left and the right side, separated by a blank, which come before the names of limbs.
     `more`: further joints by name.
-    `behind`: whether the marks come after the names instead.
+    `behind`: whether the marks come after the names of limbs instead.
     """
     table = {**_named(trunk, "pelvis spine1 spine2 spine3 neck head"), **more}
     for mark, side in zip(sides.split(), ("left", "right"), strict=True):
@@ -154,7 +154,7 @@ STATED = "joint_map"
 
 
 def match_names(path: Path, names: list[str], joint_map: Mapping[str, str] = NO_MAP) -> tuple[str, dict[str, int]]:
-    """Return the family that fits best, and the index in `names` of each matched joint by SMPL-X name.
+    """Return (family that fits best, index in `names` of each matched joint by SMPL-X name).
 
     `joint_map`: name in the file by SMPL-X name, or "" for none. It overrides the tables, and the returned family
     mentions it. Raises BadInputError about `path` when the file lacks a joint that the map names, or when a REQUIRED
@@ -179,12 +179,12 @@ def match_names(path: Path, names: list[str], joint_map: Mapping[str, str] = NO_
 
 
 def _missing(found: Mapping[str, int], stated: Mapping[str, int | None]) -> list[str]:
-    """Return the REQUIRED joints that neither `found` nor `stated` matches to a joint of the file."""
+    """Return the REQUIRED joints that are matched to a joint of the file neither in `found` nor in `stated`."""
     return [name for name in REQUIRED if name not in found and stated.get(name) is None]
 
 
 def _stated(path: Path, names: list[str], target: str, source: str) -> int | None:
-    """Return the index of the joint named `source`, if need be in another spelling of `plain`; None if it is "".
+    """Return the index of the joint whose name is `source`, or has the same `plain` name; None if `source` is "".
 
     `target`: SMPL-X joint that `source` is to be matched to. Raises BadInputError when the file has no such joint.
     """

@@ -86,7 +86,7 @@ class Wrap(enum.Enum):
 
 
 def wrapped_time(t_s: float, length_s: float, wrap: Wrap) -> float:
-    """Return the time in [0, length_s] whose frame is shown at `t_s`; 0 if the length is 0."""
+    """Return the time in [0, `length_s`] whose frame is shown at `t_s`; `wrap`: what follows the last frame."""
     if length_s <= 0:
         return 0.0
     if wrap is Wrap.HOLD:
@@ -98,9 +98,9 @@ def wrapped_time(t_s: float, length_s: float, wrap: Wrap) -> float:
 
 
 def bracket(times_s: F64, t_s: float) -> tuple[int, int, float]:
-    """Return the indices `i <= j` of the neighbours of `t_s` in increasing `times_s` (T,), and its share of the way.
+    """Return (i, j, share): the neighbours i <= j of `t_s` in increasing `times_s` (T,), and its share of the way.
 
-    The share is from 0 at `i` to 1 at `j`. A time outside the range counts as the nearest end.
+    The share is 0 at i and 1 at j. A time outside the range counts as the nearest end.
     """
     last = len(times_s) - 1
     j = min(max(int(np.searchsorted(times_s, t_s, side="right")), 1), last) if last else 0
@@ -180,8 +180,8 @@ STANDS_M, STANDS_SPREAD_M = (-0.12, 0.25), 0.25
 def joint_places(poses: F64, places: F64, leg_m: float | None) -> F64:
     """Return the positions (T, 22, 3) of a plain body's joints, metres.
 
-    `poses` (T, 55, 3): axis-angle. `places` (T, 3): positions of the pelvis, metres. `leg_m`: length of a leg, to which
-    the body is scaled; None for the plain body's own.
+    `poses` (T, 55, 3): axis-angle. `places` (T, 3): positions of the pelvis, metres. `leg_m`: length of a leg, metres,
+    to which the body is scaled; None for the plain body's length.
     """
     rest = T_POSE * (leg_m / rest_leg_m(T_POSE) if leg_m else 1.0)
     turns = matrix_from_rotvec(poses[:, :BODY_JOINT_COUNT])
@@ -202,12 +202,12 @@ def lowest(poses: F64, places: F64, leg_m: float | None, up: F64) -> F64:
 
 
 def lies(heights: F64) -> bool:
-    """Return whether the `heights` (n,) of the lowest joint are those of a person who lies or stands on the hands."""
+    """Return whether the `heights` (n,), metres, of the lowest joint are those of a lying person or a handstand."""
     return _are_within(heights, LIES_M, LIES_SPREAD_M)
 
 
 def stands(heights: F64) -> bool:
-    """Return whether the `heights` (n,) of the lowest joint are those of a person who stands or walks on the floor."""
+    """Return whether the `heights` (n,), metres, of the lowest joint are those of a person who stands or walks."""
     return _are_within(heights, STANDS_M, STANDS_SPREAD_M)
 
 
@@ -315,14 +315,14 @@ def motion_from_recording(raw: RawMotion, where: str, up_axis: str) -> Motion:
 
 
 def _readable(poses: F64, shift: F64) -> NDArray[np.bool_]:
-    """Return, for each frame (T,), whether its numbers are finite and its position is within MAX_PLACE_M."""
+    """Return a mask (T,) of the frames whose numbers are finite and whose position `shift` is within MAX_PLACE_M."""
     finite = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(shift).all(axis=1)
     with np.errstate(invalid="ignore"):
         return np.asarray(finite & (np.abs(shift) < MAX_PLACE_M).all(axis=1))
 
 
 def _broken_as(poses: F64, shift: F64) -> str:
-    """Return what is wrong with the unreadable frames, in words."""
+    """Return what is wrong with the unreadable frames, in words. `poses`, `shift`: as in `_readable`."""
     not_finite = not (np.isfinite(poses).all() and np.isfinite(shift).all())
     with np.errstate(invalid="ignore"):
         is_far = bool((np.abs(np.where(np.isfinite(shift), shift, 0.0)) >= MAX_PLACE_M).any())
@@ -338,7 +338,7 @@ def _check_angles(poses: F64, where: str) -> None:
 
 
 def _up_axis(poses: F64, places: F64 | None, raw: RawMotion, stated: str) -> tuple[str, str, tuple[str, ...]]:
-    """Return the axis that is up, how it was decided, and a note if another axis may be up.
+    """Return (axis that is up, reason in words, a note if another axis may be up).
 
     `poses` (T, 55, 3), `places` (T, 3): poses, and positions of the pelvis if recorded, of the usable frames.
     `stated`: axis by the scene, or `auto`.

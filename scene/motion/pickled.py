@@ -1,9 +1,9 @@
 """Reads the plain values and arrays of a Python pickle without executing anything in it.
 
 Rule: only None, numbers, text, bytes, lists, tuples, dicts and NumPy arrays of numbers are built. Nothing else is
-imported, called or built. `pickletools` splits the file into operations, and the tables below execute those that make
-such values. Any other object in the file becomes a `Foreign`, which only holds the object's name. An operation that is
-not in a table ends the reading.
+imported, called or built. `pickletools` splits the file into operations. Only the operations in the tables below are
+executed. Any other object in the file becomes a `Foreign`, which only holds the object's name. Any other operation ends
+the reading.
 
 The size of a file limits the memory that it can use. Text and bytes are pieces of the file. An array is a view of bytes
 whose number must match its shape. The number of operations is limited. Keys of dicts are text, whose hash a file cannot
@@ -103,7 +103,7 @@ class _Reader:
             values.append(value)
 
     def bytes_of(self, raw: Any) -> bytes:
-        """Return `raw`, which is bytes, or the bytes of a text that Python 2 and older protocols wrote for bytes.
+        """Return `raw` if it is bytes, or the bytes for which Python 2 and older protocols wrote the text `raw`.
 
         The same text object always gives the same bytes object.
         """
@@ -153,7 +153,7 @@ def printable(text: str) -> str:
 
 
 def wanted(value: Any, kind: type, what: str) -> Any:
-    """Return `value` if its type is `kind`. Raises TypeError otherwise. `what`: expected value in words."""
+    """Return `value` if its type is `kind`, otherwise raise TypeError. `what`: expected value in words."""
     if type(value) is not kind:
         found = "nothing" if value is None else type(value).__name__
         raise TypeError(f"{found} in place of {what}")
@@ -228,7 +228,7 @@ def _update(target: Any, items: list[Any]) -> None:
 
 
 def _dict_of(items: list[Any]) -> dict[str, Any]:
-    """Return a dict of alternating keys and values; integer keys become text, and keys of other types are left out."""
+    """Return a dict of `items`, alternating keys and values. Integer keys become text; other keys are left out."""
     keys = ((str(key) if type(key) is int and abs(key) < 1 << 64 else key) for key in items[::2])
     return {key: value for key, value in zip(keys, items[1::2], strict=True) if type(key) is str}
 
@@ -304,7 +304,9 @@ def _build(reader: _Reader, _value: Any) -> None:
 
 
 def _array(reader: _Reader, shape: Any, kind: Any, fortran: Any, raw: Any) -> NDArray[Any] | list[Any]:
-    """Return the array of a state, or the list of items of an array of objects.
+    """Return the array that NumPy stored as `shape`, dtype `kind`, order `fortran` and bytes `raw`.
+
+    For an array of objects, `raw` is the list of items, and so is the result.
 
     Raises ValueError unless `raw` has exactly the bytes that `shape` and `kind` require.
     """

@@ -71,7 +71,7 @@ class Retarget:
     `rest`: joints of the avatar at rest.
     `stands` (T,): whether the person stands in each frame.
     `own`: whether the recorded skeleton is built like the avatar's.
-    `turns`: global rotations (T, 3, 3) of each joint that is done, by name.
+    `turns`: global rotations (T, 3, 3) of each joint that is computed so far, by name.
     `notes`: notes for people.
     """
 
@@ -83,11 +83,11 @@ class Retarget:
     notes: list[str] = field(default_factory=list)
 
     def bone(self, start: str, end: str) -> F64:
-        """Return the direction (3,) of a bone of the avatar at rest, as a unit vector."""
+        """Return the unit vector (3,) from joint `start` to joint `end` of the avatar at rest."""
         return unit(self.rest.bone(start, end)[0])
 
     def above(self, name: str) -> F64:
-        """Return the global rotations (T, 3, 3) of a joint's parent."""
+        """Return the global rotations (T, 3, 3) of the parent of joint `name`."""
         return self.turns[JOINT_NAMES[JOINT_PARENTS[JOINT_INDEX[name]]]]
 
     def lay(self, name: str, bone: F64, recorded: F64, evidence: list[Evidence]) -> None:
@@ -104,9 +104,9 @@ class Retarget:
 
 
 def retarget(tracks: Tracks, joints: F64) -> tuple[F64, F64, tuple[str, ...]]:
-    """Return poses (T, 55, 3), axis-angle, positions (T, 3) of the avatar's pelvis, and notes for people.
+    """Return (poses (T, 55, 3), axis-angle; positions (T, 3) of the avatar's pelvis, metres; notes for people).
 
-    `tracks`: the recording; it must have hips, knees and ankles, with the hips apart. Positions are in its unit.
+    `tracks`: the recording, in any unit. It must have hips, knees and ankles, with the hips apart.
     `joints` (55, 3): rest joints of the avatar, metres.
     """
     rest = at_rest(joints)
@@ -146,7 +146,7 @@ def _leg(work: Retarget, side: str) -> None:
 
 
 def _feet(work: Retarget, up: F64) -> None:
-    """Lay the feet along the recorded feet, but keep toes and heels above the floor.
+    """Set the rotations of the feet in `work`: along the recorded feet, but with toes and heels above the floor.
 
     `up` (3,): up direction of the recording.
     """
@@ -212,7 +212,10 @@ class _RecordedFoot:
 
 
 def _recorded_foot(work: Retarget, side: str, up: F64) -> _RecordedFoot | None:
-    """Return the recorded foot of a leg whose thigh and shin are done; None if the file has no direction of it."""
+    """Return the recorded foot of a leg whose thigh and shin have rotations; None if its direction is unknown.
+
+    `side`: `left` or `right`. `up` (3,): up direction of the recording.
+    """
     way = _foot(work.tracks, side)
     if way is None:
         return None
@@ -237,9 +240,9 @@ def _ankle(work: Retarget, side: str) -> F64:
 
 
 def _foot(tracks: Tracks, side: str) -> F64 | None:
-    """Return the vector (T, 3) from the ankle to the toes, or to the end of its bone.
+    """Return the vector (T, 3) from the ankle to the toes, or else to the end of the foot's bone.
 
-    The result is None if the file has neither of these ends, or if the vector is 0 in any frame.
+    The result is None if the file has neither toes nor that end, or if the vector is 0 in any frame.
     """
     ankle, toes = f"{side}_ankle", f"{side}_foot"
     end = tracks.places.get(toes, tracks.tips.get(ankle))
@@ -250,11 +253,12 @@ def _foot(tracks: Tracks, side: str) -> F64 | None:
 
 
 def _steeper(work: Retarget, planted: Sequence[_RecordedFoot]) -> tuple[float, float]:
-    """Return how much steeper the recorded feet are than the avatar's, and how much more a flat foot slopes.
+    """Return (how much steeper recorded feet are than the avatar's, how much more a flat foot slopes), radians.
 
-    `planted`: feet that lie flat in some frames. The flatter of both feet counts, as the other may stand on its toes.
-    Both results are in radians, and 0 if the slopes are nearly equal. The first is at most MOST_STEEPER either way; the
-    second is the part beyond.
+    The first number is the difference of the slopes, cut off at MOST_STEEPER either way. The second is the part that is
+    cut off. Both are 0 if the slopes are nearly equal.
+
+    `planted`: feet that lie flat in some frames. The flatter of both feet counts, as the other foot may be on its toes.
     """
     found = min((float(np.median(foot.falls[foot.planted]) - foot.ours) for foot in planted), default=0.0)
     steeper = float(np.clip(found, -MOST_STEEPER, MOST_STEEPER))
@@ -269,7 +273,7 @@ def _steeper(work: Retarget, planted: Sequence[_RecordedFoot]) -> tuple[float, f
 
 
 def _levelled(work: Retarget, name: str, base: F64) -> F64:
-    """Return the file's rotations (T, 3, 3) of a joint after one constant rotation; `base` if the file has none.
+    """Return the file's rotations (T, 3, 3) of joint `name` after one constant rotation; `base` if the file has none.
 
     The constant makes their mean equal to the mean of `base` (T, 3, 3). Means are over frames that stand, or over all
     frames if none stands.
@@ -300,7 +304,7 @@ def _arm(work: Retarget, side: str) -> None:
 def _arm_bone(tracks: Tracks, start: str, end: str) -> F64 | None:
     """Return the vector (T, 3) of an arm's bone, from joint `start` to joint `end` or to the bone's end.
 
-    The result is None if the file has no `start`, or neither of these ends.
+    The result is None if the file lacks `start`, or has neither `end` nor the bone's end.
     """
     if not tracks.has(start):
         return None
@@ -327,7 +331,7 @@ def _hand(work: Retarget, side: str) -> None:
 def _palm(work: Retarget, side: str) -> list[Evidence]:
     """Return evidence for a hand's rotation about its length.
 
-    It is the vector from the little finger to the index finger, or that from the wrist to the thumb.
+    The evidence is the vector from the little finger to the index finger, else from the wrist to the thumb.
     """
     for start, end in (("pinky1", "index1"), ("wrist", "thumb1")):
         names = f"{side}_{start}", f"{side}_{end}"

@@ -55,7 +55,7 @@ BOTH_HANDS: Widths = {90: (FINGERS, "")}
 
 
 def from_joint(joint: str, count: int) -> Widths:
-    """Return the Widths of an array of `count` joints, in SMPL-X order, whose first joint is `joint`."""
+    """Return the allowed width of an array that has `count` joints in SMPL-X order, beginning with `joint`."""
     first = JOINT_INDEX[joint]
     return {3 * count: (tuple(range(first, first + count)), "")}
 
@@ -97,7 +97,7 @@ def turns_in(where: str, array: NDArray[Any], widths: Widths) -> JointTurns:
 
 
 def shapes(widths: Widths) -> str:
-    """Return the allowed shapes as text: `(T, 66), (T, 72) or (T, 156)`."""
+    """Return the allowed shapes of `widths` as text, such as `(T, 66), (T, 72) or (T, 156)`."""
     *others, last = [f"(T, {width})" for width in widths]
     return f"{', '.join(others)} or {last}" if others else last
 
@@ -214,8 +214,8 @@ OTHERS: dict[tuple[int, ...], str] = {
 def motion_of_array(where: str, source: str, array: NDArray[Any]) -> RawMotion:
     """Return the motion of `array`, (T, W) or (T, W / 3, 3), where W is a key of WHOLE.
 
-    `where`: path of the file, for messages. `source`: suffix of the file, for people. Raises BadInputError for anything
-    else.
+    `where`: path of the file, for messages. `source`: suffix of the file, for people. Raises BadInputError for any
+    other array.
     """
     if array.shape[1:] in OTHERS:
         raise BadInputError(where, f"shape {array.shape}", f"{shapes(WHOLE)}, axis-angle", OTHERS[array.shape[1:]])
@@ -253,7 +253,7 @@ def median_step_rad(poses: NDArray[np.float64]) -> float:
 
 
 def hands_note(poses: NDArray[np.float64]) -> str:
-    """Return a note on whether the fingers are posed."""
+    """Return a note that says whether the fingers are posed in `poses` (T, 55, 3), axis-angle."""
     return "posed (flat-hand zero)" if np.nan_to_num(poses[:, 25:]).any() else "all zero, flat"
 
 
@@ -297,7 +297,7 @@ def motion_of_frames(found: list[FoundTable], source: str) -> RawMotion:
 
 
 def _frame_numbers(found: list[FoundTable]) -> tuple[NDArray[np.int64], str]:
-    """Return the number of each frame, and a note on its source.
+    """Return (number of each frame, a note on the source of the numbers).
 
     The numbers are those in the frames' names, if all names end in different numbers; otherwise the frames' indices.
     """
@@ -309,7 +309,7 @@ def _frame_numbers(found: list[FoundTable]) -> tuple[NDArray[np.int64], str]:
 
 
 def _rows_of_person(found: list[FoundTable]) -> tuple[list[int], str]:
-    """Return the row of the chosen person in each frame, -1 if the person is not in it; and a note on the person."""
+    """Return (row of the chosen person in each frame, -1 in a frame without the person; a note on the person)."""
     counts = [len(_rows_in(frame, ROMP_POSES)) for frame in found]
     if all(frame.has(ROMP_PERSONS) for frame in found):
         persons = [
@@ -337,7 +337,7 @@ def _row_turns(frame: FoundTable, row: int) -> JointTurns:
 
 
 def _row_place(frame: FoundTable, row: int) -> F64 | None:
-    """Return the position (3,) of the person in row `row`, metres, in the camera's coordinates.
+    """Return the position (3,) of the person in row `row` of `frame`, metres, in the camera's coordinates.
 
     The result is None if the frame has no positions. Raises BadInputError when positions and poses do not match.
     """
@@ -416,7 +416,7 @@ def motion_of(where: str, source: str, values: Any, there: str = "") -> RawMotio
 
 
 def _layout_of(tables: list[FoundTable]) -> tuple[ArrayLayout, list[FoundTable]] | None:
-    """Return the first layout that any of `tables` has, and all tables that have it; None if no table has a layout."""
+    """Return (first layout that any of `tables` has, all tables that have it); None if no table has a layout."""
     for layout in LAYOUTS:
         found = [table for table in tables if all(table.has(key) for key in layout.needs)]
         if found:
@@ -462,7 +462,7 @@ def _rate(layout: ArrayLayout, found: FoundTable) -> tuple[float, str]:
 
 
 def _places(layout: ArrayLayout, found: FoundTable, frames: int) -> tuple[F64 | None, tuple[str, ...]]:
-    """Return positions (T, 3) of the pelvis, metres, or None if the file has none; and notes."""
+    """Return (positions of the pelvis (T, 3), metres, or None if the file has none; notes)."""
     key = layout.place
     if not found.has(key):
         return None, (f"no `{key}`: stays in place",)
@@ -490,7 +490,7 @@ def _scale(layout: ArrayLayout, found: FoundTable) -> float:
 
 
 def _measured(layout: ArrayLayout, found: FoundTable, frames: int) -> NDArray[np.bool_]:
-    """Return, for each frame (T,), whether it was measured; all True if the file does not say."""
+    """Return a mask (T,) of the frames that were measured; all True if the file does not say."""
     if not found.has(layout.mask):
         return np.ones(frames, dtype=bool)
     mask = found.array(layout.mask)

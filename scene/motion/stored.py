@@ -45,7 +45,7 @@ def npy_values(path: Path, expected: str) -> Any:
 
 
 def npz_values(path: Path, keys: Collection[str], expected: str) -> dict[str, Any]:
-    """Return the arrays of an `.npz` file whose names are in `keys`, and every stored object, by name.
+    """Return, by name, the arrays of an `.npz` file whose names are in `keys`, and all pickled objects.
 
     `expected`: expected content in words, for messages. Raises BadInputError.
     """
@@ -75,7 +75,7 @@ def _values(where: Path | str, data: bytes) -> Any:
 def plain(value: Any) -> Any:
     """Return the content of `value` if it is a StoredArray, otherwise `value` itself.
 
-    NumPy stores a single object as an array of one object; the result is then this object.
+    NumPy stores a single object as an array of one object. For such an array, the result is this object.
     """
     if isinstance(value, StoredArray) and isinstance(value.values, list) and len(value.values) == 1:
         return value.values[0]
@@ -83,7 +83,7 @@ def plain(value: Any) -> Any:
 
 
 def tables_in(value: Any) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield (path, dict) for each dict in `value`, from the outermost inwards, each once.
+    """Yield (path, dict) for each dict in `value` once, from the outermost inwards.
 
     The path consists of the keys and list indices that lead to the dict, joined by `.`.
     """

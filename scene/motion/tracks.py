@@ -50,7 +50,7 @@ class Tracks:
         return len(self.places["left_hip"])
 
     def has(self, *names: str) -> bool:
-        """Return whether all of these joints have positions."""
+        """Return whether all joints `names` have positions."""
         return all(name in self.places for name in names)
 
     def between(self, part: str) -> F64:
@@ -58,7 +58,7 @@ class Tracks:
         return (self.places[f"left_{part}"] + self.places[f"right_{part}"]) / 2
 
     def across(self, part: str) -> F64:
-        """Return the vector (T, 3) from the right to the left joint of a pair."""
+        """Return the vector (T, 3) from the right to the left joint of a pair, such as `hip`."""
         return self.places[f"left_{part}"] - self.places[f"right_{part}"]
 
     def bone(self, start: str, end: str) -> F64:
@@ -78,7 +78,7 @@ def unit(vectors: F64) -> F64:
 
 
 def angle_between(a: F64, b: F64) -> F64:
-    """Return angles (...) between vectors (..., 3), radians; exact near 0 and pi."""
+    """Return angles (...), radians, between vectors `a` and `b` (..., 3); exact near 0 and pi."""
     cross = np.cross(a, b)
     return np.asarray(np.arctan2(np.sqrt((cross * cross).sum(axis=-1)), (a * b).sum(axis=-1)))
 
@@ -103,7 +103,7 @@ SAME_SHARE, SAME_LEGS = 0.02, 0.003
 
 
 def standing_frames(tracks: Tracks, trunk: F64) -> NDArray[np.bool_]:
-    """Return, for each frame (T,), whether the person stands as straight as anywhere in the recording.
+    """Return a mask (T,) of the frames in which the person stands as straight as anywhere in the recording.
 
     Thighs must be in line with the vector `trunk` (T, 3), and the knees straight.
     """
@@ -133,9 +133,12 @@ def upward(tracks: Tracks, trunk: F64, stands: NDArray[np.bool_]) -> F64:
 
 
 def planted_frames(tracks: Tracks, side: str, foot: F64, up: F64) -> NDArray[np.bool_]:
-    """Return, for each frame (T,), whether a foot most likely lies flat: it hardly moves, and the leg is below the hip.
+    """Return a mask (T,) of the frames in which a foot most likely lies flat.
 
-    `foot` (T, 3): vector from the ankle to the toes. `up` (3,): up direction of the recording.
+    Such a foot hardly moves, and its leg is below the hip.
+
+    `side`: `left` or `right`. `foot` (T, 3): vector from the ankle to the toes. `up` (3,): up direction of the
+    recording.
     """
     below = angle_between(tracks.bone(f"{side}_ankle", f"{side}_hip"), up) < LEG_BELOW
     if tracks.frames == 1 or not below.any():
@@ -172,7 +175,7 @@ TOO_SHORT = 1e-6
 
 
 def transposed(turns: F64) -> F64:
-    """Return the inverse of each rotation (T, 3, 3)."""
+    """Return the inverse, which is the transpose, of each rotation (T, 3, 3)."""
     return np.swapaxes(turns, -1, -2)
 
 
@@ -261,6 +264,7 @@ def _twist(held: F64, axis: F64, laid: F64, evidence: Sequence[Evidence]) -> F64
     """Return the rotation (3, 3) about `axis` (3,) that brings the evidence closest to its recorded directions.
 
     `held` (T, 3, 3): rotations before the twist. `laid` (3, 3): rotation that takes the rest bone to `axis`.
+    `evidence`: as in `limb_turns`.
     """
     cosine = sine = 0.0
     inside = transposed(held)
@@ -332,9 +336,9 @@ class TrunkLine:
         return {"knee": (), "spine3": SPINE[:2]}.get(self.top, SPINE)
 
     def shares(self, rest: Tracks) -> F64:
-        """Return how far along the line (3,) the avatar's three joints of the spine are, 0 to 1.
+        """Return the place of each of the avatar's three joints of the spine along the line (3,), 0 to 1.
 
-        Joints at the upper end and above get 1.
+        Joints at the upper end and above it get 1. `rest`: joints of the avatar at rest.
         """
         inner = line_shares(self.points(rest))[1:-1, 0]
         return np.append(inner, np.ones(len(SPINE) - len(inner)))
@@ -350,14 +354,14 @@ def trunk_line(tracks: Tracks) -> TrunkLine:
 
 
 def line_shares(points: F64) -> F64:
-    """Return how far along a polyline (n, T, 3) each of its points is: (n, T), 0 at its beginning and 1 at its end."""
+    """Return the place (n, T) of each point along its polyline (n, T, 3): 0 at the beginning, 1 at the end."""
     steps = np.linalg.norm(np.diff(points, axis=0), axis=-1)
     reached = np.concatenate([np.zeros((1, points.shape[1])), np.cumsum(steps, axis=0)])
     return np.asarray(reached / np.where(reached[-1] > 0, reached[-1], 1.0))
 
 
 def points_at(points: F64, shares: F64) -> F64:
-    """Return the points (m, T, 3) of a polyline (n, T, 3) at constant `shares` (m,) of its length."""
+    """Return the points (m, T, 3) of a polyline (n, T, 3) at the shares `shares` (m,) of its length."""
     at = line_shares(points)
     found = np.empty((len(shares), *points.shape[1:]))
     for k, share in enumerate(shares):
@@ -382,10 +386,7 @@ class Trunk:
 
 
 def trunk_of(tracks: Tracks, line: TrunkLine, shares: F64, by_collars: bool) -> Trunk:
-    """Return the frames of pelvis and spine, with the joints of the spine at `shares` (3,) of the trunk line.
-
-    `by_collars`: whether the chest turns with the collar joints, if these are apart; otherwise with the shoulders.
-    """
+    """Return the coordinate frames of pelvis and spine; the spine's joints are at `shares` (3,) of the trunk line."""
     low, *inner, top = points_at(line.points(tracks), np.array([0.0, *shares, 1.0]))
     hips = unit(tracks.across("hip"))
     chest = _across_chest(tracks, hips, by_collars)
@@ -498,7 +499,10 @@ def with_shoulders_on(across: F64, turns: dict[str, F64], rest: Tracks) -> dict[
 
 
 def turns_of_neck(tracks: Tracks, rest: Tracks, chest: F64) -> F64:
-    """Return global rotations (T, 3, 3) of the neck: it points to the recorded head, and its left is the chest's."""
+    """Return global rotations (T, 3, 3) of the neck, which points to the recorded head, with the left of the chest.
+
+    `chest` (T, 3, 3): global rotations of the chest.
+    """
     if not tracks.has("neck", "head"):
         return chest
     left = chest[:, :, 0]

@@ -1,8 +1,8 @@
 """A network as a stage: `onnx = "net.onnx"` of a pipeline file, in a runtime that reads and writes the slots.
 
 Rule: the runtime reads an input with the network's type directly from its slot, and writes an output directly to its
-slot. A picture is first prepared into memory of the stage, as the block `prepare` does it. If there is no newest frame
-yet, the input is zeros.
+slot. A picture is first converted into memory of the stage, as by the block `prepare`. If there is no newest frame yet,
+the input is zeros.
 
 The module runs networks of any number types, inputs and outputs, in each of the runtimes:
 
@@ -86,6 +86,7 @@ def engine_of(path: Path, runtime: str, shapes: Shapes, options: RuntimeOptions)
 
     `runtime`: name of the runtime.
     `shapes`: shape of each input by name.
+    `options`: options of the runtime.
 
     Raises BadInputError for a network that the runtime does not load, MissingPartError for an absent runtime.
     """
@@ -197,13 +198,13 @@ class NetworkStage(PortedStage):
         return {}
 
     def _bound(self, sources: Sequence[NDArray[Any]], outputs: Arrays) -> Callable[[], object]:
-        """Return the function that computes `outputs` from `sources`, the array of each input."""
+        """Return the function that computes `outputs` from `sources`, which has one array for each input."""
         given = {fed.name: array.reshape(fed.type.shape) for fed, array in zip(self._fed, sources, strict=True)}
         return self._engine.bound(given, {name or self._engine.outputs[0]: array for name, array in outputs.items()})
 
 
 def build(settings: Mapping[str, Any], unit: UnitContext) -> NetworkStage:
-    """Build the stage. Raises BadInputError, MissingPartError."""
+    """Build the stage that runs the network of `settings`. Raises BadInputError, MissingPartError."""
     if has_device(settings["keys"]["runtime"]):
         unit.use_device(settings["keys"]["runtime"])
     return NetworkStage(settings, RuntimeOptions(unit.settings.threads, unit.settings.spin))

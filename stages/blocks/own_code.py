@@ -71,7 +71,7 @@ class OwnCode(PortedStage):
             self._guarded(own)
 
     def _write(self, found: object, outputs: Arrays) -> None:
-        """Copy the arrays that the code returned to the output slot. Raises TrilaneError for other values."""
+        """Copy `found`, the arrays that the code returned, to the output slot. Raises TrilaneError for other values."""
         if not isinstance(found, dict):
             found = dict.fromkeys(outputs, found) if len(outputs) == 1 else found
         self._check(found, outputs)
@@ -80,7 +80,7 @@ class OwnCode(PortedStage):
             target[...] = found[name]
 
     def _check(self, found: object, outputs: Arrays) -> None:
-        """Raise TrilaneError if the code returned other ports, types or shapes than the file states."""
+        """Raise TrilaneError if `found`, the arrays by port, has other ports, types or shapes than the file states."""
         if not isinstance(found, dict) or found.keys() != outputs.keys():
             said = f"a dict of {', '.join(map(str, found))}" if isinstance(found, dict) else type(found).__name__
             ports = ", ".join(name or "one array" for name in outputs)
@@ -102,7 +102,7 @@ class OwnCode(PortedStage):
         return found
 
     def _guarded(self, call: Callable[..., Any], *args: Any, **named: Any) -> Any:
-        """Return the result of a call; an error in it becomes a TrilaneError with stage, file and line of the code."""
+        """Return the result of `call`. An error in the user's code becomes a TrilaneError with stage, file and line."""
         try:
             return call(*args, **named)
         except (TrilaneError, ModuleNotFoundError):
@@ -139,7 +139,10 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> OwnCode:  # noqa: A
 
 
 class Busy(PortedStage):
-    """Works for the CPU time `load_ms`, and writes zeros; it sends the frames to a bypass that the file names."""
+    """Uses `load_ms` milliseconds of CPU time for each frame, and writes zeros.
+
+    If the file states a bypass, the frames that its `share` or `pattern` selects take it.
+    """
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         super().__init__(settings)
@@ -162,5 +165,5 @@ class Discard(PortedStage):
 
 
 def build_load(settings: Mapping[str, Any], unit: UnitContext) -> PortedStage:  # noqa: ARG001 - a factory's signature
-    """Build the block that the keys name."""
+    """Build the block that the key `block` names: `busy` or `discard`."""
     return {"busy": Busy, "discard": Discard}[settings["keys"]["block"]](settings)

@@ -2,17 +2,17 @@
 
 The block `prepare` writes a picture in a network's size, layout and numbers. The number for a byte b of channel c is
 ((b / 255 - mean[c]) / sd[c]) / step + zero_point; for an integer type it is rounded and clipped. Without keys, mean is
-0, sd is 1, and step is 1 for floats. For bytes, step is 1/255, so that bytes do not change; the zero point is 0, or
--128 for signed bytes.
+0 and sd is 1. The step is 1 for floats and 1/255 for bytes, so that bytes do not change. The zero point is 0, but -128
+for signed bytes.
 
 The block `overlay` draws these outputs on a picture:
 
 - `mask`: classes or scores. If it has three axes, the smaller of the first and the last has the channels. The largest
-  of several channels is the class, and channel 0 is the background. A single float channel is a mask where it is above
-  0.5; a single integer channel contains classes.
+of several channels is the class, and channel 0 is the background. A pixel of a single float channel belongs to the mask
+if it is above 0.5. A single integer channel contains classes.
 - `depth`: one channel, drawn from its least number (blue) to its largest (red).
 - `boxes`: rows of x0, y0, x1, y1 and maybe a score, in pixels of the picture, or from 0 to 1. A box with score 0 is not
-  drawn.
+drawn.
 
 Mask and depth are stretched over the picture.
 """
@@ -69,7 +69,7 @@ class Preparation:
         self._height_in, self._width_in, self._channels_in = picture.shape
 
     def _quantised(self, keys: Mapping[str, Any], where: str) -> tuple[float, float]:
-        """Return (step, zero point) of the network's numbers."""
+        """Return (step, zero point) of the network's numbers. `keys`, `where`: as in `Preparation`."""
         if self._dtype.kind == "f":
             return keys.get("step") or 1.0, float(keys.get("zero_point") or 0)
         if self._dtype.itemsize > 1 and keys.get("step") is None:
@@ -96,7 +96,7 @@ class Preparation:
         return self._channels, self._height, self._width
 
     def _channelled(self, picture: U8) -> U8:
-        """Return `picture` with as many channels as the network reads."""
+        """Return `picture` (h,w,c) with the number of channels that the network reads."""
         count = picture.shape[2]
         if count == self._channels:
             return picture
@@ -128,7 +128,10 @@ _DEFAULTS: Final = {"mean": 0.0, "sd": 1.0}
 
 
 def _each(values: Sequence[float] | None, channels: int, other: float, where: str) -> NDArray[np.float64]:
-    """Return a value for each channel (channels,). `other`: value for all channels if `values` is None."""
+    """Return a value for each channel (channels,).
+
+    `other`: value of all channels if `values` is None. `where`: place of the stage in its file, for errors.
+    """
     given = [other] if values is None else list(values)
     if len(given) not in (1, channels):
         expected = f"1 or {channels}, one for each channel"
@@ -137,7 +140,10 @@ def _each(values: Sequence[float] | None, channels: int, other: float, where: st
 
 
 def _layout(wanted: PortType, asked: str | None, where: str) -> tuple[str, tuple[int, int, int]]:
-    """Return (layout of a network's input, (height, width, channels) in it). `asked`: layout that the file states."""
+    """Return (layout of a network's input, (height, width, channels) of the picture in it).
+
+    `wanted`: type of the input. `asked`: layout that the file states. `where`: place of the stage in its file.
+    """
     shape = wanted.shape[-3:]
     if len(wanted.shape) not in (3, 4):
         expected = "one that reads pictures, 1xCxHxW or 1xHxWxC"
@@ -173,7 +179,7 @@ class Prepare(PortedStage):
 
 
 def build_prepare(settings: Mapping[str, Any], unit: UnitContext) -> Prepare:  # noqa: ARG001 - a factory's signature
-    """Build the block. Raises BadInputError."""
+    """Build the block `prepare`. Raises BadInputError."""
     return Prepare(settings)
 
 
@@ -236,7 +242,7 @@ class Overlay(PortedStage):
         picture[..., :3] = chosen if where is None else np.where(where[..., None], chosen, picture[..., :3])
 
     def _draw(self, picture: U8, boxes: NDArray[np.float64]) -> None:
-        """Draw the outline of each box. `boxes`: (boxes, 4 or more): x0, y0, x1, y1, maybe score."""
+        """Draw the outlines of `boxes` (boxes, 4 or more) into `picture`: x0, y0, x1, y1, maybe score."""
         boxes = boxes[np.isfinite(boxes[:, :4]).all(axis=1)]
         if boxes.shape[1] > 4:
             boxes = boxes[boxes[:, 4] > 0]
@@ -255,7 +261,7 @@ class Overlay(PortedStage):
 
 
 def _channels(array: NDArray[Any]) -> NDArray[Any]:
-    """Return `array` as (channels, height, width); the smaller of the first and the last of three axes has channels."""
+    """Return `array` as (channels, height, width). Of three axes, the smaller of first and last has the channels."""
     planes = array.reshape([size for size in array.shape if size > 1])
     if planes.ndim == 2:
         return planes[None]
@@ -263,7 +269,7 @@ def _channels(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def _classes(mask: NDArray[Any]) -> U8:
-    """Return the class of each pixel (h,w)."""
+    """Return the class of each pixel (h,w) of `mask`, an output of a network."""
     planes = _channels(mask)
     if len(planes) > 1:
         return np.asarray(planes.argmax(axis=0) % CLASSES, np.uint8)
@@ -279,5 +285,5 @@ def _depth_colours(depth: F32) -> U8:
 
 
 def build_overlay(settings: Mapping[str, Any], unit: UnitContext) -> Overlay:  # noqa: ARG001 - a factory's signature
-    """Build the block. Raises BadInputError."""
+    """Build the block `overlay`. Raises BadInputError."""
     return Overlay(settings)

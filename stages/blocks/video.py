@@ -36,7 +36,7 @@ EXPECTED = "a video or a folder of pictures"
 
 
 class FoundPictures(NamedTuple):
-    """The facts of a video or a folder of pictures.
+    """Facts about a video or a folder of pictures.
 
     `pictures`: number of pictures; 0 if it is not known.
     `fps`: the file's own rate in frames a second; None if it has none.
@@ -47,7 +47,7 @@ class FoundPictures(NamedTuple):
 
 
 def footage(path: Path) -> FoundPictures:
-    """Return the facts of a video file or a folder of pictures. Raises BadInputError."""
+    """Return the number and rate of the pictures of a video file or a folder. Raises BadInputError."""
     if not path.exists():
         raise BadInputError(path, "no such file", EXPECTED, "put it there, or change `path`")
     if path.is_dir():
@@ -107,15 +107,18 @@ class VideoStage(PortedStage):
 
 
 def build_video(settings: Mapping[str, Any], unit: UnitContext) -> VideoStage:  # noqa: ARG001 - a factory's signature
-    """Build the block. Raises BadInputError."""
+    """Build the block `video`. Raises BadInputError."""
     return VideoStage(settings)
 
 
 class Encode(PortedStage):
     """Encodes one picture for each frame.
 
-    Its keys are `fps`, `segments`, the name of the folder of segments below the run's folder, and `window`, the path of
-    the window for the newest picture, or empty. Sides are cut to even numbers, because the video's colours need it.
+    Sides are cut to even numbers, because the video's colours need it. Its keys:
+
+    `fps`: rate of the video in frames a second.
+    `segments`: name of the folder of segments below the run's folder.
+    `window`: path of the window for the newest picture, or empty.
     """
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
@@ -149,5 +152,5 @@ class Encode(PortedStage):
 
 
 def build_encode(settings: Mapping[str, Any], unit: UnitContext) -> Encode:  # noqa: ARG001 - a factory's signature
-    """Build the block."""
+    """Build the block `encode`."""
     return Encode(settings)

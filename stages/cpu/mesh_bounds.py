@@ -82,8 +82,9 @@ class Outermost:
         return np.concatenate(found) if len(found) == len(sides) else None
 
     def _project(self, vertices: F32, camera: F64, reach: F64) -> F64:
-        """Write the clip coordinates of `vertices`, and return the error bound of each coordinate (4,).
+        """Compute the clip coordinates of `vertices`, and return the error bound of each coordinate (4,).
 
+        `camera`: matrix (4,4) to clip space.
         `reach`: reach of a vertex's sphere along each clip coordinate (4,).
         """
         np.matmul(camera[:, :3].astype(np.float32), vertices.T, out=self._flat)
@@ -120,7 +121,7 @@ VERSION = "patches 1"  # raise it when the same body gives other patches
 
 @dataclass(frozen=True)
 class Level:
-    """P patches of one level of detail.
+    """The P patches of one level of patches, the coarse or the fine one.
 
     `centres`: index of each patch's centre, a vertex (P,).
     `size`, `give`: (P,) and (P,54), metres. The sphere about a patch's posed centre has the radius size + sum_b give_b
@@ -251,13 +252,13 @@ class _Extent:
     high: F64 = field(default_factory=lambda: np.full(2, -np.inf))
 
     def add(self, low: F64, high: F64) -> None:
-        """Widen the extent by points whose bounds are `low` and `high` (N,2)."""
+        """Widen the extent by N points whose (x, y) lie between `low` and `high` (N,2), NDC."""
         if len(low):
             np.minimum(self.low, low.min(axis=0), out=self.low)
             np.maximum(self.high, high.max(axis=0), out=self.high)
 
     def widened_by(self, low: F64, high: F64) -> Mask:
-        """Return a mask (N,): which of the bounds `low`, `high` (N,2) would move a side inside the screen."""
+        """Return a mask (N,) of the boxes from `low` to `high` (N,2), NDC, that would move a side inside the screen."""
         return np.asarray(
             (((low < self.low) & (self.low > -1.0)) | ((high > self.high) & (self.high < 1.0))).any(axis=1)
         )
@@ -276,7 +277,7 @@ class _View:
 
     `camera`: matrix (4,4) to clip space.
     `norms`: norm of the first three columns of each row of `camera` (4,).
-    `near_norm`, `far_norm`: norms for the distances from the near and from the far plane.
+    `near_norm`, `far_norm`: largest changes of W + Z and of W - Z, clip coordinates, per metre of movement.
     `per_joint`: matrix of each joint from rest to clip space (55,16).
     `turned`: |R - I| of joints 1 to 54 (54,).
     """
@@ -344,7 +345,10 @@ class MeshBounds:
         return bool((away < -self.reach_m * np.linalg.norm(planes[:, :3], axis=1)).any())
 
     def may_be_seen(self, posed: Posed, clip: ArrayLike) -> bool:
-        """Return whether the mesh may be on the screen, by its coarse patches; False: it is certainly not."""
+        """Return False if the coarse patches show that no part of the mesh is on the screen, otherwise True.
+
+        `clip`: projection @ view (4,4).
+        """
         view = _View.of(posed, clip)
         level = self._levels[0]
         touching, cut = self._sort_out(level, np.arange(len(level.centres)), view, _Extent())
@@ -384,9 +388,11 @@ class MeshBounds:
         return seen.rect() if (seen.low > -1.0).all() and (seen.high < 1.0).all() else None
 
     def _sort_out(self, level: Level, rows: I64, view: _View, seen: _Extent) -> tuple[I64, I64]:
-        """Return the indices of (patches of `rows` that may widen `seen`, patches that the near plane may cut).
+        """Return indices of (patches that may widen `seen`, patches that the near plane may cut).
 
-        The patches that are certainly visible widen `seen` by a point each.
+        Each patch that is certainly visible widens `seen` by one point.
+
+        `rows`: indices of the patches of `level` to examine.
         """
         radius = level.size[rows] + (self._standoff + ROUNDING_M)
         radius += np.einsum("pj,j->p", level.give[rows], view.turned / np.sqrt(2.0))
@@ -419,7 +425,7 @@ class MeshBounds:
         seen.add(*_quotients(points, np.full(len(points), self._standoff), view))
 
     def _add_triangles(self, faces: I64, view: _View, seen: _Extent) -> None:
-        """Add the triangles that the near plane may cut, clipped to it."""
+        """Clip triangles to the near plane, and widen `seen` by them. `faces`: indices of triangles."""
         corners = self._project(self._faces[faces].ravel(), view).reshape(-1, 3, 4)
         clipped = _clip_near(corners, self._standoff * view.near_norm)
         seen.add(*_quotients(clipped, np.full(len(clipped), self._standoff), view))
@@ -428,8 +434,9 @@ class MeshBounds:
 def _reach(shaped: ShapedBody, weights: F64, levels: list[Level]) -> float:
     """Return the largest distance in metres that a vertex can have from the root joint in any pose.
 
-    A joint is no further from the root than the sum of the bones between them. A point that a joint moves keeps its
-    distance from the joint, and a skinned vertex is a mean of such points. |R - I| of a joint is at most 2 sqrt(2).
+    A joint is no further from the root than the sum of the bones between them. A joint keeps its distance from each
+    point that it moves, and a skinned vertex is a mean of points that joints move. |R - I| of a joint is at most 2
+    sqrt(2).
     """
     parents, joints = shaped.body.parents, shaped.joints
     bones = np.linalg.norm(joints - np.where(parents[:, None] < 0, joints, joints[parents]), axis=1)
@@ -441,9 +448,12 @@ def _reach(shaped: ShapedBody, weights: F64, levels: list[Level]) -> float:
 
 
 def _against_near(centres: F64, radius: F64, view: _View) -> tuple[Mask, Mask]:
-    """Return two masks (N,): spheres wholly in front of the near plane (and of W = 0), and spheres that cross it.
+    """Return two masks (N,): spheres wholly in front of the near plane and of W = 0, and spheres that cross it.
 
     A sphere in neither mask is not visible.
+
+    `centres`: clip coordinates of the centres (N,4).
+    `radius`: radius of each sphere (N,), metres.
     """
     near, far = centres[:, 3] + centres[:, 2], centres[:, 3] - centres[:, 2]
     within = far + radius * view.far_norm >= 0.0
@@ -471,7 +481,7 @@ def _clip_near(triangles: F64, slack: float) -> F64:
     """Return the clip coordinates (N,4) of corners in front of the near plane, and of points where edges cross it.
 
     `triangles`: clip coordinates of the corners (F,3,4).
-    `slack`: distance by which the plane is moved back, in clip coordinates.
+    `slack`: distance by which the near plane is moved towards the camera, in clip coordinates.
     """
     near = triangles[:, :, 2] + triangles[:, :, 3] + slack
     points = [triangles[near > 0.0]]

@@ -1,9 +1,9 @@
 """The pose stage: it computes from a frame's number all data that the other stages need about the frame.
 
 Motion and camera are sampled at the frame's media time, frame / fps; all numbers that leave this stage are finite. If a
-frame shows the same as an earlier frame, or nobody, nothing is skinned, and the frame skips the stages that would draw
-it. Each body gets a level of its mesh, then the cheapest level of detail for which the sum of both errors is within the
-budget of pixels.
+frame shows nobody, or the same as an earlier frame, nothing is skinned, and the frame skips the stages that draw. Each
+body gets a level of its mesh, then the cheapest level of detail for which the sum of both errors is within the budget
+of pixels.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class DrawnMesh:
         return [FrameSkinner(self.shaped, detail) for detail in DETAILS]
 
     def pose(self, posed: Posed, level: int, vertices: F32, moved: ByteCounter) -> F32:
-        """Skin the body into the beginning of `vertices`, and return this part of the array.
+        """Skin the body in pose `posed` into the beginning of `vertices`, and return this part of the array.
 
         `level`: level of detail, an index into `DETAILS`.
         `moved`: counter of the moved bytes.
@@ -139,9 +139,11 @@ class ModelledBody:
     def choose(self, posed: Posed, clip: F64, output: Shape, before: HeldMesh | None = None) -> DetailChoice:
         """Return the levels of mesh and detail for a frame, with the bound on their error.
 
+        `posed`: pose of the frame.
+
         `clip`: projection @ view (4,4).
         `output`: (height, width) of the picture.
-        `before`: level of the mesh in the frame before; None without one.
+        `before`: level of the mesh in the previous frame; None if there was none.
         """
         if not self.details and not self.levels:
             return DetailChoice(HeldMesh(0), FINEST, 0.0)
@@ -158,6 +160,8 @@ class ModelledBody:
         """Return a bound on the error of `level`, metres, in the pose `posed`.
 
         If the level's least error in any pose is already above the budget, that least error is returned.
+
+        `stretch`, `w`: stretch of the projection and clip coordinate W, which turn metres into pixels (`error_px`).
         """
         if error_px(level.least_m, stretch, w) > self.budget_px:
             return level.least_m
@@ -187,7 +191,10 @@ class ModelledBody:
 
 
 def widened(rect: Rect, error_px: float, output: Shape) -> Rect:
-    """Return `rect` with `error_px` pixels more on every side, clipped to the screen."""
+    """Return `rect` with `error_px` pixels more on every side, clipped to the screen.
+
+    `output`: (height, width) of the picture in pixels.
+    """
     x, y = 2.0 * error_px / output[1], 2.0 * error_px / output[0]
     low = max(rect.x0 - x, SCREEN.x0), max(rect.y0 - y, SCREEN.y0)
     high = min(rect.x1 + x, SCREEN.x1), min(rect.y1 + y, SCREEN.y1)
@@ -232,7 +239,7 @@ class FramePlan:
 
     @property
     def meshes(self) -> float:
-        """The vertices that are drawn, in whole meshes of an avatar."""
+        """The sum of `share` over all visible avatars: the drawn vertices, counted in whole meshes."""
         return sum(one.share for one in self.seen.values())
 
 
@@ -342,14 +349,18 @@ class PoseStage:
         return _metrics(self.plan, self._moved)
 
     def _count(self, packet: NDArray[np.void], view: F64, moved: Sequence[tuple[F64, F64]]) -> None:
-        """Count the bytes of every frame: the samples and the header."""
+        """Count the bytes that every frame moves: the samples of motions and camera, and the header `packet`."""
         sampled = view.nbytes + sum(array.nbytes for pair in moved for array in pair)
         self._moved.read += sampled
         self._moved.written += packet.nbytes
         self._moved.least += sampled + packet.nbytes
 
     def _view(self, t_s: float, moved: Sequence[tuple[F64, F64]]) -> F64:
-        """Return the matrix (4,4) from world to camera: the scene's camera, steered about the first avatar."""
+        """Return the matrix (4,4) from world to camera: the scene's camera, steered about the first avatar.
+
+        `t_s`: time in the scene, seconds.
+        `moved`: (pose, place) of each avatar.
+        """
         view = self._camera.sample(t_s)
         if self._window is None:
             return view
@@ -393,7 +404,9 @@ class PoseStage:
         return bool(seen)
 
     def _lay_out(self, packet: NDArray[np.void], seen: list[tuple[NDArray[np.void], SeenAvatar]]) -> FramePlan:
-        """Set crop rectangles, `tensor_rect`s and the tensor's shape; with nobody in view, the smallest shape.
+        """Set crop rectangles, `tensor_rect`s and the tensor's shape in the header `packet`.
+
+        With nobody in view, the tensor has the smallest shape.
 
         `seen`: pairs of an avatar's part of the header and its place on the screen.
         """
@@ -436,8 +449,11 @@ class PoseStage:
         An avatar that is far off the screen is not posed. An avatar that the last computed frame did not show is first
         searched by its patches, before it is skinned.
 
+        `actor`: body, motion and place of the avatar.
         `avatar`: the avatar's part of the header.
         `vertices`: array for its skinned vertices; None if the GPU unit skins.
+        `moved`: (pose, place) of each avatar.
+        `clip`: projection @ view (4,4).
         """
         pose, translation = moved[actor.index]
         avatar["avatar"], avatar["visible"] = actor.index, False
@@ -478,7 +494,7 @@ def _metrics(plan: FramePlan, moved: ByteCounter) -> Mapping[str, float]:
 
 
 def _copy_same(source: NDArray[np.void], target: NDArray[np.void]) -> None:
-    """Copy a header without the fields OF_THE_FRAME."""
+    """Copy the header `source` to `target`, without the fields OF_THE_FRAME."""
     for name in source.dtype.names or ():
         if name not in OF_THE_FRAME:
             target[name] = source[name]

@@ -1,9 +1,9 @@
 """The present stage: it encodes frames as a segment of video, and writes a digest of every frame to a text file.
 
-The stage computes the digest of the bytes in the slot before it uses them otherwise. Each process writes one segment
-with a name of its own; the parent joins the segments (`apps/run/run_files.py`). A segment is fragmented MP4: if its
-writer is killed, it is readable, and lacks at most the last frame. Frames that are compared after the run are kept as
-arrays in a folder beside it.
+The stage computes a frame's digest from the bytes in the slot before it encodes the frame. Each process writes one
+segment with a name of its own; the parent joins the segments (`apps/run/run_files.py`). A segment is fragmented MP4: if
+its writer is killed, it is readable, and lacks at most the last frame. Frames that are compared after the run are kept
+as arrays in a folder beside the segment.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ class PresentStage:
                 raise UnwrittenError(path, FileNotFoundError(errno.ENOENT, REMOVED)) from error
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
-        """Present `inputs[slot_in]` as frame `frame`. Raises ValueError if `slot_in` is None."""
+        """Present `inputs[slot_in]` as frame `frame`, and return metrics. Raises ValueError if `slot_in` is None."""
         if slot_in is None:
             raise ValueError("the present stage needs an input slot")
         if self._window is not None and self._window.is_looked_at:
@@ -210,7 +210,7 @@ class KeptFrames:
 
 
 def kept_frames(folder: Path) -> dict[int, Path]:
-    """Return the file of each frame that was kept in `folder`, by the frame's number."""
+    """Return the files of the frames that were kept in `folder`, by frame number."""
     return {
         int(file.stem): file for file in sorted((folder / KEPT_FOLDER).glob("*.npy"), key=lambda file: int(file.stem))
     }

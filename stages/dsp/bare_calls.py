@@ -1,8 +1,8 @@
 """Measures isolated calls of a network on this machine, on distinct inputs, in a process like a unit of a run.
 
-Rule: a measurement is cached under everything that it depends on, so that a changed machine, package or network is
-measured again. An integer network runs like an avatar's network. Any other network runs with its own number types: in
-ONNX Runtime, or for a stage of a pipeline file in the runtime of the stage.
+Rule: the key of a cached measurement contains everything on which it depends. Therefore a changed machine, package or
+network is measured again. An integer network runs like an avatar's network. Any other network runs with its own number
+types: in ONNX Runtime, or for a stage of a pipeline file in the runtime of the stage.
 """
 
 from __future__ import annotations
@@ -156,7 +156,7 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> CallStage:
 
 
 def _calls(path: Path, shapes: Shapes, runtime: str, options: RuntimeOptions) -> list[Callable[[], object]]:
-    """Return functions that call any network on random inputs and throw its outputs away.
+    """Return functions, each of which calls the network on a random input of its own and throws the outputs away.
 
     Raises BadInputError for a graph that the runtime cannot load, or whose inputs are no numbers.
     """

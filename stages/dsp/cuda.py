@@ -2,9 +2,8 @@
 
 Rule: every node of the graph runs on the GPU. If one cannot, loading fails; no node falls back to the CPU.
 
-ONNX Runtime has no integer layers for CUDA: it computes a layer's sums in float, and the bytes before and after stay
-the same.
-Slots are copied to the GPU and back in every run, because the GPU cannot read their memory directly.
+ONNX Runtime has no integer layers for CUDA: it computes a layer's sums in float, and only the layer's input and output
+are bytes. Slots are copied to the GPU and back in every run, because the GPU cannot read their memory directly.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ def gpu_session(where: str, model: str | bytes, device: Mapping[str, str]) -> on
     """Return a session on the GPU.
 
     `where`: name of the network in errors.
-    `model`: path of its file, or its bytes.
+    `model`: path of the network's file, or the bytes of the file.
     `device`: settings of the CUDA provider.
 
     Raises as `load` does.

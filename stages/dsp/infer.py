@@ -1,6 +1,6 @@
 """The infer stage: it runs the avatar's integer network, or a part of it, from the input slot to the output slot.
 
-`bind` makes all sessions and bindings. A frame allocates nothing, and nothing runs with nobody in view. The tensors
+`bind` makes all sessions and bindings. A frame allocates nothing. If nobody is in view, no network runs. The tensors
 that cross a cut of the network are in the slot in the order of the cut, each on its own cache lines. All processes with
 the same configuration use the same offsets.
 """
@@ -91,7 +91,7 @@ def extent(shapes: Shapes) -> int:
 
 
 def views(payload: U8, shapes: Shapes) -> dict[str, U8]:
-    """Return views of the tensors of `shapes` in a slot, in their order. Raises ValueError if the slot is too small."""
+    """Return views of the tensors of `shapes` in a slot, by name. Raises ValueError if the slot is too small."""
     found, start = {}, 0
     for name, shape in shapes.items():
         size = math.prod(shape)
@@ -113,8 +113,8 @@ class BoundPart:
     """A part of the network, bound to an input slot and an output slot.
 
     `passed`: pairs (source, target) of tensors that are copied unchanged for a later part.
-    `in_bytes`: bytes that the part reads, with its weights if they come from memory.
-    `out_bytes`: bytes that the part writes.
+    `in_bytes`: number of bytes that the part reads, including its weights if they do not fit into the cache.
+    `out_bytes`: number of bytes that the part writes.
     """
 
     binding: Binding
@@ -173,7 +173,7 @@ class InferStage:
                 self._bindings |= bindings
 
     def _prepare(self, number: int, shape: Shape) -> dict[Key, BoundPart]:
-        """Return the part of network `number` for tensors of `shape` on each pair of slots."""
+        """Return the bound part of network `number` for tensors of `shape`, by pair of slots."""
         part = parts_for(self._config, self._networks[number], shape)[self._part]
         session = self._module.load(part, self._options)
         sources = [self._own(packet, number, MAX_CHANNELS) for packet in self._inputs]
@@ -188,16 +188,22 @@ class InferStage:
         return bindings
 
     def _own(self, packet: Packet, number: int, channels: int) -> U8:
-        """Return the part of a slot that belongs to network `number`; the whole slot for an only network."""
+        """Return the part of a slot that belongs to network `number`; the whole slot for an only network.
+
+        `channels`: channels of a pixel in this slot.
+        """
         if len(self._networks) == 1:
             return packet.payload
         return network_parts(packet.payload, len(self._networks), self._shapes, channels)[number]
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
-        """Run each network that paints somebody in view; with nobody in view, write transparent pictures.
+        """Run each network that paints somebody in view, and return metrics.
 
-        The metrics are `inferred`, the number of inferences, and the bytes moved. The least bytes are the networks'
-        inputs and outputs, and their weights if these do not fit into the last-level cache.
+        With nobody in view, transparent pictures are written. The metrics are `inferred`, the number of inferences, and
+        the
+        bytes moved. The least bytes are the networks' inputs and outputs, and their weights if these do not fit into
+        the
+        last-level cache.
         """
         assert slot_in is not None and slot_out is not None
         pose, picture, moved = self._inputs[slot_in].header, self._outputs[slot_out].payload, self._moved
@@ -246,7 +252,7 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> InferStage:
 def _bound(session: Session, part: NetworkPart, source: U8, target: U8, weights: int) -> BoundPart:
     """Return `part`, bound to the slots `source` and `target`.
 
-    `weights`: bytes of the part's weights that each run reads from memory.
+    `weights`: number of bytes of the part's weights that each run reads from memory.
     """
     given, handed_on = views(source, part.crossing_in), views(target, part.crossing_out)
     inputs, outputs = [given[name] for name in part.inputs], [handed_on[name] for name in part.outputs]

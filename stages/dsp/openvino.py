@@ -52,7 +52,7 @@ class OpenvinoSession:
 
 
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OpenvinoSession:
-    """Return `network` compiled, from the cache if it was compiled before.
+    """Return `network` compiled for the threads of `options`, from the cache if it was compiled before.
 
     Raises BadInputError if OpenVINO cannot load it or would run a layer in float.
     """
@@ -79,7 +79,7 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OpenvinoSession:
 
 
 def _key(network: IntegerNetwork, settings: Mapping[str, Any]) -> str:
-    """Return a file name that depends on everything that a compiled network depends on, including the processor."""
+    """Return the cache's file name, which differs if network, `settings`, version or processor differ."""
     core = _core()
     machine = [str(core.get_property(DEVICE, name)) for name in ("FULL_DEVICE_NAME", "OPTIMIZATION_CAPABILITIES")]
     parts = (network.digest, version(), *machine, *(f"{name}={value}" for name, value in settings.items()))

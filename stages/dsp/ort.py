@@ -72,7 +72,10 @@ class OrtSession:
 
 
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
-    """Return `network` compiled. Raises BadInputError if ONNX Runtime cannot load it or would run a layer in float."""
+    """Return `network` compiled for the threads of `options`.
+
+    Raises BadInputError if ONNX Runtime cannot load it or would run a layer in float.
+    """
     with tempfile.TemporaryDirectory(prefix="trilane-ort-") as folder:
         optimised = Path(folder) / "optimised.onnx"
         settings = settings_of(options)

@@ -32,7 +32,7 @@ DEFAULTS = {**SOCS["sm8350"], "htp_performance_mode": "burst"}
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
     """Return `network` compiled for the HTP, from the cache if it was compiled before.
 
-    Raises BadInputError if a node of it does not run on the HTP in integers.
+    Raises BadInputError if a node of the network does not run on the HTP in integers.
     """
     check_integer_layers(network)
     device = {**DEFAULTS, **options.device}
@@ -82,8 +82,8 @@ def htp_session(where: str, model: str | bytes, device: Mapping[str, str], entri
     """Return a session on the HTP.
 
     `where`: name of the network in errors.
-    `model`: path of its file, or its bytes.
-    `device`: settings of the provider.
+    `model`: path of the network's file, or the bytes of the file.
+    `device`: settings of the QNN provider.
     `entries`: further entries of the session's configuration.
 
     Raises BadInputError if a node does not run on the HTP.

@@ -42,7 +42,7 @@ class Binding(Protocol):
 
 
 class Session(Protocol):
-    """A loaded network of one shape."""
+    """A loaded network, or a loaded part of one, for one tensor shape."""
 
     def bind(self, inputs: Sequence[U8], outputs: Sequence[U8]) -> Binding:
         """Return a binding to arrays in the order of the network's inputs and outputs.
@@ -67,7 +67,7 @@ class RuntimeEntry:
     """A row of the table of runtimes.
 
     `module`: module that implements `Runtime`.
-    `package`: package that it needs.
+    `package`: package that the runtime needs.
     `install`: function that returns the command that installs the package.
     `file`: file that the package must contain, relative to its folder; empty for none.
     `copies`: whether each run copies the slots to a device's memory, and back.
@@ -87,7 +87,10 @@ class RuntimeEntry:
 
 
 def cuda_line() -> str:
-    """Return the command that installs the runtime `cuda`; its package replaces the CPU's, which has the same files."""
+    """Return the command that installs the runtime `cuda`.
+
+    The command first removes the package for the CPU, because both packages have the same files.
+    """
     here = pip()
     return f"{here} uninstall -y onnxruntime && {here} install onnxruntime-gpu  # on a machine with an NVIDIA GPU"
 
@@ -128,7 +131,7 @@ def has_device(name: str) -> bool:
 
 
 def copies_slots(name: str) -> bool:
-    """Return whether runtime `name` copies the slots to its device and back in every run, and does not use them."""
+    """Return whether each run of runtime `name` copies the slots to its device's memory and back."""
     return RUNTIMES[name].copies
 
 

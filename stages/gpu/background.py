@@ -2,8 +2,8 @@
 
 Every frame covers the output: `cover` scales the picture until no border is left, and crops both sides equally. Videos
 and folders start again when they end; photos that belong to the camera's views are shown with these views. The EXIF tag
-of a picture says how it is turned, but a caller may choose another turn. A picture that Pillow would show wrongly is
-converted to eight bits, or refused.
+of a picture says by how many quarter turns it is shown, but a caller may choose another number. A picture that Pillow
+would show wrongly is converted to eight bits, or refused.
 
 `survey` returns size, rate and range of a background. Rule: all pictures that the run will show are opened before the
 run: each picture is decoded, and a video's frames are counted. Therefore a broken file is named before a process is
@@ -67,13 +67,13 @@ A_VIDEO = "a video, a picture, or a folder of pictures"
 
 
 def look_at_picture(path: Path) -> Stored:
-    """Return size and turn of the picture in `path`, without decoding it. Raises BadInputError if that fails."""
+    """Return size and quarter turns of the picture in `path`, without decoding it. Raises BadInputError."""
     with _opened(path) as image:
         return Stored((image.height, image.width), QUARTERS.get(_orientation(image), 0))
 
 
 def check_picture(path: Path) -> None:
-    """Decode the whole picture in `path`, a JPEG at an eighth of its size. Raises BadInputError if that fails."""
+    """Raise BadInputError if the picture in `path` cannot be decoded; a JPEG is decoded at an eighth of its size."""
     with _opened(path) as image:
         image.draft("RGB", (1, 1))
         image.load()
@@ -134,7 +134,7 @@ def open_background(path: Path, shape: Shape, fps: float, camera: CameraPath | N
     """Return the opened background in `path`; a folder's pictures follow each other at `fps`. Raises BadInputError.
 
     `shape`: (height, width) of its pictures.
-    `camera`: camera of the scene. The pictures may belong to its views; None: they belong to no views.
+    `camera`: camera of the scene, to whose views the pictures may belong; None if they belong to no views.
     """
     turned = () if camera is None else camera.optics.turned
     if camera is not None and camera.is_held:
@@ -238,7 +238,7 @@ def check_pictures(path: Path, fps: float, frames: int, camera: CameraPath) -> N
 
     `fps`: rate at which a folder's pictures follow each other, and the frames of the run.
     `frames`: number of frames of the run.
-    `camera`: camera of the scene. The pictures may belong to its views.
+    `camera`: camera of the scene, to whose views the pictures may belong.
     """
     if path.is_dir():
         for _ in _checked(_shown(path, fps, frames, camera)):
@@ -280,6 +280,9 @@ def _size(stored: Stored) -> str:
 
 class _Head(NamedTuple):
     """Facts of a video from its first frame and its stream.
+
+    `stored`: size and quarter turns of the frames.
+    `pixels`: aspect, transfer and primaries of the pixels.
 
     `codec`: name of the codec.
     `bits`: bits per colour.

@@ -62,7 +62,7 @@ Drawing = tuple[int, int, bytes, bytes]
 
 
 class DrawnFrames:
-    """Remembers which drawing each output slot has."""
+    """Remembers which drawing each output slot has. A drawing is the inputs from which a frame's picture follows."""
 
     def __init__(self) -> None:
         self._slots: dict[int, tuple[Drawing | None, int]] = {}
@@ -85,7 +85,7 @@ class DrawnFrames:
 
 
 class StillBackground:
-    """Keeps the pixels of a background, so that one that does not change is drawn only once.
+    """Keeps the pixels of a background that two frames in a row have, so that further frames copy them.
 
     `target`: framebuffer with one RGBA colour attachment of 8 bits.
     """
@@ -97,7 +97,7 @@ class StillBackground:
         self._is_kept = False
 
     def draw(self, shown: Hashable, draw: Callable[[], None]) -> None:
-        """Fill the target with a background: call `draw`, or copy the kept background.
+        """Fill the target with a background: copy the kept pixels, or else call `draw`.
 
         `shown`: value that identifies the background; not None.
         """
@@ -170,7 +170,10 @@ def measured_line(pose: NDArray[np.void], presented_ns: list[int]) -> str:
 
 
 def hud_lines(pose: NDArray[np.void], measured: str) -> list[str]:
-    """Return the three lines of the text display. `measured`: the middle line, from `measured_line`."""
+    """Return the three lines of the text display for the frame with header `pose`.
+
+    `measured`: middle line, from `measured_line`.
+    """
     height, width = pose["tensor_shape"].tolist()
     visible = int(sum(avatar["visible"] for avatar in pose["avatars"][: int(pose["avatar_count"])]))
     return [
@@ -282,7 +285,10 @@ class CompositeStage:
         self._draw(pose)
 
     def _take(self, pose: NDArray[np.void], image: NDArray[np.uint8]) -> None:
-        """Upload a new picture of the background, if any, and for a full frame the avatars' picture."""
+        """Upload the background's new picture, if there is one, and `image` if the frame is a full frame.
+
+        `pose`: header of the frame. `image`: the networks' pictures of the avatars.
+        """
         if self._background is not None and self._picture is not None:
             picture = self._background.at(float(pose["media_time_s"]))
             if picture is not None:
@@ -299,11 +305,14 @@ class CompositeStage:
             counter_of(self._ctx).least += _cells_bytes(pose)
 
     def _holds(self, picture: int) -> bool:
-        """Return whether the uploaded picture of the avatars belongs to the frame number `picture`."""
+        """Return whether the uploaded picture of the avatars belongs to the frame with the number `picture`."""
         return self._held is not None and int(self._held["picture"]) == picture
 
     def _drawing(self, pose: NDArray[np.void]) -> Drawing | None:
-        """Return the inputs on which the frame's bytes depend; None if the text display makes each frame different."""
+        """Return the inputs on which the bytes of the frame with header `pose` depend.
+
+        The result is None if the text display makes each frame different.
+        """
         if self._hud is not None:
             return None
         nobody = self._held is None or int(pose["work"]) == FrameWork.NONE
@@ -345,7 +354,10 @@ class CompositeStage:
             self._planes.draw(pose["view"], pose["projection"])
 
     def _depth(self, pose: NDArray[np.void], avatar: Any) -> float:
-        """Return the z of the avatar's pelvis in camera space, metres; the most negative is the farthest."""
+        """Return z of the pelvis of an avatar in camera space, metres; the most negative is the farthest.
+
+        `pose`: header of the frame. `avatar`: the avatar's part of it.
+        """
         pelvis = avatar["joints"][0] @ np.append(self._rest[int(avatar["avatar"])][0], 1.0)
         return float(pose["view"][2, :3] @ pelvis + pose["view"][2, 3])
 

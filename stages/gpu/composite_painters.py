@@ -217,7 +217,7 @@ def spans(shown: Mask, margin: int) -> F32:
     """Return the parts of a picture to draw: left, top, right, bottom of each, as shares of its sides (N,4) float32.
 
     `shown`: mask of the pixels that are not transparent (h,w).
-    `margin`: number of texels that a screen pixel reads on each side of its middle.
+    `margin`: number of texels that a screen pixel reads on each side of its centre.
     """
     height, width = shown.shape
     has_any = shown.any(axis=1)
@@ -490,7 +490,7 @@ class PlanePainter:
 def half_sides(plane: PlaneSpec) -> tuple[F32, F32]:
     """Return the two half sides of `plane` as vectors (3,), metres: half its width, and half its depth.
 
-    The vectors are at right angles to each other and to the normal.
+    The vectors are at right angles to each other and to the plane's normal.
     """
     normal = np.asarray(plane.normal, np.float64) / np.linalg.norm(plane.normal)
     towards = np.array([1.0, 0.0, 0.0]) if abs(normal[1]) > UPRIGHT else np.array([0.0, 1.0, 0.0])

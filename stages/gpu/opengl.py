@@ -53,8 +53,8 @@ class Driver:
 def open_context(threads: int | None = None) -> Any:
     """Return a new off-screen `moderngl.Context` of OpenGL 3.3 or later, current on the calling thread.
 
-    `threads`: number of CPU threads that a software driver may use, including the calling thread. Mesa reads it only
-    when the process makes its first context.
+    `threads`: number of CPU threads that a software driver may use, including the calling thread. Mesa reads this
+    number only when the process makes its first context.
 
     Raises MissingPartError if no context can be made.
     """
@@ -151,7 +151,7 @@ def function(name: str) -> Callable[..., Any]:
 
 
 def clear_unsigned(value: tuple[int, int, int, int]) -> None:
-    """Fill colour attachment 0 of the bound framebuffer with `value`; it must have an unsigned integer format."""
+    """Fill colour attachment 0 of the bound framebuffer, which has an unsigned integer format, with `value`."""
     function("glClearBufferuiv")(COLOR, 0, (ctypes.c_uint * 4)(*value))
 
 
@@ -222,7 +222,7 @@ def build_program(ctx: Any, vertex: str | Path, fragment: str | Path, **defines:
 
 
 def set_uniforms(program: Any, values: dict[str, Any]) -> None:
-    """Set uniforms by name; a uniform that the shader's compiler removed is ignored."""
+    """Set the uniforms `values` by name; a uniform that the shader's compiler removed is ignored."""
     for name, value in values.items():
         if name in program:
             program[name].value = value

@@ -58,8 +58,8 @@ def texture_array(ctx: Any, texture: Floats, filtering: str = "linear", levels: 
     """Return an FP16 array texture of C/4 RGBA layers from `texture` (H,W,C), clamped at its edge.
 
     `filtering`: one of FILTERS.
-    `levels`: smaller levels that were learnt, each (H,W,C). They replace the levels that the driver computes, and no
-    smaller level is read. With them, `linear` becomes `mipmap`.
+    `levels`: learnt smaller levels, each (h,w,C), the largest first; they replace the levels that the driver computes.
+    With them, `linear` becomes `mipmap`.
     """
     height, width, channels = texture.shape
     array = ctx.texture_array((width, height, channels // 4), 4, _pixels(texture), dtype="f2")
@@ -76,7 +76,7 @@ def texture_array(ctx: Any, texture: Floats, filtering: str = "linear", levels: 
 
 
 def texture_words(ctx: Any, texture: Floats) -> tuple[Any, float]:
-    """Return (texture of 32-bit words with the FP16 numbers of `texture` (H,W,C), uniform `unit`) for a deferred pass.
+    """Return (texture of 32-bit words, uniform `unit`) for a deferred pass. The words pack `texture` (H,W,C) as FP16.
 
     The numbers are first multiplied by the largest power of two that FP16 allows, so that small numbers are not
     subnormal. `packed_tensor.frag` turns the bits of such a number into a float, and multiplies it by `unit`.
@@ -95,7 +95,7 @@ def texture_words(ctx: Any, texture: Floats) -> tuple[Any, float]:
 
 
 def filter_of(asked: str, learnt: bool) -> str:
-    """Return the filter of a texture. `asked`: filter of the scene. `learnt`: whether it has learnt smaller levels.
+    """Return the filter of a texture. `asked`: filter of the scene. `learnt`: whether the texture has learnt levels.
 
     Learnt levels are always read, so `linear` becomes `mipmap` with them.
     """
@@ -149,7 +149,7 @@ class Placement:
 
 @dataclass(frozen=True)
 class Target:
-    """A target of the pass.
+    """A target of the packed pass.
 
     `words`: framebuffer of the tensor.
     `uv_image`: texture of u and v in a deferred pass.
@@ -257,7 +257,7 @@ class PackedAvatar:
 
         `mesh`: whole mesh, number 0.
         `texture`: neural texture (H,W,C).
-        `levels`: packed smaller levels of the texture, which a deferred pass cannot read; None without any.
+        `levels`: smaller levels of the texture, packed, which a deferred pass cannot read; None without any.
         `coarser`: levels of the mesh, numbers 1, 2, ...
 
         Raises BadInputError if a texture has a number beyond FP16, or C is not the pass's number of channels.
@@ -313,7 +313,7 @@ class PackedAvatar:
 
 
 class RasterStage:
-    """The raster stage.
+    """Draws the input tensors of the networks from pose packets.
 
     `passes`: pass that draws the tensors of each network, by the network's number.
     `avatars`: meshes and texture of each avatar of the scene, by the avatar's number.
@@ -344,7 +344,7 @@ class RasterStage:
             packed.target(shape)
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
-        """Write the tensor (h,w,C) uint8 of each network: drawn if it paints somebody in view, otherwise empty.
+        """Write the tensor (h,w,C) uint8 of each network, empty if the network paints nobody in view. Return metrics.
 
         The metrics are the bytes moved. The least bytes are the pose of the drawn mesh of each visible avatar, and the
         drawn tensors.
@@ -430,7 +430,7 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> RasterStage:
 
 
 def _meshes(ctx: Any, bodies: Sequence[ShapedBody], config: RunConfig) -> list[Mesh]:
-    """Return the meshes of a whole body and of its levels.
+    """Return the meshes of `bodies`: a whole body, then the body of each level of its mesh.
 
     If the whole mesh encloses a volume, each level counts as closed. A level may fold over itself, but its triangles
     that face away are behind others, so it is drawn without them.

@@ -104,7 +104,7 @@ def _surface(normal: Floats | None, colour: Floats | None, source: NDArray[np.in
 
 
 def is_closed(vertices: Floats, faces: Ints) -> bool:
-    """Return whether the faces (F,3) enclose a volume and wind outward; a share `MAX_OPEN` of edges may be open.
+    """Return whether `faces` (F,3) enclose a volume and wind outward; the share `MAX_OPEN` of edges may be open.
 
     Bodies have small openings that no camera sees, such as the backs of the eyes.
     """
@@ -335,7 +335,10 @@ class SkinnedMesh:
         return _vertex_array(self._ctx, program, [self._content], indices, self.arrays)
 
     def upload_pose(self, pose: BodyPose) -> None:
-        """Write the skinning matrices, and for a mesh with pose blend shapes the pose feature. Raises ValueError."""
+        """Write the skinning matrices, and for a mesh with pose blend shapes the pose feature, to the GPU.
+
+        Raises ValueError if `pose` lacks the feature that the mesh needs.
+        """
         upload(self._ctx, self._joints, np.ascontiguousarray(pose.joints, np.float32))
         if self.posedirs is None:
             return
@@ -377,7 +380,10 @@ def _prepare(ctx: Any, closed: bool) -> None:
 
 
 def _layout(arrays: MeshArrays, with_source: bool) -> tuple[list[str], list[str], list[NDArray[Any]]]:
-    """Return (names, formats, columns) of the interleaved vertex buffer; the formats are moderngl's."""
+    """Return (names, formats, columns) of the interleaved vertex buffer; the formats are moderngl's.
+
+    `with_source`: whether each vertex has the index of the body's vertex.
+    """
     columns: dict[str, tuple[str, NDArray[Any]]] = {"position": ("3f", arrays.position), "uv": ("2f", arrays.uv)}
     columns |= {name: (f"{values.shape[1]}f", values) for name, values in arrays.surface.items()}
     for group in range(arrays.weights_per_vertex // 4):
@@ -423,7 +429,10 @@ class MeshDraw:
             set_uniforms(program, values)
 
     def draw(self, pose: BodyPose, view: Floats, projection: Floats) -> None:
-        """Draw the mesh in `pose` into the current target, with the depth test and culling that are enabled."""
+        """Draw the mesh in `pose` into the current target, with the depth test and culling that are enabled.
+
+        `view`, `projection`: OpenGL matrices (4,4).
+        """
         clip = target_clip(view, projection)
         self._mesh.upload_pose(pose)
         for program, vertices in self._parts:

@@ -67,7 +67,10 @@ def to_srgb(codes: NDArray[np.uint16], transfer: str, is_wide: bool) -> U8:
 
 @cache
 def _eotf(transfer: str) -> F32:
-    """Return the light of STEPS codes from 0 to 1. PQ: light of the display, cd/m2; HLG: light of the scene, 0 to 1."""
+    """Return the light (STEPS,) of STEPS codes from 0 to 1 of `transfer`.
+
+    For PQ, it is the light of the display, cd/m2; for HLG, the light of the scene, 0 to 1.
+    """
     code = np.arange(STEPS) / (STEPS - 1)
     if transfer == PQ:
         return pq_light(code).astype(np.float32)
@@ -90,7 +93,10 @@ def pq_code(light: F64) -> F64:
 
 @cache
 def _gains() -> F32:
-    """Return factors on light. Entry i belongs to the i-th of STEPS square roots of light, from 0 to that of PEAK."""
+    """Return the factors by which light is reduced (STEPS,).
+
+    Entry i is for a light whose square root is the i-th of STEPS equal steps from 0 to the square root of PEAK.
+    """
     light = np.maximum(np.linspace(0, np.sqrt(PEAK), STEPS), 1e-3) ** 2
     gains: F32 = (roll_off(light) / light).astype(np.float32)
     return gains
@@ -108,7 +114,10 @@ def roll_off(light: F64) -> F64:
 
 @cache
 def _srgb() -> U8:
-    """Return the sRGB bytes of light. Entry i belongs to the i-th of STEPS square roots of light, from 0 to 1."""
+    """Return the sRGB bytes of lights (STEPS,).
+
+    Entry i is for a light whose square root is the i-th of STEPS equal steps from 0 to 1.
+    """
     light = (np.arange(STEPS) / (STEPS - 1)) ** 2
     curve = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.power(light, 1 / 2.4) - 0.055)
     return (curve * 255 + 0.5).astype(np.uint8)
@@ -143,10 +152,10 @@ class VideoReader:
         self._open(0.0)
 
     def at(self, time_s: float) -> U8 | None:
-        """Return the newest frame (h,w,3) that is not after `time_s`; None if an earlier call returned it.
+        """Return the newest frame (h,w,3) that is not after `time_s`; None if an earlier call returned this frame.
 
-        If a time lies before that of the last frame, the video is opened again. This happens between the frames that
-        are measured before a run and the run's first frame. Raises BadInputError if the file cannot be decoded.
+        If `time_s` lies before the time of the last frame, the video is opened again. This happens at the first frame
+        of a run that was rehearsed. Raises BadInputError if the file cannot be decoded.
         """
         if time_s + ROUNDING_S < self._shown_s:
             self.close()
@@ -257,8 +266,8 @@ def quarters_of(frame: Any) -> int:
 def is_mirrored(frame: Any) -> bool:
     """Return whether the file says to mirror `frame` top to bottom before it is turned, as files of selfies do.
 
-    FFmpeg computes the angle from the direction of x (`av_display_rotation_get`). What then remains of a mirror image
-    is a reversed y.
+    FFmpeg computes the angle from the direction of x (`av_display_rotation_get`). After this turn, a mirror image
+    differs only by a reversed y.
     """
     for side in frame.side_data:
         if side.type == Type.DISPLAYMATRIX:
