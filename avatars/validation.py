@@ -195,8 +195,8 @@ class SizeLoss:
     def at(self, work: int) -> float | None:
         """Return the loss in dB of a tensor with `work` thousandths of the largest tensor's pixels.
 
-        It is 0 for the full size, else the loss at the largest measured size that is not larger. Return None if there
-        is no such size.
+        Return 0 for the full size, else the loss at the next smaller size that was measured; None if no smaller size
+        was measured.
         """
         if work >= WHOLE and self.by_work:
             return 0.0

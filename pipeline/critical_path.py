@@ -3,8 +3,8 @@
 Rule: a job begins when the last of its conditions is met. The conditions are its input, its unit, a free slot, a free
 place among the frames in flight, and its frame's release. If a job has several inputs, the last input counts. The path
 goes on with the job whose end met the last condition. The time between these two jobs belongs to neither: it is
-overhead, a cap or a restart. Therefore the pieces of a path follow each other without gaps, and add up to the time from
-the path's begin to its end.
+overhead, throttling or a restart. Therefore the pieces of a path follow each other without gaps, and add up to the time
+from the path's begin to its end.
 
 The job that met the last condition is known, not guessed. If a job was handed over while its unit did another job, it
 waited for that job. Any other job waited for a job whose end the scheduler heard of in the step that handed it over.

@@ -128,8 +128,9 @@ class StageInput(Described):
 
 
 class PipelineStage(Described):
-    """One stage.
+    """One stage of a pipeline.
 
+    `name`, `unit`: names of the stage, and of the unit that runs it.
     `factory`: `module:name` of a `trilane.pipeline.stage.StageFactory`, importable in the unit's process.
     `settings`: JSON values that are handed to the factory.
     `pace_ns`: least time of a job in ns; a shorter job is made longer by a wait at its end. 0: none.
@@ -386,9 +387,11 @@ def unsaid(pipeline: Pipeline) -> Iterator[str]:
 
 
 def file_text(tables: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
-    """Return the tables as TOML, with a line for each key; a stage is one key. `comments`: lines before the tables.
+    """Return the text of a pipeline file, TOML with one line for each key of a table.
 
-    Names of stages and units need no quotes as keys.
+    A stage is one key of the table [stages]. Keys are written without quotes, which names of stages and units allow.
+
+    `tables`: tables of the file, such as from `tables_of`. `comments`: lines before the tables.
     """
     lines = [f"# {each}" for each in comments]
     for name, table in tables.items():

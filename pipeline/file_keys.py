@@ -266,7 +266,7 @@ def _inside(text: str) -> str:
 
 
 def _mp4(text: str) -> str:
-    """Return the path `text`. Raise UnexpectedValue unless it is an .mp4.
+    """Return the path `text`. Raise UnexpectedValue if it does not end with .mp4.
 
     Without this rule, a run could replace code or a network in the folder.
     """

@@ -56,7 +56,7 @@ def text(value: Any) -> str:
 
 
 def numbers(value: Any) -> Mapping[str, float]:
-    """Return finite numbers by name."""
+    """Return `value`, which must be a map from names to finite numbers."""
     if type(value) is not dict:
         raise UnexpectedValue(shown(value), "numbers by name")
     if not (set(map(type, value)) <= {str} and set(map(type, value.values())) <= NUMBERS):
@@ -67,7 +67,7 @@ def numbers(value: Any) -> Mapping[str, float]:
 
 
 def counts(value: Any) -> Mapping[str, int]:
-    """Return whole numbers by name, each at least 0."""
+    """Return `value`, which must be a map from names to whole numbers of at least 0."""
     found: Any = numbers(value)
     if any(type(each) is not int or each < 0 for each in found.values()):
         raise UnexpectedValue(shown(value), "whole numbers from 0 on, by name")

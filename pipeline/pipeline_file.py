@@ -116,7 +116,7 @@ class PipelineFile:
     def periods(self) -> dict[str, int]:
         """The distance, in frames, between the frames that each stage takes, by the stage's name.
 
-        The stage's own `every` and those of the stages before it decide.
+        It is the least common multiple of `every` of the stage and of the stages before it.
         """
         found: dict[str, int] = {}
         for name, stage in self.stages.items():
@@ -169,7 +169,7 @@ def read_pipeline(path: Path) -> PipelineFile:
 
 
 def tables_of(path: Path) -> dict[str, Any]:
-    """Return the tables of a pipeline file, not checked yet. Raises BadInputError."""
+    """Return the tables of a pipeline file by name, not checked yet. Raises BadInputError if it is no TOML."""
     data = read_bytes(path, MOST_BYTES, FORM, IF_EMPTY)
     try:
         return tomllib.loads(data.decode("utf-8-sig"))
@@ -304,7 +304,10 @@ def _meaning(model: type[Keys], key: str) -> str:
 
 
 def _stage(name: str, values: object, path: Path) -> StageKeys:
-    """Check the table of one stage, and return the stage as an instance of its kind. Raises BadInputError."""
+    """Check the table of one stage, and return the stage as an instance of its kind. Raises BadInputError.
+
+    `name`: name of the stage. `values`: its table, not checked yet. `path`: path of the file.
+    """
     where = f"{path}: stages.{name}"
     if not isinstance(values, dict):
         expected = "a table with a unit and one of onnx, python, block, time_ms"

@@ -175,10 +175,10 @@ class ClockGovernor(Protocol):
     due_ns: int
 
     def begin(self, now_ns: int) -> list[SetDuty]:
-        """Return the duties at the start of the run."""
+        """Return an event for the duty of each unit at the start of the run."""
 
     def tick(self, now_ns: int, busy_ns: dict[str, int]) -> list[SetDuty]:
-        """Return the duties that change now. `busy_ns`: busy time of each unit in ns since the run began."""
+        """Return an event for each duty that changes now. `busy_ns`: busy time of each unit in ns since the start."""
 
 
 class RealtimeClock:
@@ -363,7 +363,7 @@ class RealtimeClock:
         return [Pinged(unit) for unit in units]
 
     def _tell_stopped(self, now_ns: int) -> None:
-        """Note units that a signal has stopped; when such a unit runs again, log how long it was stopped."""
+        """Note units that a signal has stopped. When a stopped unit runs again, log how long it was stopped."""
         stopped = self._processes.stopped
         for unit in stopped - self._stopped_ns.keys():
             self._stopped_ns[unit] = now_ns

@@ -51,7 +51,8 @@ class Chain:
     """Sends single frames through the stages of `graph`, which must be a chain.
 
     `processes`: for each unit, the `UnitProcesses` with the unit's process, which must be ready and have no job.
-    `whole`: whether the last stage takes part.
+    `interrupts`: signals, which end the wait for an answer.
+    `whole`: whether the last stage, which may write files, takes part.
     """
 
     def __init__(
@@ -291,7 +292,7 @@ def _started(group: Group, assets: Assets, starter: UnitStarter, interrupts: Int
 
 
 class _Live:
-    """A group whose processes run."""
+    """A `Group` together with its running processes."""
 
     def __init__(self, group: Group, processes: _Replaying, interrupts: Interrupts) -> None:
         self._group, self._processes, self._interrupts = group, processes, interrupts

@@ -136,11 +136,14 @@ class RunLog:
             hear(text)
 
     def fail(self, text: str, exit_code: int = 1) -> None:
-        """Note a failure of the run, unless one is noted already. `exit_code`: exit code of the program after it."""
+        """Note the first failure of the run; do nothing for later failures.
+
+        `text`: reason as one sentence. `exit_code`: exit code of the program after this failure.
+        """
         self.failure = self.failure or Failure(text, exit_code)
 
     def fail_with(self, message: Failed) -> None:
-        """Note a stage's error as failure and as message, unless a failure is noted already."""
+        """If it is the first failure of the run, note a stage's error as failure and as message."""
         if self.failure is None:
             self.fail(message.message, message.exit_code)
             self.say(message.message)

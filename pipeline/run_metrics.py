@@ -22,7 +22,7 @@ class Record(Model):
     """Base class of everything that is written to report.json."""
 
     def as_json(self) -> dict[str, Any]:
-        """Return the keys that were set, as JSON values, in the order of the fields."""
+        """Return the fields that were set, by their keys in report.json, as JSON values in the order of the fields."""
         return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
 
     @model_validator(mode="before")
@@ -86,7 +86,7 @@ class TimeSummary(Record):
     @model_validator(mode="before")
     @classmethod
     def _know_nothing_of_no_times(cls, document: Any) -> Any:
-        """Replace the zeros of a summary without times by null; older reports have such zeros too."""
+        """Replace the zeros of a summary without times by null. Ledgers and older reports have these zeros."""
         if not isinstance(document, dict) or document.get("samples") != 0:
             return document
         return {key: value if key == "samples" else None for key, value in document.items()}
@@ -236,11 +236,11 @@ class CoreShare(Record):
 
 
 class UnitCap(Record):
-    """The cap of one unit.
+    """The cap of one unit: the corner, and so the share of the time, that the governor allowed it.
 
     `corner`: corner at the run's end.
-    `duty`: allowed share of the time at the run's end.
-    `duty_mean`: mean allowed share over the run.
+    `duty`: duty at the run's end, 0 to 1.
+    `duty_mean`: mean duty over the run, 0 to 1.
     """
 
     corner: str
@@ -249,7 +249,7 @@ class UnitCap(Record):
 
 
 class Caps(Record):
-    """The caps of the units. All fields except `how` are present only if a performance profile was requested.
+    """The caps of the units (`UnitCap`). All fields but `how` are present only if a performance profile was requested.
 
     `how`: meaning of a cap on this clock, or a note that there was none.
     `profile`: name of the hardware profile whose corners and limits were used.
@@ -446,7 +446,7 @@ class PolicyMetrics(Record):
     @field_validator("fps")
     @classmethod
     def _know_no_rate_of_one_frame(cls, fps: float | None, known: ValidationInfo) -> float | None:
-        """Replace the 0 of a run that presented fewer than two frames by null; older reports have such a 0 too."""
+        """Replace the rate 0, as ledgers and older reports have it, by null if fewer than two frames were presented."""
         frames = known.data.get("frames")
         return fps if frames is None or frames.presented > 1 else None
 

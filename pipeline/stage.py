@@ -255,7 +255,7 @@ class PortedStage:
         return min((int(header["t_sampled_ns"]) for header in taken), default=0)
 
     def bind(self, inputs: Sequence[Any], outputs: Sequence[Packet]) -> None:
-        """Make the views of all slots, then call `ready`."""
+        """Make the arrays of all slots, and then call `ready`. `inputs`, `outputs`: slots, as for `Stage.bind`."""
         streams: Sequence[Sequence[Packet]] = inputs if self.settings.joins else [inputs] if inputs else []
         self._inputs = [
             [self._views(place, packet, ports) for place, packet in enumerate(packets)]

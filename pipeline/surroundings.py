@@ -57,7 +57,10 @@ def check_cores(pipeline: Pipeline) -> None:
 
 
 def check_positive(**values: float | None) -> None:
-    """Raise BadInputError unless each value is None, or finite and above 0. The names are those in the message."""
+    """Raise BadInputError for the first value that is 0 or less, or is not finite; None is allowed.
+
+    `values`: values by the name that the message gives them.
+    """
     for name, value in values.items():
         if value is not None and not 0 < value < math.inf:
             raise BadInputError(name, str(value), "more than 0")

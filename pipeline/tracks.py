@@ -89,7 +89,7 @@ class Track(Protocol):
     def late(self, unit: str) -> list[str]:
         """Return the names of the stages whose output the unit lacks for the oldest frame that has only some inputs.
 
-        If the unit waits for no such frame, the list is empty.
+        If each frame before the unit has all inputs or none, the list is empty.
         """
 
 

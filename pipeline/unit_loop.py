@@ -87,7 +87,7 @@ class UnitSpec(Model):
         return [*self.job_pipe, self.assets_fd, *(edge.fd for edge in self.edges.values())]
 
     def renumbered(self, number_of: Mapping[int, int]) -> UnitSpec:
-        """Return the same spec, with descriptor n replaced by `number_of[n]`."""
+        """Return this spec with every descriptor n replaced by `number_of[n]`."""
         edges = {name: edge.model_copy(update={"fd": number_of[edge.fd]}) for name, edge in self.edges.items()}
         return self.model_copy(
             update={
@@ -325,7 +325,7 @@ def _threads() -> set[int]:
 
 
 def build_stages(spec: UnitSpec) -> list[BoundStage]:
-    """Return the unit's stages, bound to their slots, in the order of `spec.stages`. Raises what a factory raises."""
+    """Return the unit's stages, bound to their slots, in the order of `spec.stages`. Raises any error of a factory."""
     sys.path[:0] = map(str, spec.module_folders)
     unit = UnitContext(spec.unit, spec.settings, map_assets(spec.assets_fd))
     stages = [factory_named(stage.factory)(stage.settings, unit) for stage in spec.stages]

@@ -310,7 +310,7 @@ class Core:
             self.source.start(self.now_ns)
 
     def _on_died(self, event: UnitDied) -> None:
-        """Plan the restart and reclaim the slots, or end the run when the unit fails too often."""
+        """Plan the unit's restart and reclaim its slots; if the unit has failed too often, end the run."""
         unit = self.units[event.unit]
         # Only a unit that passed its deadline is stopping.
         loss = Loss(LossKind.HUNG if unit.life == STOPPING else LossKind.DIED, unit.name)
@@ -420,7 +420,7 @@ class Recorder(Protocol):
 def run_loop(core: Core, clock: Clock, recording: Recorder | None = None) -> Outcome:
     """Run `core` until it finishes, add every step to `recording`, and return how the run ended.
 
-    Raises what `clock` raises, KeyError and UnitLifeError (see Core.step).
+    Raises any error of `clock`, and the errors of `Core.step`.
     """
     wait, perform = clock.wait, clock.perform  # looked up once: they are called for every step
     deadline_ns: int = NEVER

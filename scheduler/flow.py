@@ -250,7 +250,7 @@ class Flow:
         return self._is_awaited(behind, state) and bool(state.begun & self.main & ~(behind.before | behind.bit))
 
     def _is_awaited(self, behind: StageState, state: FrameState) -> bool:
-        """Return whether a reader of the stage has yet to begin the frame. Readers that are side work do not count."""
+        """Return whether a reader of the stage `behind` has yet to begin a frame. Readers of side work do not count."""
         waiting = state.todo & ~state.begun & self.main
         return any(waiting & reader.bit for reader in behind.readers)
 
@@ -314,7 +314,7 @@ class Flow:
             self.drop(replaced, stage, DropCause.STALE)
 
     def _present(self, frame: int, state: FrameState, end_ns: int) -> None:
-        """Note that a stage without readers has done the frame. The last such stage presents the frame."""
+        """Note that a stage without readers has done the frame. The last of these stages presents the frame."""
         if state.todo & self._ends:
             return
         state.is_presented = True

@@ -109,7 +109,10 @@ class _UnitBook:
                 self.busy_ns -= min(preempted_ns + asleep_ns, ran_ns)
 
     def shares(self, joins: bool) -> dict[str, Any]:
-        """Return the unit's row of the report. `joins`: whether one of its stages has several inputs."""
+        """Return the keys `busy`, `idle`, `jobs`, `restarts` of the unit in report.json, with their values.
+
+        `joins`: whether one of its stages has several inputs, so that `idle` has the cause `join`.
+        """
         total = sum(self.totals) or 1
         assigned, starved, blocked, throttled, join = self.totals
         idle = {
@@ -214,13 +217,13 @@ class Ledger:
         self._units[job.unit].add_job(begin_ns, end_ns, preempted_ns, asleep_ns, preempted_before_ns)
 
     def lose(self, frame: int, release_ns: int, loss: Loss) -> None:
-        """Book a lost frame."""
+        """Book the loss of a frame. `release_ns`: time of its release. `loss`: reason."""
         self.lost[loss] += 1
         if self.left is not None:
             self.left.append(FrameLeft(frame, release_ns, str(loss)))
 
     def drop(self, frame: int, release_ns: int, drop: Drop) -> None:
-        """Book a dropped frame."""
+        """Book the drop of a frame. `release_ns`: time of its release. `drop`: reason."""
         self.dropped[drop] += 1
         if self.left is not None:
             self.left.append(FrameLeft(frame, release_ns, str(drop)))

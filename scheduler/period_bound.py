@@ -199,7 +199,7 @@ def _bound(
 
 
 def _of_units(waits: _Waits, shares: Mapping[str, Fraction]) -> Iterator[PeriodBound]:
-    """Yield for each unit the bound that its work for one frame sets."""
+    """Yield, for each unit, the bound that follows from its work for one frame. `shares`: as in `period_bound`."""
     for unit in waits.graph.units:
         names = tuple(stage.name for stage in waits.graph.stages if stage.unit == unit)
         each = {name: shares.get(name, 1) * Fraction(waits.times_ns[name], waits.periods[name]) for name in names}

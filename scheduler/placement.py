@@ -250,7 +250,10 @@ class Rules(NamedTuple):
 
 
 def frame_ns(placement: Placement, cores: Sequence[CpuCore], times: Times, rules: Rules) -> int:
-    """Return the predicted frame time in ns."""
+    """Return the predicted frame time of `placement` in ns.
+
+    `cores`: cores of the run. `times`: work of each unit. `rules`: properties of the run.
+    """
     model = _Model(placement, cores, times, rules)
     return model.sum_ns() if rules.sequential else model.pipelined_ns()
 

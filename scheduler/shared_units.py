@@ -55,7 +55,7 @@ class Waiting(NamedTuple):
 
 
 def _in_turn(waiting: Sequence[Waiting]) -> Waiting:
-    """Choose the job of the next pipeline in turn, so that each waiting pipeline gets one job after the other."""
+    """Choose the job of the next pipeline in turn, so that waiting pipelines get one job each, one after another."""
     return min(waiting, key=lambda job: (job.behind, job.order))
 
 

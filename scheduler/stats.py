@@ -220,7 +220,7 @@ class Samples:
             self._sketch = self._make_sketch()
 
     def summary_ms(self) -> dict[str, float]:
-        """Return the keys of the function `summary_ms` for all values."""
+        """Return the summary of all values, with the keys of the function `summary_ms`."""
         sketch = self._sketch
         if sketch is None:
             ordered = sorted(self.kept)

@@ -355,7 +355,7 @@ class SharedCores:
             self._set_rates()
 
     def _step(self, now_ns: int, events: tuple[Event, ...]) -> None:
-        """Take a step of the core, and begin the jobs that it hands over."""
+        """Take a step of the core at `now_ns` with `events`, and begin the jobs that it hands over."""
         actions, self._deadline_ns = self._core.step(now_ns, events)
         is_changed = False
         for action in actions:

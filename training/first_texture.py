@@ -149,7 +149,10 @@ def eigenfunctions(vertices: F64, faces: Ints, count: int) -> F64:
 
 
 def cotangent_laplacian(vertices: F64, faces: Ints) -> tuple[Any, F64]:
-    """Return (sparse cotangent Laplacian (V,V) of a mesh, area (V,) that belongs to each vertex)."""
+    """Return (sparse cotangent Laplacian (V,V) of a mesh, area (V,) that belongs to each vertex).
+
+    `vertices`: (V,3). `faces`: (F,3) indices of vertices.
+    """
     count = len(vertices)
     rows, columns, values = [], [], []
     mass = np.zeros(count)

@@ -45,9 +45,9 @@ CHUNK = 4000
 class Pairs:
     """P pairs of points: a point of the whole mesh, and the point of the level that shows the same texel.
 
-    `corners`: indices (P,5) of corners. The first two span the point of the whole mesh, the last three the point of the
-    level.
-    `shares`: (P,5), barycentric weight of each corner: negative in the whole mesh's point, positive in the level's.
+    `corners`: indices (P,5) of corners. The point of the whole mesh lies between the first two, the point of the level
+    between the last three.
+    `shares`: (P,5), barycentric weight of each corner in its point: negated for the first two corners.
     `uv_error`: as in `MeshLevel`.
     """
 

@@ -160,7 +160,7 @@ def instead_of_file(path: Path) -> str:
 
 
 def read_text(path: Path, expected: str) -> str:
-    """Return the file as text. Raises BadInputError when it is missing, empty, over 256 MiB, not UTF-8 or not text."""
+    """Return the text of the file. Raises BadInputError if it is missing, empty, over 256 MiB, or no text in UTF-8."""
     size = require_file(path, expected)
     if size > MAX_TEXT_BYTES:
         raise BadInputError(path, f"{size} bytes", f"at most {MAX_TEXT_BYTES}")

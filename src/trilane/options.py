@@ -178,7 +178,7 @@ class Options(BaseModel):
         return self.checked({**dict(self), **values})
 
     def as_json(self) -> dict[str, Any]:
-        """Return the value of every option as JSON, by field name. The report holds these values."""
+        """Return the value of every option as a JSON value, by field name, as the report contains them."""
         return {name: _as_json(value) for name, value in self}
 
 

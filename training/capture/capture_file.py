@@ -247,7 +247,7 @@ class PictureFolder:
         self.folder, self.names, self._kind = folder, names, kind
 
     def read(self, number: int) -> U8:
-        """Return picture `number`, see `Pictures.read`."""
+        """Return picture `number`, as `Pictures.read` describes."""
         modes, expected, remedy, _ = STORED[self._kind]
         try:
             with Image.open(self.folder / self.names[number]) as image:

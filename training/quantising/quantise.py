@@ -245,7 +245,10 @@ def equalised(model: onnx.ModelProto) -> onnx.ModelProto:
 def _pairs(
     graph: onnx.GraphProto, weights: dict[str, onnx.TensorProto]
 ) -> Iterator[tuple[onnx.NodeProto, onnx.NodeProto]]:
-    """Yield pairs of Convs of one group, the second after the first, with only a ReLU between them."""
+    """Yield pairs (Conv, next Conv) with only a ReLU between them; grouped Convs are left out.
+
+    `weights`: constants of `graph`, by name.
+    """
     users: dict[str, list[onnx.NodeProto]] = {}
     for node in graph.node:
         for name in node.input:
