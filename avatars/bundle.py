@@ -41,7 +41,7 @@ CLOTHES_STANDOFF_M = 0.045
 
 @dataclass(frozen=True)
 class Bundle:
-    """A bundle whose manifest is valid and whose files exist inside `folder`."""
+    """A bundle whose manifest is valid, and whose files exist inside `folder`."""
 
     folder: Path
     manifest: Manifest
@@ -74,7 +74,9 @@ class Bundle:
         return self.read_body().shape(self.manifest.betas, self.manifest.expression)
 
     def read_mesh_levels(self, shaped: ShapedBody) -> tuple[MeshLevel, ...]:
-        """Return the levels of the mesh of `shaped`, finest first; none if the bundle has no file of levels.
+        """Return the coarser levels of the mesh, finest first; empty if the bundle has no file of levels.
+
+        `shaped`: body of this bundle, from `shaped_body`.
 
         Raises BadInputError.
         """
@@ -82,7 +84,7 @@ class Bundle:
         return () if file is None else read_mesh_levels(self.folder / file, shaped)
 
     def read_texture(self) -> NDArray[np.float32]:
-        """Return the neural texture, (H, W, C) float32, row 0 at v = 0. Raises BadInputError."""
+        """Return the neural texture (H, W, C) float32, with row 0 at v = 0. Raises BadInputError."""
         return read_texture(self.texture_path, self.manifest.network.channels)
 
     def read_levels(self) -> NDArray[np.float32] | None:
@@ -97,7 +99,7 @@ class Bundle:
         return _decoded(arrays["levels"], arrays.get("scale"), self.texture_path)
 
     def read_network(self) -> NetworkFile:
-        """Return the checked network. Raises BadInputError, also for a network that contradicts the manifest."""
+        """Return the checked network. Raises BadInputError, also if the network contradicts the manifest."""
         network = read_network(self.network_path)
         entry = self.manifest.network
         if network.channels != entry.channels:
@@ -108,9 +110,11 @@ class Bundle:
 
 
 def read_texture(path: Path, channels: int) -> NDArray[np.float32]:
-    """Return the neural texture (H, W, `channels`) float32 in a bundle's file, row 0 at v = 0. Raises BadInputError.
+    """Return the neural texture (H, W, `channels`) float32 in the file `path`, with row 0 at v = 0.
 
     `channels`: number of channels that the texture must have.
+
+    Raises BadInputError.
     """
     arrays = read_npz(path, TEXTURE_KEYS, "a neural texture")
     if "texture" not in arrays:
@@ -119,12 +123,12 @@ def read_texture(path: Path, channels: int) -> NDArray[np.float32]:
 
 
 def bundle_folder(name: str | Path) -> Path:
-    """Return the folder of the bundle `name`: a name of `BUILT_IN` means a folder of the package, any other a path."""
+    """Return the folder of a bundle. `name`: a name of `BUILT_IN`, for a folder of the package, or else a path."""
     return Path(__file__).parent / name if str(name) in BUILT_IN else Path(name)
 
 
 def load_bundle(name: str | Path) -> Bundle:
-    """Return the bundle `name`, as in `bundle_folder`. Raises BadInputError that names file and key."""
+    """Return a bundle. `name`: as for `bundle_folder`. Raises BadInputError, which names file and key."""
     folder = bundle_folder(name)
     path = folder / MANIFEST
     if not folder.exists():
@@ -163,20 +167,22 @@ def write_bundle(
     levels: NDArray[Any] | None = None,
     mesh_levels: Sequence[MeshLevel] = (),
 ) -> None:
-    """Write a bundle beside `folder`, read it back, then put its files in `folder`.
+    """Write a bundle to a temporary folder, read it back as a check, then move its files into `folder`.
 
-    If the manifest's validation is of other files than these, it is left out.
+    If the validation in `manifest` was made with other files than these, it is left out.
 
     `folder`: folder of the bundle; made when it does not exist.
-    `manifest`: manifest to write; this function adds the names of the files of `offsets` and `mesh_levels`.
-    `body`: .npz file to copy.
+    `manifest`: manifest to write; this function adds the file names of `offsets` and `mesh_levels`.
+    `body`: .npz file of the body, which is copied.
     `texture`: (H, W, C) float16, or int8 with `scale`.
     `network`: network to write.
     `scale`: scale of each channel of an int8 texture, (C,) float32; None for a float16 texture.
     `offsets`: offsets of the body's vertices at rest, (V,3) metres; None for a body that is drawn bare.
-    `levels`: smaller levels of the texture, packed by `pack_levels`, with the dtype of the texture; None for none.
-    `mesh_levels`: levels of the mesh of this body with the `offsets` and the manifest's shape.
-    Raises BadInputError when the parts do not fit together; then nothing is written.
+    `levels`: smaller levels of the texture, packed by `pack_levels`, with the dtype of the texture; None: there are
+    none.
+    `mesh_levels`: coarser levels of the mesh, made for this body with these `offsets` and the manifest's shape.
+
+    Raises BadInputError if the parts do not fit together; then nothing is written.
     """
     with write_folder(folder) as draft:
         shutil.copyfile(body, draft / manifest.body)
@@ -218,7 +224,7 @@ def write_manifest(folder: Path, manifest: Manifest) -> None:
 
 
 def require_writable_manifest(folder: Path) -> None:
-    """Raise BadInputError, before long work, when `write_manifest` cannot write the manifest in `folder`."""
+    """Raise BadInputError if `write_manifest` cannot write the manifest in `folder`; called before long work."""
     require_writable(_manifest_file(folder))
 
 
@@ -231,7 +237,7 @@ def _content(manifest: Manifest) -> bytes:
 
 
 def _with_own_validation(manifest: Manifest, folder: Path) -> Manifest:
-    """Return `manifest`, without its validation if that is not of the files in `folder`."""
+    """Return `manifest`; its validation is left out if it was made with other files than those in `folder`."""
     validation = manifest.validation
     own = validation is not None and validation.digests == digests_of(folder, manifest)
     return manifest if own else manifest.model_copy(update={"validation": None})
@@ -283,27 +289,30 @@ def _check_scale(scale: Any, path: Path, channels: int) -> NDArray[np.float32]:
     return factor
 
 
-# Smaller levels of a neural texture (H, W, C), learnt together with it. They are sampled where texels are smaller than
-# pixels.
+# Smaller levels of a neural texture (H, W, C) are learnt together with the texture. They are sampled where texels are
+# smaller than pixels.
 #
-# Rule: the levels are stored side by side in one array (H/2, W/2 + W/4 + ..., C), each at the top. An avatar thus has
-# only one more array, and the width of that array tells the number of levels.
+# Rule: the levels are stored side by side in one array (H/2, W/2 + W/4 + ..., C), each from row 0 on. Therefore all
+# levels need only one array, and the width of this array tells the number of levels.
 
 #: The fifth level of a usual texture of 512x512 has 16 texels along a side. A sixth would have too few for a body.
 MOST_LEVELS = 5
 
 
 def pack_levels(levels: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return one array of `levels` (H/2,W/2,C), (H/4,W/4,C), ..., side by side; at least one level."""
+    """Return the levels side by side in one array (H/2, W/2 + W/4 + ..., C).
+
+    `levels`: at least one level, (H/2,W/2,C), (H/4,W/4,C), ...
+    """
     height = levels[0].shape[0]
     rows = [np.pad(level, ((0, height - level.shape[0]), (0, 0), (0, 0))) for level in levels]
     return np.concatenate(rows, axis=1)
 
 
 def split_levels(packed: NDArray[Any] | None, width: int) -> list[NDArray[Any]]:
-    """Return the levels in `packed`, largest first; none if `packed` is None.
+    """Return the levels in `packed`, largest first; an empty list if `packed` is None.
 
-    `packed`: array of `pack_levels`, or None.
+    `packed`: array from `pack_levels`, or None.
     `width`: width of the whole texture in texels.
     """
     levels: list[NDArray[Any]] = []
@@ -317,9 +326,10 @@ def split_levels(packed: NDArray[Any] | None, width: int) -> list[NDArray[Any]]:
 
 
 def check_levels(packed: NDArray[Any], texture: NDArray[Any], where: object) -> None:
-    """Raise BadInputError unless `packed` has levels of `texture` (H,W,C), with the same dtype.
+    """Raise BadInputError if `packed` cannot have the levels of `texture` (H,W,C): wrong shape, or another dtype.
 
-    `where`: file to name in the error.
+    `packed`: array from `pack_levels`.
+    `where`: file that the error names.
     """
     height, width, channels = texture.shape
     widths = [sum(width >> (k + 1) for k in range(count)) for count in range(1, MOST_LEVELS + 1)]
@@ -344,19 +354,19 @@ LONGEST_M = 0.5
 
 
 def as_kept(offsets: F32) -> F32:
-    """Return `offsets` (V,3) rounded as a file stores them."""
+    """Return `offsets` (V,3), in metres, rounded as a file stores them."""
     return offsets.astype(np.float16).astype(np.float32)
 
 
 def save_offsets(file: Path | BinaryIO, offsets: F32) -> None:
-    """Write `offsets` (V,3), metres, to an .npz file."""
+    """Write `offsets` (V,3), in metres, to an .npz file."""
     np.savez_compressed(file, offsets=offsets.astype(np.float16))
 
 
 def read_offsets(path: Path, vertices: int) -> F32:
-    """Return the offsets (V,3), metres, in an .npz file. Raises BadInputError.
+    """Return the offsets (V,3), in metres, in an .npz file. Raises BadInputError.
 
-    `vertices`: number V of vertices that the body has.
+    `vertices`: number V of the body's vertices.
     """
     array = read_npz(path, (OFFSETS_KEY,), OFFSETS_EXPECTED).get(OFFSETS_KEY)
     if array is None:

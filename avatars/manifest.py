@@ -27,8 +27,8 @@ from trilane.errors import BadInputError
 
 #: Value of `weights` in `provenance` for a network that nobody trained.
 UNTRAINED = "untrained: for speed alone"
-#: Value of `body` in `provenance` if the person is known from frames alone: no ground truth of other poses or views can
-#: be drawn.
+#: Value of `body` in `provenance` if the person is known only from frames, so that no ground truth of other poses or
+#: views can be drawn.
 CAPTURED = "that of a capture"
 
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -66,8 +66,10 @@ class ByteRange(_Model):
 class NetworkEntry(_Model):
     """The network file and the network in it.
 
-    `encoder`, `norm`: names, as `trilane avatar network` takes them. `width`: channels of the first layers; 64 is the
-    full network. `channels`: channels of the neural texture.
+    `file`: name of the network's file in the bundle.
+    `encoder`, `norm`: names of the encoder and of the normalisation, as `trilane avatar network` takes them.
+    `width`: channels of the first layers; 64 is the full network.
+    `channels`: channels of the neural texture.
     `input`, `output`: scale and zero point of the network's input and output bytes.
     """
 
@@ -81,10 +83,10 @@ class NetworkEntry(_Model):
 
 
 class Digests(_Model):
-    """SHA-256, hexadecimal, of everything that an avatar's pictures depend on.
+    """SHA-256, hexadecimal, of everything on which an avatar's pictures depend.
 
-    `body`, `texture`, `network`: digests of these files' bytes; offsets count as part of the body. Levels of the mesh
-    do not count, because their files name the body, and a validation draws the whole mesh.
+    `body`, `texture`, `network`: digests of the bytes of these files; offsets count as part of the body. Levels of the
+    mesh have no digest, because their file identifies the body, and a validation draws the whole mesh.
     `constants`: digest of the manifest's numbers: shape, expression, and the scales and zero points of the network's
     bytes.
     """
@@ -96,10 +98,13 @@ class Digests(_Model):
 
 
 class WorstView(_Model):
-    """The view of the least PSNR, with the numbers that identify the view.
+    """The view with the least PSNR, and the numbers that identify the view.
 
+    `seed`: seed from which the view was drawn.
     `number`: number of the view among the views of `seed`.
-    `psnr_db`, `body_psnr_db`: PSNR of this view in dB, as in `training/image_error.py`.
+    `band`: how much of the person the view shows.
+    `psnr_db`, `body_psnr_db`: PSNR of this view in dB, in the bounding box and on the body
+    (`training/image_error.py`).
     """
 
     seed: int
@@ -120,9 +125,11 @@ class SeedFigures(_Model):
 class AccuracyFigures(_Figures):
     """Image error of one network on one runtime, on poses and views that were not trained on.
 
-    `psnr_db_by_band`: mean PSNR in dB, in front of random backgrounds, inside the bounding box of the true mask.
-    `see_through`: share of the pixels inside the person whose alpha is less than 0.9. `iou`, `ssim`: means.
-    The other keys are those of `summary` in `training/image_error.py`; a key that nobody measured is None and not
+    `psnr_db_by_band`: mean PSNR in dB, by band, in front of random backgrounds, in the bounding box of the true mask.
+    `see_through`: share of the pixels inside the person whose alpha is less than 0.9.
+    `iou`, `ssim`: means over the views, of the masks and of the pictures.
+
+    All further keys are those of `summary` in `training/image_error.py`. A key that was not measured is None and not
     written. If `psnr_db_by_background` is None, an older Trilane measured the figures in front of a single grey.
     """
 
@@ -158,9 +165,10 @@ class AccuracyFigures(_Figures):
 class MadeWith(_Model):
     """The software that measured the figures.
 
-    `trilane`: version of Trilane. `revision`, `modified`: commit of its checkout in git, and whether files differ from
-    that commit. These three are None if unknown. `renderer`: name of OpenGL's renderer. `runtimes`: name and version of
-    each runtime's library, by the runtime's name.
+    `trilane`: version of Trilane; None if it is not known.
+    `revision`, `modified`: commit of Trilane's checkout in git, and whether files differ from it; None if not known.
+    `renderer`: name of OpenGL's renderer.
+    `runtimes`: name and version of each runtime's library, by the runtime's name.
     """
 
     trilane: str | None
@@ -205,20 +213,20 @@ class BySize(_Figures):
         return self
 
 
-#: Figures that a validation repeats at its top level; they are those of its `runtime`.
+#: Keys of the figures that a validation repeats at its top level; they are the figures of its `runtime`.
 AT_THE_TOP = ("psnr_db_by_band", "psnr_db_by_background", "see_through", "iou", "ssim")
 
 
 class Validation(AccuracyFigures):
     """The figures of an avatar, and the material on which they were measured.
 
-    `date`: day of the validation, UTC. `date`, `digests`, `figures_digest` and `made_with` are None in a manifest that
-    an older Trilane wrote.
+    The first four keys are None in a manifest that an older Trilane wrote.
+
+    `date`: day of the validation in UTC.
     `digests`: digests of the validated files.
     `figures_digest`: digest of all other keys here, by the function `figures_digest`.
     `made_with`: software that measured the figures.
     `runtime`: runtime of the figures in `integer`. The keys of `AT_THE_TOP` repeat these figures.
-    `other_runtimes`: figures of more runtimes, by name.
     `size`: tensor size, as `trilane run --size` takes it.
     `texture_filter`: filter of the neural texture.
     `by_size`: image error by tensor size; None if it was not measured.
@@ -249,7 +257,8 @@ class Manifest(_Model):
 
     `offsets`: file of the offsets of the body's vertices; None if the body is drawn bare.
     `mesh_levels`: file of the levels of the mesh; None if the whole mesh is drawn at every distance.
-    `betas`, `expression`: coefficients of shape and of expression.
+    `betas`, `expression`: coefficients of shape and of expression, in standard deviations.
+    `provenance`: how the avatar was made, such as `weights` (UNTRAINED) and `body` (CAPTURED).
     """
 
     schema_version: Literal[1] = 1
@@ -268,7 +277,10 @@ class Manifest(_Model):
 
 
 def network_entry(network: NetworkFile, encoder: str, norm: str, width: int) -> NetworkEntry:
-    """Return the manifest's entry for a quantised network in the file `network.onnx`. See `NetworkEntry`."""
+    """Return the manifest's entry for a quantised network in the file `network.onnx`.
+
+    `encoder`, `norm`, `width`: as in `NetworkEntry`.
+    """
     ends = [ByteRange(scale=end.scale, zero_point=end.zero_point) for end in (network.input, network.output)]
     return NetworkEntry(
         file="network.onnx",
@@ -282,7 +294,7 @@ def network_entry(network: NetworkFile, encoder: str, norm: str, width: int) -> 
 
 
 def parse_manifest(text: str, path: Path) -> Manifest:
-    """Return the manifest in JSON `text`, which was read from `path`. Raises BadInputError naming file and key."""
+    """Return the manifest from its JSON `text`. Raises BadInputError, which names the file `path` and the key."""
     try:
         return Manifest.model_validate_json(text)
     except ValidationError as error:
@@ -298,15 +310,18 @@ def _short(value: object) -> str:
     return text if len(text) <= 60 else text[:57] + "..."
 
 
-# Digests of everything that an avatar's pictures depend on: the bytes of its files and the numbers of its manifest.
+# Digests of everything on which an avatar's pictures depend: the bytes of its files and the numbers of its manifest.
 #
-# Rule: a byte that may change a picture changes a digest. Names, provenance and other texts do not.
+# Rule: a byte that may change a picture changes a digest. Names, provenance and other texts change no digest.
 
 BLOCK = 1 << 20
 
 
 def digests_of(folder: Path, manifest: Manifest) -> Digests:
-    """Return the digests of the files in `folder` that `manifest` names. Raises BadInputError for an unreadable one."""
+    """Return the digests of the files in `folder` that `manifest` names, and of the manifest's numbers.
+
+    Raises BadInputError for a file that cannot be read.
+    """
     return Digests(
         body=sha256_of([folder / file for file in (manifest.body, manifest.offsets) if file is not None]),
         texture=sha256_of([folder / manifest.texture]),
@@ -316,9 +331,9 @@ def digests_of(folder: Path, manifest: Manifest) -> Digests:
 
 
 def figures_digest(validation: Validation) -> str:
-    """Return the SHA-256, hexadecimal, of a canonical JSON of `validation` without its `figures_digest`.
+    """Return the SHA-256, hexadecimal, of `validation` as canonical JSON without the key `figures_digest`.
 
-    Optional keys of the figures that are None are left out. A new optional key thus changes no older digest.
+    Optional keys of figures are left out if they are None. Therefore a new optional key changes no older digest.
     """
     said = validation.model_dump(mode="json", exclude={"figures_digest"})
     return hashlib.sha256(_in_one_way(said).encode()).hexdigest()
@@ -343,7 +358,7 @@ def sha256_of(files: Sequence[Path]) -> str:
 
 
 def _constants(manifest: Manifest) -> str:
-    """Return a canonical JSON of those numbers of the manifest that the pictures depend on."""
+    """Return, as canonical JSON, the numbers of the manifest on which pictures depend."""
     network = manifest.network
     numbers = {
         "betas": list(manifest.betas),

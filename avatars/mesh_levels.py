@@ -1,28 +1,27 @@
 """Levels of a body's mesh: fewer triangles between some of its vertices, and a bound on how far they move the surface.
 
-A level keeps vertices where they are, so a level is a list of triangles. **How far it moves the surface** is measured
-texel by texel. Each texel shows on a point of the whole mesh and on a point of the level; the bound holds for the
-distance between these two points. It holds for the outline and for all details inside the outline.
+A level keeps vertices where they are, so a level is a list of triangles. The bound is **how far a level moves the
+surface**. Each texel shows on a point of the whole mesh and on a point of the level; the bound holds for the distance
+between these two points, for every texel. Therefore it holds for the outline and for all details inside the outline.
 
-Proof of the bound. A posed point of either mesh is a sum of b_v x_v over the corners of its triangle, with x_v = sum_j
-w_vj G_j v and G_j the rigid motion of joint j. Let e_v be the level's b_v minus the whole mesh's; the e_v sum to 0, and
-d = sum e_v v is the distance at rest. Seen from a joint k, G_j is G_k and the steps along the bones between the two.
-Each step is a turn by an angle t_b about the centre c_b of a joint b. Let y_b = sum e_v W_vb (v - c_b), with W_vb the
-sum of w_vj over b and the joints below it. The step of b moves y_b, or d - y_b where k is b or below it. So the
-distance is at most
+Proof of the bound. A posed point of either mesh is a sum of b_v x_v over the corners v of its triangle. Here x_v =
+sum_j w_vj G_j v, w_vj are the skinning weights, and G_j is the rigid motion of joint j. Let e_v be the level's b_v
+minus the whole mesh's b_v. The e_v sum to 0, and d = sum e_v v is the distance at rest. For any joint k, G_j is G_k
+followed by one turn for each joint on the way from k to j: a turn by an angle t_b about the centre c_b of a joint b.
+Let y_b = sum e_v W_vb (v - c_b), with W_vb the sum of w_vj over b and the joints below b. The turn of b moves y_b;
+where k is b or below b, it moves d - y_b. Therefore the distance is at most
 
     |d| + sum_b 2 sin(t_b / 2) |y_b or d - y_b|
 
-for any k. Between the places where the edges of the two meshes cross in the texture, both points are linear functions
-of the texel. The distance is thus largest where edges cross, or at a vertex that lies in a triangle of the level
-without being its corner: left out, or in a fold of the level. `training/mesh_levels.py` evaluates the terms at these
-places, one row for each place. Pose blend shapes move a vertex
-by at most r_v = sum_b r_vb |R_b - I|, which adds sum |e_v| r_v. Rows are joined in groups: a group has the largest
-value of each term.
+for any k. Between the places where edges of the two meshes cross in the texture, both points are linear functions of
+the texel. Therefore the distance is largest at one of two kinds of places: where edges cross, or at a vertex that lies
+in a triangle of the level but is not its corner (left out, or in a fold of the level). `training/mesh_levels.py`
+evaluates the terms at these places, one row for each place. Pose blend shapes move a vertex by at most r_v = sum_b r_vb
+|R_b - I|, which adds sum |e_v| r_v. Rows are joined in groups: a group has the largest value of each term.
 
-A bundle has its levels in `mesh-levels.npz`. Rule: this file identifies the body that the levels were made for, by a
-digest of the body's stored arrays and by measures of the computed arrays. The bounds would be wrong for any other body,
-so the file is refused for any other. An avatar without this file has one level, its whole mesh.
+A bundle has its levels in `mesh-levels.npz`. Rule: this file identifies the body for which the levels were made, by a
+digest of the body's stored arrays and by samples of its computed arrays. For any other body the bounds would be wrong,
+and the file is refused. An avatar without this file has one level, its whole mesh.
 """
 
 from __future__ import annotations
@@ -43,7 +42,7 @@ from trilane.body.joints import JOINTS, Posed
 from trilane.errors import BadInputError
 from trilane.files import read_npz
 
-#: Error that float32 may add, metres: the rounding of weights, of skinned vertices and of the stored terms.
+#: Error in metres that float32 may add, by the rounding of weights, of skinned vertices and of the stored terms.
 ROUNDING_M = 5e-6
 TURNS = JOINTS - 1
 #: Approximate number of rows of terms that bound a level.
@@ -52,12 +51,12 @@ BOUND_ROWS = 2048
 
 @dataclass(frozen=True)
 class MeshLevel:
-    """A level of a mesh: F triangles and G rows of terms of its bound, see the module.
+    """A level of a mesh: F triangles, and G rows with the terms of its bound (see the module's docstring).
 
-    `faces`, `uv_faces`: (F,3) indices of the whole body's vertices and of its texture coordinates.
-    `rest`: (G,) |d|, metres.
-    `swing`: (G,54) factors of 2 sin(t_b / 2), metres.
-    `blend`: (G,54) factors of |R_b - I|, metres.
+    `faces`, `uv_faces`: (F,3) indices of vertices, and of texture coordinates, of the whole body.
+    `rest`: (G,) distances |d| at rest, in metres.
+    `swing`: (G,54) factors of 2 sin(t_b / 2) for each joint but the root, in metres.
+    `blend`: (G,54) factors of |R_b - I| for each joint but the root, in metres.
     `uv_error`: largest distance between the seams of the level and of the whole mesh, in texture widths.
     """
 
@@ -83,7 +82,7 @@ class MeshLevel:
 
     @cached_property
     def least_m(self) -> float:
-        """Lower bound of `metres` over all poses: the largest move at rest, in metres."""
+        """The largest distance at rest, in metres. In no pose is `metres` less."""
         return float(self.rest.max())
 
     def reduced(self, shaped: ShapedBody) -> ShapedBody:
@@ -106,10 +105,13 @@ class MeshLevel:
 
 
 def grouped(rest: F64, swing: F64, blend: F64) -> tuple[F32, F32, F32]:
-    """Return G rows of terms (G,), (G,54), (G,54) that bound the P rows `rest` (P,), `swing` (P,54), `blend` (P,54).
+    """Return fewer rows (`rest`, `swing`, `blend`) that bound the given rows in every pose.
 
-    A row that never has the largest sum, however far the joints turn, is left out. The rows are sorted by the joints of
-    their two largest swings, then by their largest sum. Neighbours become one row with the largest value of each term.
+    A row that cannot have the largest sum in any pose is left out. The rows are sorted by the joints of their two
+    largest swings, and then by their largest sum. Groups of neighbours become one row with the largest value of each
+    term.
+
+    `rest`: (P,), `swing`, `blend`: (P,54): terms of P rows, as in `MeshLevel`.
     """
     most = rest + 2.0 * swing.sum(axis=1) + 2.0 * np.sqrt(2.0) * blend.sum(axis=1)
     matters = most >= rest.max()
@@ -130,10 +132,10 @@ MESH_LEVELS = "mesh-levels.npz"
 EXPECTED = "levels of a mesh (.npz)"
 REMEDY = "`trilane avatar levels` makes them"
 DIGEST, MEASURES = "digest", "measures"
-#: Largest difference between equal measures. Sums of products differ in their last digits from processor to processor,
-#: and 10 micrometres do not matter to a bound of millimetres.
+#: Largest difference at which samples of computed arrays count as equal. Sums of products differ in their last digits
+#: from processor to processor, and 10 micrometres do not matter to a bound of millimetres.
 MOST_APART = 1e-5
-#: Every `STEP`th vertex is measured.
+#: Every `STEP`th vertex is among the samples.
 STEP = 97
 #: For each array of a level, the number of its columns (0: one-dimensional) and whether it holds indices.
 COLUMNS = {
@@ -151,7 +153,7 @@ MOST_ROWS = 1 << 19
 
 
 def digest_of(shaped: ShapedBody) -> str:
-    """Return the SHA-256, hexadecimal, of those stored arrays of the body that levels of its mesh depend on."""
+    """Return the SHA-256, hexadecimal, of the body's stored arrays on which the levels of its mesh depend."""
     body = shaped.body
     digest = hashlib.sha256()
     arrays = (body.v_template, body.parents, body.faces, body.uv_faces, body.uv)
@@ -162,20 +164,20 @@ def digest_of(shaped: ShapedBody) -> str:
 
 
 def measures_of(shaped: ShapedBody) -> NDArray[np.float64]:
-    """Return samples (N,) float64 of arrays that are computed from a body file: joints, vertices, skinning weights."""
+    """Return samples (N,) of arrays that are computed from the body's file: joints, vertices, skinning weights."""
     weights = shaped.body.weights.astype(np.float64)
     parts = (shaped.joints, shaped.vertices[::STEP], weights.mean(axis=0), weights[::STEP])
     return np.concatenate([np.asarray(part, np.float64).ravel() for part in parts])
 
 
 def levels_to_arrays(levels: Sequence[MeshLevel]) -> dict[str, NDArray[Any]]:
-    """Return the arrays of L levels: `faces1`, `uv_faces1`, ... of the first level, and one `uv_error` (L,)."""
+    """Return the arrays of L levels by name: `faces1`, `uv_faces1`, ... of the first level, and `uv_error` (L,)."""
     arrays = {f"{name}{k}": getattr(level, name) for k, level in enumerate(levels, 1) for name in COLUMNS}
     return {**arrays, UV_ERROR: np.array([level.uv_error for level in levels], np.float64)}
 
 
 def levels_from_arrays(arrays: Mapping[str, NDArray[Any]]) -> tuple[MeshLevel, ...]:
-    """Return the levels in `arrays`, as `levels_to_arrays` made them."""
+    """Return the levels from `arrays`, a result of `levels_to_arrays`."""
     return tuple(
         MeshLevel(**{name: arrays[f"{name}{k}"] for name in COLUMNS}, uv_error=float(uv_error))
         for k, uv_error in enumerate(arrays[UV_ERROR], 1)
@@ -190,9 +192,9 @@ def save_mesh_levels(file: Path | BinaryIO, shaped: ShapedBody, levels: Sequence
 
 
 def read_mesh_levels(path: Path, shaped: ShapedBody) -> tuple[MeshLevel, ...]:
-    """Return the levels of the mesh of `shaped`, finest first.
+    """Return the levels of the mesh in the file `path`, finest first. `shaped`: body of which they must be.
 
-    Raises BadInputError when the file is missing or damaged, is for another body, or has impossible numbers.
+    Raises BadInputError if the file is missing or damaged, is for another body, or has impossible numbers.
     """
     numbers = range(1, MOST_LEVELS + 1)
     arrays = read_npz(

@@ -22,8 +22,8 @@ from trilane.files import require_file, signature_of
 
 # The integer network that an avatar's file holds and a runtime loads.
 #
-# Rule: the graph has fixed shapes, and bytes at both ends. Its layers run in integers, except those that its metadata
-# names.
+# Rule: the graph has fixed shapes; its input and its output are bytes. Its layers run in integers, except the layers
+# that its metadata names.
 
 #: Metadata key of the file: a JSON list of the names of layers that were left in float on purpose.
 FLOAT_LAYERS_KEY = "trilane.float_layers"
@@ -46,7 +46,8 @@ class Affine:
 class IntegerNetwork:
     """The network that a runtime loads.
 
-    `model`: integer graph with fixed shapes and bytes at both ends. `where`: source to name in errors, such as a file.
+    `where`: source of the network, such as a file, that errors name.
+    `model`: integer graph with fixed shapes, whose input and output are bytes.
     """
 
     where: str
@@ -74,8 +75,8 @@ class IntegerNetwork:
 class NetworkFile(IntegerNetwork):
     """A checked network.
 
-    `shape`: (N, H, W, C) of the uint8 input; the output is (N, H, W, 4) uint8. `input`, `output`: scale and zero point
-    of the input and output bytes.
+    `shape`: sizes (N, H, W, C) of the uint8 input. The output is (N, H, W, 4) uint8, RGBA.
+    `input`, `output`: scale and zero point of the input and output bytes.
     """
 
     shape: tuple[int, int, int, int]
@@ -88,12 +89,12 @@ class NetworkFile(IntegerNetwork):
 
 
 def node_name(node: onnx.NodeProto) -> str:
-    """Return the node's name; if it has none, its operator and the name of its output tensor."""
+    """Return the node's name; if it has none, a text of its operator and its first output tensor."""
     return node.name or f"{node.op_type} that makes {next(iter(node.output), 'nothing')}"
 
 
 def constants_of(model: onnx.ModelProto) -> Mapping[str, TensorProto]:
-    """Return constant tensors of the graph by name: initializers and the outputs of Constant nodes."""
+    """Return the constant tensors of the graph by name: initializers, and outputs of Constant nodes."""
     constants = {tensor.name: tensor for tensor in model.graph.initializer}
     for node in model.graph.node:
         if node.op_type == "Constant":
@@ -102,7 +103,7 @@ def constants_of(model: onnx.ModelProto) -> Mapping[str, TensorProto]:
 
 
 def check_integer_layers(network: IntegerNetwork) -> None:
-    """Raise BadInputError for layers outside `float_layers` whose inputs are not dequantised integers."""
+    """Raise BadInputError if a layer has inputs that are not dequantised integers. Layers of `float_layers` may."""
     makers = {out: node for node in network.model.graph.node for out in node.output}
     float_layers = []
     for node in network.model.graph.node:
@@ -125,8 +126,8 @@ def _beyond_transposes(makers: Mapping[str, onnx.NodeProto], name: str) -> onnx.
 
 # Checks a network: operators, shapes of its input and output, scales and zero points.
 #
-# Rule: a network that passes is an integer network with fixed shapes, from NHWC bytes to RGBA bytes. A runtime need not
-# check it again. The error about any other network names the wrong node.
+# Rule: a network that passes the checks is an integer network with fixed shapes, from NHWC bytes to RGBA bytes, so a
+# runtime need not check it again. The error about any other network names the wrong node.
 
 RGBA = 4
 #: Remedy for a float network.
@@ -151,7 +152,7 @@ ZERO_POINT_TYPES = {
 
 
 def check_network(model: onnx.ModelProto, where: str) -> NetworkFile:
-    """Return `model` as a checked network. Raises BadInputError that names `where` and the wrong node."""
+    """Return `model` as a checked network. Raises BadInputError, which names `where` and the wrong node."""
     _check_operators(model, where)
     shape = _check_input(model, where)
     _check_output(model, where, shape)
@@ -289,7 +290,8 @@ def _affine(node: onnx.NodeProto, constants: Mapping[str, TensorProto], where: s
     return Affine(float(scale.astype(np.float64).item()), int(zero.item()))
 
 
-# Makes the same network for another tensor shape: rewrites batch, height and width, and infers all other shapes again.
+# Makes the same network for another tensor shape: rewrites batch, height and width of input and output, and infers all
+# shapes between them again.
 #
 # Rule: the result has fixed shapes and passes `check_network`; weights do not change.
 
@@ -297,11 +299,12 @@ STRIDE = 32
 
 
 def reshaped(network: NetworkFile, height: int, width: int, batch: int = 1) -> NetworkFile:
-    """Return `network` for inputs of another shape; `network` itself if it already has that shape.
+    """Return `network` for inputs of another shape; `network` itself if it already has this shape.
 
-    `height`, `width`: size of the input in pixels, multiples of 32.
+    `height`, `width`: size of the input in pixels, multiples of STRIDE.
     `batch`: number of frames that are inferred together.
-    Raises BadInputError when the graph cannot run at that shape.
+
+    Raises BadInputError if the graph cannot run at this shape.
     """
     if height % STRIDE or width % STRIDE or min(height, width, batch) < 1:
         raise BadInputError(network.where, f"shape {batch}x{height}x{width}", f"sides in multiples of {STRIDE}")
@@ -328,19 +331,19 @@ EXPECTED = "an ONNX network"
 
 
 def read_network(path: Path) -> NetworkFile:
-    """Return the checked network in an ONNX file. Raises BadInputError that names the file and the node."""
+    """Return the checked network in an ONNX file. Raises BadInputError, which names the file and the wrong node."""
     return check_network(parse_network(path), str(path))
 
 
 def parse_network(path: Path) -> onnx.ModelProto:
-    """Return the unchecked ONNX model in a file, with its external data. Raises BadInputError if it is unreadable."""
+    """Return the unchecked ONNX model in a file, with its external data. Raises BadInputError if this fails."""
     model = _parse(path)
     _load_external(model, path)
     return model
 
 
 def network_files(path: Path) -> list[Path]:
-    """Return the ONNX file, then the files of its external data, sorted. Raises BadInputError."""
+    """Return a list of the ONNX file `path` and the files of its external data, sorted. Raises BadInputError."""
     kept = {_external_file(tensor, path) for tensor in _external_tensors(_parse(path))}
     return [path, *sorted(kept)]
 
@@ -378,7 +381,7 @@ def _load_external(model: onnx.ModelProto, path: Path) -> None:
 
 
 def _external_file(tensor: TensorProto, path: Path) -> Path:
-    """Return the file of the external data of `tensor` in network `path`.
+    """Return the file with the external data of `tensor`. `path`: file of the network.
 
     Raises BadInputError for a file that is missing, too large or outside the network's folder.
     """

@@ -2,9 +2,9 @@
 
 Rule: only bytes cross a cut, so the parts, run one after the other, give the same bytes as the whole network.
 
-Every tensor that a later part reads crosses the cut: the tensor that names the cut, and others, such as a U-Net's skip
-connections or the network's input. A Dequantize and a Transpose that read a crossing tensor are repeated in the later
-part.
+A cut is named after the tensor at which it is made. Every tensor that a later part reads crosses the cut: this tensor,
+and others, such as a U-Net's skip connections or the network's input. If a DequantizeLinear or a Transpose reads a
+crossing tensor, the later part repeats this node.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from trilane.avatars.network_file import IntegerNetwork, NetworkFile
 from trilane.errors import BadInputError
 
 QUANTIZE = "QuantizeLinear"
-#: Operators with one input that a later part can repeat on crossing bytes.
+#: Operators with one data input that a later part can repeat on crossing bytes.
 MOVABLE = ("DequantizeLinear", "Transpose")
 Shapes = dict[str, tuple[int, ...]]
 
@@ -31,8 +31,9 @@ Shapes = dict[str, tuple[int, ...]]
 class Cut:
     """A place to cut.
 
-    `at`: name of the tensor that names the cut. `nodes`: number of the graph's nodes before the cut.
+    `at`: name of the tensor after which the cut is named.
     `crossing`: shape of every tensor that crosses the cut, by name; all are uint8, and `at` is one of them.
+    `nodes`: number of the graph's nodes before the cut.
     """
 
     at: str
@@ -47,11 +48,12 @@ class Cut:
 
 @dataclass(frozen=True)
 class NetworkPart(IntegerNetwork):
-    """A part of the network that runs by itself. The four tables give the shapes of uint8 tensors by name.
+    """A part of the network that runs by itself. Each field has shapes of uint8 tensors by name.
 
     `inputs`, `outputs`: inputs and outputs of `model`, in the model's order.
-    `crossing_in`, `crossing_out`: tensors that cross the cut before this part, and the cut behind it. If a tensor of
-    `crossing_out` is not in `outputs`, it is in `crossing_in`, and has to be copied unchanged.
+    `crossing_in`: tensors that cross the cut before this part.
+    `crossing_out`: tensors that cross the cut behind this part. A tensor of `crossing_out` that is not in `outputs` is
+    in `crossing_in`, and must be copied unchanged.
     """
 
     inputs: Shapes
@@ -71,9 +73,11 @@ def cuts(network: NetworkFile) -> Iterator[Cut]:
 
 
 def split(network: NetworkFile, at: Sequence[str]) -> list[NetworkPart]:
-    """Return the parts of `network` between the cuts `at`. Raises BadInputError if there is no such cut.
+    """Return the parts of `network` between the cuts `at`, in order.
 
     `at`: names of cuts, in the order of the network's nodes.
+
+    Raises BadInputError for an unknown cut, and for cuts in another order.
     """
     known = {cut.at: cut for cut in cuts(network)} if at else {}
     for name in at:
@@ -90,7 +94,10 @@ def split(network: NetworkFile, at: Sequence[str]) -> list[NetworkPart]:
 
 
 def _crossing(graph: onnx.GraphProto, nodes: int) -> Shapes | None:
-    """Return the tensors that cross a cut behind the first `nodes` nodes, with shapes; None if any is not uint8."""
+    """Return the shape of each tensor that crosses a cut, by name; None if any of these tensors is not uint8.
+
+    `nodes`: number of the graph's nodes before the cut.
+    """
     makers = {name: node for node in graph.node[:nodes] for name in node.output}
     names = []
     for node in graph.node[nodes:]:
@@ -131,7 +138,7 @@ def _part(network: NetworkFile, before: Cut, after: Cut) -> NetworkPart:
 
 
 def _needed(nodes: Sequence[onnx.NodeProto], outputs: Sequence[str]) -> list[onnx.NodeProto]:
-    """Return the nodes of `nodes`, in the same order, that the tensors `outputs` depend on."""
+    """Return, in their order, the nodes on which the tensors `outputs` depend."""
     wanted, needed = set(outputs), []
     for node in reversed(nodes):
         if wanted.intersection(node.output):

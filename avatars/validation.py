@@ -1,7 +1,7 @@
-"""Decides which accuracy figures are valid for an avatar, and explains why others are not shown.
+"""Decides which figures of an avatar's image error may be shown, and explains why other figures are not shown.
 
-Rule: a figure is shown only if bytes, constants and the way of drawing are the same as in its measurement. Otherwise a
-sentence names the difference and the command that measures the figure.
+Rule: a figure is shown only if the avatar's files and numbers, and the way of drawing, are the same as when it was
+measured. Otherwise a sentence names the difference, and the command that measures the figure.
 """
 
 from __future__ import annotations
@@ -44,8 +44,10 @@ PLANNED, BY_FRAME = "auto", "`trilane bench planner` measures scenes whose tenso
 class DrawnAs:
     """How a run draws an avatar.
 
-    `runtime`: runtime of the network. `size`: tensor size, as `trilane run --size` takes it. `texture_filter`: filter
-    of the neural texture. `avatars`: number of avatars that share the tensor.
+    `runtime`: runtime of the network.
+    `size`: tensor size, as `trilane run --size` takes it.
+    `texture_filter`: filter of the neural texture.
+    `avatars`: number of avatars that share the tensor.
     """
 
     runtime: str
@@ -55,15 +57,16 @@ class DrawnAs:
 
 
 def from_validation(date: datetime.date | None) -> str:
-    """Return the source to name for a figure from an avatar's validation of `date`."""
+    """Return the text that names the source of a figure: an avatar's validation of `date`."""
     return f"from the avatar's validation of {date}"
 
 
 def accuracy_of(bundle: Bundle, drawn: DrawnAs) -> dict[str, Any]:
-    """Return the figures of the avatar's image error that hold for a run that draws it as `drawn`.
+    """Return the figures of the avatar's image error that hold for a run that draws the avatar as `drawn`.
 
     Keys: `source`, which names the validation and its date; `runtime`, `size`; the keys of `AccuracyFigures`. If no
     figure holds, the keys are those of `refused`: `source`, `changed`, `why`.
+
     Raises BadInputError for a file that cannot be read.
     """
     validation = bundle.manifest.validation
@@ -86,9 +89,9 @@ def accuracy_of(bundle: Bundle, drawn: DrawnAs) -> dict[str, Any]:
 
 
 def validation_facts(bundle: Bundle) -> dict[str, Any] | None:
-    """Return the whole validation with its `source`; None for an avatar without one.
+    """Return the keys of the avatar's validation, and `source`; None for an avatar without a validation.
 
-    If the validation is not valid, return what `refused` returns.
+    If no figure may be shown, return the keys of `refused`. Raises BadInputError for a file that cannot be read.
     """
     validation = bundle.manifest.validation
     if validation is None:
@@ -97,10 +100,11 @@ def validation_facts(bundle: Bundle) -> dict[str, Any] | None:
 
 
 def refused(bundle: Bundle) -> dict[str, Any]:
-    """Return why no figure of the manifest may be shown; empty if the figures are valid for the avatar's files.
+    """Return the reason why no figure of the manifest may be shown; empty if they may be shown.
 
-    Keys: `source`, which is `NO_FIGURES`; `changed`: keys of `PARTS` that were changed since the validation; `why`: a
-    sentence.
+    Keys: `source`, which is `NO_FIGURES`; `changed`, the keys of `PARTS` that were changed since the validation; `why`,
+    the reason as a sentence.
+
     Raises BadInputError for a file that cannot be read.
     """
     validation = bundle.manifest.validation
@@ -131,12 +135,15 @@ def refused(bundle: Bundle) -> dict[str, Any]:
 
 
 def no_truth(bundle: Bundle) -> str:
-    """Return why an avatar of a capture cannot be validated, and where its error on held out frames is, if known."""
+    """Return part of a sentence: why an avatar of a capture cannot be validated.
+
+    If the manifest has the error on frames that were held out of training, the text says so.
+    """
     return f"{NO_TRUTH}; {ON_HELD_OUT}" if HELD_OUT in bundle.manifest.provenance else NO_TRUTH
 
 
 def _drawn_otherwise(validation: Validation, drawn: DrawnAs) -> str:
-    """Return how `drawn` differs from the drawing in the validation, as a sentence part; "" if nothing differs."""
+    """Return part of a sentence: how `drawn` differs from the drawing in the validation; "" if nothing differs."""
     runtimes = [validation.runtime, *validation.other_runtimes]
     if drawn.avatars > 1:
         return f"it was validated alone in its tensor, and here {drawn.avatars} avatars share one"
@@ -151,16 +158,19 @@ def _drawn_otherwise(validation: Validation, drawn: DrawnAs) -> str:
 
 
 def _no_figures(bundle: Bundle, changed: Sequence[str], why: str, how: str = "", remark: str = "") -> dict[str, Any]:
-    """Return the keys of `refused`, with the command that measures the present files added to `why`.
+    """Return the keys of `refused`. Their `why` ends with the command that measures the figures.
 
-    `how`: options of the command. `remark`: words after the command.
+    `changed`: keys of `PARTS` that were changed since the validation.
+    `why`: reason.
+    `how`: options of the command.
+    `remark`: words after the command.
     """
     command = f"{VALIDATE} {shlex.quote(name_of(bundle.folder))}{how}"
     return {"source": NO_FIGURES, "changed": list(changed), "why": f"{why}; `{command}` measures it{remark}"}
 
 
 def name_of(folder: Path) -> str:
-    """Return what a person types for `folder`: the name of a built-in avatar, or the path."""
+    """Return the word by which a command names the avatar in `folder`: a name of BUILT_IN, or the path."""
     known = (name for name in BUILT_IN if folder.absolute() == bundle_folder(name).absolute())
     return next(known, str(folder))
 
@@ -191,9 +201,10 @@ class SizeLoss:
     curve: tuple[tuple[int, int], ...] = ()
 
     def at(self, work: int) -> float | None:
-        """Return the loss in dB of a tensor with `work` thousandths of the pixels; 0 for a tensor of the full size.
+        """Return the loss in dB of a tensor with `work` thousandths of the largest tensor's pixels.
 
-        This is the loss measured at the next smaller size; None if no smaller size was measured.
+        Return 0 for the full size, else the loss at the next smaller size that was measured; None if no smaller size
+        was measured.
         """
         if work >= WHOLE and self.by_work:
             return 0.0
@@ -202,7 +213,7 @@ class SizeLoss:
 
 
 def size_loss(bundle: Bundle) -> SizeLoss:
-    """Return the loss of `bundle` in smaller tensors. Raises BadInputError for a file that cannot be read."""
+    """Return the loss of PSNR of `bundle` in smaller tensors. Raises BadInputError for a file that cannot be read."""
     validation, name = bundle.manifest.validation, bundle.manifest.name
     measures = f"`{VALIDATE} {name_of(bundle.folder)} --sizes` measures them"
     if validation is None or refused(bundle):

@@ -1,11 +1,11 @@
 """Requests to a live run: controls, frame requests, and signals.
 
-Rule: any thread may send a request; the run handles it between two of its steps, on its own thread. A signal handler
+Rule: any thread may send a request; the run handles it between two of its steps, on the run's thread. A signal handler
 only counts the signal.
 
-A request becomes an event of the scheduler, so that the recording contains it and a replay repeats it. A kill becomes
-an event when the end of the unit's process is noticed. Requested frames are answered in the order in which they were
-presented.
+A request becomes an event of the scheduler, so that the recording contains it and a replay repeats it. A request to
+kill a unit becomes an event when the run notices the end of the unit's process. Requested frames are answered in the
+order in which they are presented.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class RunControls:
         self._closed = False
 
     def hold(self, frames: int) -> None:
-        """Release `frames` more frames and then none; `ALL` ends the hold."""
+        """Release `frames` more frames now, and no others until the next call; `ALL` ends the hold."""
         self._ask(Hold(frames))
 
     def stop(self) -> None:
@@ -54,7 +54,7 @@ class RunControls:
                 os.eventfd_write(self.fd, 1)
 
     def taken(self) -> tuple[list[Event], list[str]]:
-        """Return the events and the units to kill that were asked for since the last call; called by the run."""
+        """Return (requested events, names of units to kill) since the last call; called by the run."""
         with self._lock:
             taken = self._events, self._kills
             self._events, self._kills = [], []
@@ -77,11 +77,12 @@ class RunControls:
 class FrameRequestQueue:
     """Passes frame requests to one run; frames are numbered from 0 in the order of the requests.
 
-    `answered(frame)`: function that is called when a frame was presented.
-    `ended()`: function that is called when the run is over; no frame is answered after it.
+    `answered(frame)`: function that is called with the number of each presented frame.
+    `ended()`: function that is called when the run is over; after it `answered` is not called any more.
     `unanswered(causes)`: function that is called once, when the first frames were dropped or lost. `causes`: number of
     these frames by the cause's key in the report.
-    `is_open`: event that is set when the run takes requests, and when it is over.
+    `fd`: descriptor that becomes readable with each request.
+    `is_open`: `threading.Event` that is set when the run begins to take requests, and also when the run is over.
     """
 
     def __init__(
@@ -99,7 +100,7 @@ class FrameRequestQueue:
         self._closed = False
 
     def request(self, count: int = 1) -> None:
-        """Ask for `count` frames; once the run is over this does nothing."""
+        """Ask for `count` frames; once the run is over, do nothing."""
         self._put(FrameRequest(count))
 
     def end(self) -> None:
@@ -107,7 +108,7 @@ class FrameRequestQueue:
         self._put(Stop())
 
     def events(self) -> list[Event]:
-        """Return the requests since the last call."""
+        """Return the requests since the last call, as events of the scheduler."""
         events: list[Event] = []
         with contextlib.suppress(IndexError):
             while True:
@@ -115,13 +116,13 @@ class FrameRequestQueue:
         return events
 
     def tell_unanswered(self, causes: Mapping[str, int]) -> None:
-        """Call `unanswered` with the number of dropped and lost frames by cause, the first time that there are any."""
+        """Call `unanswered` the first time that there are dropped or lost frames. `causes`: their number by cause."""
         if causes and not self._told:
             self._told = True
             self._unanswered(causes)
 
     def close(self) -> None:
-        """Note that the run is over: call `ended`, and set `is_open` so that no thread waits for it any longer."""
+        """Note that the run is over: call `ended`, and set `is_open`, so that no thread waits any longer."""
         with self._lock:
             if self._closed:
                 return
@@ -138,12 +139,14 @@ class FrameRequestQueue:
 
 
 class Interrupts:
-    """Context manager that counts signals and makes `fd` readable at each; it does nothing outside the main thread.
+    """Context manager that counts signals, and makes `fd` readable at each signal.
 
-    Within the context SIGPIPE is ignored: a message to a unit that is gone must not end the program.
+    It does nothing outside the main thread. Within the context SIGPIPE is ignored: a message to a unit that is gone
+    must not end the program.
 
+    `fd`: descriptor that becomes readable.
     `count`: number of signals so far that end a run.
-    `last`: the last of these signals.
+    `last`: the last of the signals that `count` counts.
     `continued`: number of times that this process went on after a signal had stopped it.
     """
 

@@ -1,17 +1,18 @@
 """Finds what bounds the frame time: the critical path, walked backwards from a presented frame.
 
-Rule: a job begins when the last of its conditions is met. The conditions are its input, its unit, a slot, room in
-flight, and its frame's release. If a job has several inputs, the last input counts. The path goes on with the job whose
-end met the last condition. Time between the two jobs belongs to neither: overhead, a cap, a restart. Therefore the
-pieces of a path follow each other without gaps and add up to the time that it spans.
+Rule: a job begins when the last of its conditions is met. The conditions are its input, its unit, a free slot, a free
+place among the frames in flight, and its frame's release. If a job has several inputs, the last input counts. The path
+goes on with the job whose end met the last condition. The time between these two jobs belongs to neither: it is
+overhead, throttling or a restart. Therefore the pieces of a path follow each other without gaps, and add up to the time
+from the path's begin to its end.
 
 The job that met the last condition is known, not guessed. If a job was handed over while its unit did another job, it
 waited for that job. Any other job waited for a job whose end the scheduler heard of in the step that handed it over.
 
 Units that share cores slow each other down, although neither needs the other's result. Therefore time in which a job on
 the path had no core belongs to the stage whose job had the core (`Sharing`). The kernel counted how long a job had no
-core. In that time other jobs ran on cores that both units may use; from them `Sharing` computes which stage had the
-core. For the rest of the time another program had it, or a thread of a unit between two jobs.
+core. `Sharing` computes which stage had the core, from the other jobs that ran then on cores of the job's unit. If no
+job explains a part of this time, another program had the core, or a thread of a unit between two jobs.
 """
 
 from __future__ import annotations
@@ -27,15 +28,17 @@ from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.stats import LEAST_FRAMES, batch_interval
 
-DELAY: Final = 256  # number of further jobs after which all jobs that ran beside a job have ended
+DELAY: Final = 256  # once so many further jobs have ended, all jobs that ran at the same time as a job have ended
 
 
 class Taken(NamedTuple):
     """Sums over all jobs of a stage, in ns.
 
+    `unit`: unit of the stage.
+    `jobs`: number of the jobs.
     `service_ns`: time from begin to end of the jobs.
     `preempted_ns`: time in which the jobs had no core.
-    `of`: part of `preempted_ns` in which a job of another stage had the core, by that stage.
+    `of`: part of `preempted_ns` in which a job of another stage had the core, by the other stage's name.
     `other_ns`: part of `preempted_ns` that no job of the run explains.
     """
 
@@ -51,10 +54,11 @@ class Taken(NamedTuple):
 
 
 class Sharing:
-    """Computes for the jobs of each stage which other stages had the core while these jobs had none.
+    """Computes which stages had a core while the jobs of another stage had none.
 
     `cores`: numbers of the cores of each unit; a unit whose cores are not known is missing.
-    `delay`: number of further jobs after which all jobs that ran beside a job have ended.
+    `delay`: number of further jobs after whose end a job is counted. By then, all jobs that ran at the same time must
+    have ended.
     """
 
     def __init__(self, cores: Mapping[str, Sequence[int]], delay: int = DELAY) -> None:
@@ -68,7 +72,7 @@ class Sharing:
         self._sums: dict[str, Taken] = {}
 
     def add(self, job: JobRecord) -> None:
-        """Count a job; jobs come in the order of their ends."""
+        """Add a job that has ended; call this in the order of the jobs' ends."""
         if self._beside.get(job.unit):
             of_unit = self._jobs[job.unit]
             of_unit.append(job)
@@ -85,10 +89,12 @@ class Sharing:
         return self._sums
 
     def taken(self, unit: str, begin_ns: int, end_ns: int, lacked_ns: int) -> dict[str, int]:
-        """Return the time in ns in which each stage's jobs had the core that `unit` lacked between two times.
+        """Return, by stage, the time in ns in which its jobs had the core that `unit` lacked.
 
-        `lacked_ns`, the unit's time without a core, is divided among the stages. Each stage's part is proportional to
-        the time that its jobs ran between the two times, and is not longer than this time.
+        The unit's time without a core is divided among the stages. Each stage's part is proportional to the time that
+        its jobs ran between `begin_ns` and `end_ns`, and is not longer than this time.
+
+        `lacked_ns`: time in ns between `begin_ns` and `end_ns` in which the unit had no core.
         """
         if not lacked_ns:
             return {}
@@ -120,9 +126,9 @@ def _end_ns(job: JobRecord) -> int:
 
 
 def _within_ns(job: JobRecord, begin_ns: int, end_ns: int) -> int:
-    """Return the time in ns that `job` ran between two times.
+    """Return the time in ns for which `job` ran between two times.
 
-    The job's time without a core and its sleep are assumed to be spread evenly over the job.
+    The job's sleep, and its time without a core, are assumed to be spread evenly over the job.
     """
     ns = min(job.end_ns, end_ns) - max(job.begin_ns, begin_ns)
     length_ns = job.end_ns - job.begin_ns
@@ -146,7 +152,7 @@ WHATS = {
     RELEASE: "no frame was released yet: the rate from outside",
     UNKNOWN: "before what is known",
 }
-#: The causes into which a gap between two jobs is divided, in this order; the rest is overhead.
+#: The causes into which a gap between two jobs is divided, in this order; time that is left is overhead.
 OF_GAPS = (LOST, DOWN, THROTTLED, HELD, PREEMPTED)
 MARGIN: Final = 32  # number of presented frames within which paths that end with different frames meet
 STEP: Final = 3 * LEAST_FRAMES
@@ -161,9 +167,9 @@ class Piece(NamedTuple):
 
     `what`: kind of the piece, a key of `WHATS`.
     `stage`: stage of `job`; for DOWN, a stage of the unit that was down.
-    `job`: job whose time the piece is part of, or the first job after the piece.
+    `job`: job that contains the piece; for a piece between two jobs, the later job.
     `begin_ns`, `end_ns`: begin and end of the piece, in ns of the run's clock.
-    `asleep`: kind that the job's sleep counts as, ASLEEP or STOPPED.
+    `asleep`: kind as which the job's sleep counts, ASLEEP or STOPPED.
     """
 
     what: str
@@ -212,7 +218,7 @@ class Paths:
         self._presented: deque[Key] = deque(maxlen=kept)
 
     def add(self, explained: ExplainedJob) -> None:
-        """Take the next job of the run that has ended."""
+        """Add the job of the run that ended next."""
         job, key = explained.job, explained.key
         self._jobs[key] = explained
         if before := self._last_of_unit.get(job.unit):
@@ -237,7 +243,7 @@ class Paths:
             del self._last_of_frame[key[1]]
 
     def walk(self, last: ExplainedJob, until_ns: int) -> Iterator[Piece]:
-        """Yield the pieces from the end of `last` back to `until_ns`, the latest piece first."""
+        """Yield the pieces of the path from the end of the job `last` back to `until_ns`, the latest piece first."""
         now: ExplainedJob | None = last
         end_ns = last.job.end_ns
         while now is not None and end_ns > until_ns:
@@ -251,10 +257,11 @@ class Paths:
             now, end_ns = before, from_ns
 
     def _gap(self, now: ExplainedJob, from_ns: int, released: bool, is_first: bool) -> Iterator[Piece]:
-        """Yield the pieces between `from_ns` and the begin of `now`, the latest piece first.
+        """Yield the pieces of the gap before the job `now`, the latest piece first.
 
+        `from_ns`: begin of the gap.
         `released`: whether the job also waited for its frame's release.
-        `is_first`: whether the job that the path goes on with is not known.
+        `is_first`: whether the path ends here, because the job before the gap is not known.
         """
         job = now.job
         if released:
@@ -268,7 +275,10 @@ class Paths:
             yield from _divided(now, from_ns, HELD if is_latched else self._overhead(now, from_ns))
 
     def _overhead(self, now: ExplainedJob, from_ns: int) -> str:
-        """Return the kind of the time from `from_ns` to the begin of `now` that has no other cause."""
+        """Return the kind (STALLED, STOPPED or OVERHEAD) of time before a job that has no cause of `OF_GAPS`.
+
+        `from_ns`: begin of the gap that ends with the begin of `now`.
+        """
         begin_ns = now.job.begin_ns
         for stall in reversed(self._stalls):
             if stall.end_ns <= from_ns:
@@ -280,7 +290,10 @@ class Paths:
     def _unreleased(self, job: JobRecord, from_ns: int, end_ns: int) -> Iterator[Piece]:
         """Yield the pieces of the time before a frame was released, the latest piece first.
 
-        If a unit was down in this time, that explains why no earlier frame was presented.
+        Time in which a unit was down is a piece of kind DOWN, because it explains why no earlier frame was presented.
+
+        `job`: first job of the frame.
+        `from_ns`, `end_ns`: begin and end of the time.
         """
         for down in reversed(self._downs):
             if end_ns <= from_ns or down.end_ns <= from_ns:
@@ -294,7 +307,10 @@ class Paths:
         yield Piece(RELEASE, job.stage, job, from_ns, end_ns)
 
     def _bound_by(self, now: ExplainedJob) -> tuple[ExplainedJob | None, bool]:
-        """Return (job whose end let `now` begin, or None; whether `now` also waited for its frame's release)."""
+        """Return (job whose end let `now` begin, whether `now` also waited for its frame's release).
+
+        The job is None if it is not known.
+        """
         key, job = now.key, now.job
         own = [self._before.get(key), self._input.get(key)]
         mine = self._jobs.get(own[0]) if own[0] else None
@@ -308,12 +324,12 @@ class Paths:
         return found, False
 
     def _shown_by(self, by_ns: int) -> ExplainedJob | None:
-        """Return the job that presented the last frame up to `by_ns`; None if it is not kept."""
+        """Return the job that presented the last frame that was presented by `by_ns`; None if it is not kept."""
         shown = (self._jobs[key] for key in reversed(self._presented) if key in self._jobs)
         return next((each for each in shown if each.job.end_ns <= by_ns), None)
 
     def _latest(self, keys: list[Key], job: JobRecord) -> ExplainedJob | None:
-        """Return, of the jobs in `keys` that ended before `job` began, the one that ended last; None without one."""
+        """Return the job of `keys` that ended last before `job` began; None if none did."""
         ended = [self._jobs[key] for key in keys if key in self._jobs and self._jobs[key].job.end_ns <= job.begin_ns]
         return max(ended, key=lambda each: each.job.end_ns, default=None)
 
@@ -349,11 +365,12 @@ Part = tuple[str, str]
 
 
 def parts(piece: Piece, begin_ns: int, end_ns: int, sharing: Sharing | None = None) -> dict[Part, int]:
-    """Return the time of a piece between `begin_ns` and `end_ns` in ns, by kind and stage.
+    """Return the time in ns of a piece between `begin_ns` and `end_ns`, by (kind, stage).
 
-    It is not known when in a job the unit was preempted or asleep. Therefore this time is spread evenly over the job.
+    The moments at which a unit was preempted or asleep in a job are not known. Therefore preempted time and sleep are
+    spread evenly over the job.
 
-    `sharing`: object that says which stages had the core that a job lacked; None: no job of the run had it.
+    `sharing`: object that says which stages had the core that a job lacked; None: no job of the run had this core.
     """
     ns = min(piece.end_ns, end_ns) - max(piece.begin_ns, begin_ns)
     if ns <= 0:
@@ -376,13 +393,14 @@ def parts(piece: Piece, begin_ns: int, end_ns: int, sharing: Sharing | None = No
 
 
 def _divided_preempted(stage: str, ns: int, taken: Mapping[str, int], lacked_ns: int) -> dict[Part, int]:
-    """Return how `ns`, a time without a core, is divided among the stages that had the core.
+    """Divide a part of a job's time without a core among the stages that had the core; return ns by (kind, stage).
 
-    Each stage gets the same share of `ns` that it has of `lacked_ns`. The rest counts as preempted.
+    Each stage has the same share of `ns` as of `lacked_ns`. Time that no stage explains counts as preempted.
 
-    `stage`: stage of the job without a core.
-    `taken`: time in ns in which each stage had the core.
-    `lacked_ns`: whole time without a core.
+    `stage`: stage of the job.
+    `ns`: length of the part in ns.
+    `taken`: part of `lacked_ns` in which each stage had the core, in ns.
+    `lacked_ns`: the job's whole time without a core, in ns.
     """
     found = {(TAKEN, other): ns * of_other // lacked_ns for other, of_other in taken.items()}
     left_ns = ns - sum(found.values())
@@ -392,13 +410,13 @@ def _divided_preempted(stage: str, ns: int, taken: Mapping[str, int], lacked_ns:
 class Budget:
     """The critical path of a whole run, as time by kind and stage.
 
-    A path is walked back from every STEP-th presented frame. A walk does not count the last MARGIN frames before its
-    start: paths that end with different frames meet within this margin, so the next walk counts these frames.
-    Therefore the cost per frame does not grow with the run.
+    A path is walked back from every STEP-th presented frame. The MARGIN frames before this frame are left to the next
+    walk, because paths that end with different frames meet within MARGIN frames. Therefore the cost per frame does not
+    grow with the run.
 
     `paths`: jobs of the run so far.
-    `sharing`: object that says which stages had a core that a job lacked.
-    `ns_of`: time of the path in ns by kind and stage, from the first presented frame on.
+    `sharing`: object that says which stages had a core that a job lacked; None: no job of the run had this core.
+    `ns_of`: time of the path in ns by (kind, stage), from the first presented frame on.
     """
 
     def __init__(self, paths: Paths, sharing: Sharing | None = None) -> None:
@@ -412,7 +430,7 @@ class Budget:
         self.ns_of: dict[Part, int] = {}
 
     def present(self, shown: ExplainedJob) -> None:
-        """Take the job that presented the next frame."""
+        """Add the job that presented the next frame."""
         self._newest = shown
         if self._from_ns is None:
             self._from_ns = shown.job.end_ns
@@ -422,7 +440,7 @@ class Budget:
             self._cut([self._since.popleft() for _ in range(STEP)][LEAST_FRAMES - 1 :: LEAST_FRAMES])
 
     def close(self) -> dict[Part, int]:
-        """Count the rest of the path, and return `ns_of`; called after the last frame."""
+        """Count the part of the path that is not counted yet, and return `ns_of`; called after the last frame."""
         if self._newest is not None and self._since:
             ends_ns = [*self._since][LEAST_FRAMES - 1 :: LEAST_FRAMES]
             is_whole = len(self._since) % LEAST_FRAMES == 0
@@ -431,9 +449,10 @@ class Budget:
         return self.ns_of
 
     def names(self, unit_of: Mapping[str, str]) -> dict[str, dict[Part, str]]:
-        """Return two maps from parts of the path to names: `unit` has all parts, `stage` only the parts of stages.
+        """Return two maps from (kind, stage) to a name.
 
-        Time that belongs to no unit is named after its kind: other programs, release, overhead, held.
+        The map `unit` names the unit of each part of the path. A part that belongs to no unit is named after its kind:
+        other programs, release, overhead, held. The map `stage` names the stage, and has only the parts of stages.
 
         `unit_of`: unit of each stage.
         """
@@ -443,10 +462,10 @@ class Budget:
         return {"unit": units, "stage": stages}
 
     def largest(self, name_of: Mapping[Part, str]) -> dict[str, Any] | None:
-        """Return the largest `share` of a name in the path, with its `rivals`; None without a path.
+        """Return the keys of `share` for the name with the largest share of the path, and the key `rivals`.
 
-        Rivals are the names whose share may be as large: the 95 % interval of the difference contains 0. Called after
-        `close`.
+        Rivals are the names whose share may be as large: the 95 % interval of the difference contains 0. `rivals` is
+        None if there are too few frames for an interval. Without a path, return None. Called after `close`.
 
         `name_of`: name of each part of the path, from `names`.
         """
@@ -461,25 +480,33 @@ class Budget:
         return {**self.share(name_of, name), "rivals": rivals}
 
     def share(self, name_of: Mapping[Part, str], name: str) -> dict[str, Any]:
-        """Return `name`, its `share` in the path, and `share_low` and `share_high`, the bounds of its 95 % interval."""
+        """Return `name`, its `share` of the path (0 to 1), and the bounds `share_low` and `share_high` of the share.
+
+        The bounds are those of the 95 % interval; both are None if there are too few frames.
+
+        `name_of`: name of each part of the path, from `names`.
+        """
         share = _by_name(self.ns_of, name_of).get(name, 0) / sum(self.ns_of.values())
         half = self._half_width(name_of, name)
         low, high = (None, None) if half is None else (max(share - half, 0.0), min(share + half, 1.0))
         return {"name": name, "share": share, "share_low": low, "share_high": high}
 
     def shares(self, name_of: Mapping[Part, str]) -> dict[str, float]:
-        """Return the share of each name in the path, the largest first."""
+        """Return the share of each name in the path (0 to 1), the largest first. `name_of`: as for `share`."""
         total = sum(self.ns_of.values())
         sums = _by_name(self.ns_of, name_of)
         return {name: ns / total for name, ns in sorted(sums.items(), key=lambda row: -row[1])}
 
     def _half_width(self, name_of: Mapping[Part, str], name: str, other: str = "") -> float | None:
-        """Return half the 95 % interval of the share of `name`, or of its difference from the share of `other`."""
+        """Return half the 95 % interval of the share of `name`, less the share of `other` if one is given.
+
+        Return None if there are too few blocks.
+        """
         blocks = [(_by_name(block, name_of), max(sum(block.values()), 1)) for block in self._blocks]
         return batch_interval([(ns.get(name, 0) - ns.get(other, 0)) / of for ns, of in blocks])
 
     def _cut(self, ends_ns: Sequence[int], *, is_whole: bool = True) -> None:
-        """Count the path from the end of its counted part up to the last of `ends_ns`, in blocks.
+        """Count the path, in blocks, from the end of the part that is counted already to the last of `ends_ns`.
 
         `ends_ns`: end of each block, in ns.
         `is_whole`: whether the last block has as many frames as the other blocks.
@@ -499,7 +526,7 @@ class Budget:
         self._keep()
 
     def _keep(self) -> None:
-        """Store whole blocks. As soon as there are MOST_BLOCKS, merge each two neighbours into one."""
+        """Store whole blocks. When there are MOST_BLOCKS, merge them in pairs of neighbours."""
         while len(self._open) >= self._merged:
             block: dict[Part, int] = {}
             for each in self._open[: self._merged]:

@@ -89,7 +89,7 @@ class Described(Model):
 
 
 def _bad_input(what: str, error: ValidationError) -> BadInputError:
-    """Return the error for the first defect in `error`. `what`: name of the checked class."""
+    """Return the BadInputError for the first defect in `error`. `what`: name of the checked class."""
     first = error.errors()[0]
     place = ".".join([what, *(str(part) for part in first["loc"])])
     unexpected = unexpected_in(first)
@@ -106,7 +106,7 @@ class UnitSettings(Described):
 
     `cores`: numbers of cores of this machine.
     `threads`: number of threads, from 1.
-    `spin`: whether threads may spin between jobs.
+    `spin`: whether threads may spin between jobs, so that they begin the next job sooner.
     """
 
     cores: tuple[int, ...] = Field(min_length=1)
@@ -118,8 +118,8 @@ class StageInput(Described):
     """An input of a stage of a graph.
 
     `stage`: name of the stage whose stream the input reads.
-    `latest`: whether the stage takes the newest frame, whatever its number.
-    `max_age_ms`: age in ms from which on the newest frame counts as absent; 0: no such age.
+    `latest`: whether the reading stage takes the stream's newest frame, whatever its number.
+    `max_age_ms`: longest age in ms at which the newest frame is taken; an older frame counts as absent. 0: any age.
     """
 
     stage: str
@@ -128,13 +128,14 @@ class StageInput(Described):
 
 
 class PipelineStage(Described):
-    """One stage.
+    """One stage of a pipeline.
 
+    `name`, `unit`: names of the stage, and of the unit that runs it.
     `factory`: `module:name` of a `trilane.pipeline.stage.StageFactory`, importable in the unit's process.
     `settings`: JSON values that are handed to the factory.
-    `pace_ns`: least time of a job; a shorter job waits until its end. 0: none.
-    `inputs`: what the stage reads; None for a stage of a chain, which reads what the stage before it writes.
-    `every`: distance between the frames that the stage takes.
+    `pace_ns`: least time of a job in ns; a shorter job is made longer by a wait at its end. 0: none.
+    `inputs`: inputs of the stage; None for a stage of a chain, which reads the stream of the stage before it.
+    `every`: distance between the frames that the stage takes: 3 for the first, the fourth and so on.
     """
 
     name: str = Field(pattern=r"^[\w-]+$", max_length=LONGEST_NAME)
@@ -147,13 +148,13 @@ class PipelineStage(Described):
 
     @property
     def joins(self) -> bool:
-        """Whether it is a `trilane.pipeline.stage.JoiningStage`: it has several inputs, or one with `latest`."""
+        """Whether the stage has several inputs, or one with `latest` (`trilane.pipeline.stage.JoiningStage`)."""
         inputs = self.inputs or ()
         return len(inputs) > 1 or any(each.latest for each in inputs)
 
 
 class PipelineEdge(Described):
-    """The slots that a stage writes. The next stage reads them; in a graph, all readers of the stage do.
+    """The slots that a stage writes. In a chain the next stage reads them; in a graph, all readers of the stage.
 
     `payload_bytes`: size of every packet's payload.
     `header`: dtype of every packet's header, made by `trilane.transport.packets.header_dtype`.
@@ -169,14 +170,14 @@ class Pipeline(Described):
     """Stages and the edges between them. Raises BadInputError naming the wrong field, as its parts do.
 
     `stages`: a chain, or a graph in which each stage has `inputs` and follows the stages that it reads.
-    `edges`: slots behind each stage that has a reader, in the order of the stages.
+    `edges`: edge behind each stage that has a reader, in the order of the stages.
     `units`: cores and threads of each unit that a stage names; the scheduler runs on the cores of the first stage's
     unit.
     `latency_to`: stage at whose end a frame's latency ends; empty for the last stage.
     `bypass`: names of two stages. If the first stage returns a `Skip` for a frame, the frame goes on to the second
     stage, past the stages between. The edges behind the first and before the second have the same header.
     `from_release`: whether the latency begins with a frame's release, as for a camera with a rate.
-    `warms_up`: whether the stages of a chain do a frame before the run; False if they may count their calls.
+    `warms_up`: whether the stages of a chain do a frame before the run; must be False if a stage counts its calls.
     `module_folders`: folders where a unit's process first looks for the modules of factories.
     `preload`: modules that are imported once, before the units' processes are forked; none from `module_folders`.
     """
@@ -213,7 +214,10 @@ class Pipeline(Described):
             self._check_headers(self.edges_into(self.bypass[1]))
 
     def _check_headers(self, names: tuple[str, ...]) -> None:
-        """Raise UnexpectedValue if the edges `names`, which meet at the end of a bypass, have different headers."""
+        """Raise UnexpectedValue if edges that meet at the end of a bypass have different headers.
+
+        `names`: names of these edges.
+        """
         headers = {edge.header for name, edge in zip(self.edge_names, self.edges, strict=True) if name in names}
         if len(headers) > 1:
             raise UnexpectedValue(f"different headers of edges {', '.join(names)}", "one, as a bypass joins them")
@@ -226,7 +230,7 @@ class Pipeline(Described):
 
     @property
     def joints(self) -> dict[str, tuple[PipelineStage, tuple[PipelineStage, ...]]]:
-        """(Writer, readers) of each edge, by the edge's name `FROM->TO`, in the order of `edges`."""
+        """(Writing stage, reading stages) of each edge, by its name `WRITER->READER`, in the order of `edges`."""
         graph, named = self.graph(), {stage.name: stage for stage in self.stages}
         return {
             graph.edge_name(place): (named[name], tuple(named[reader] for reader in readers))
@@ -266,9 +270,9 @@ class Pipeline(Described):
         return tuple(sorted({core for settings in self.units.values() for core in settings.cores}))
 
     def places(self) -> dict[str, Place]:
-        """Return the cores and threads of each unit.
+        """Return the cores and the number of threads of each unit.
 
-        A unit with a paced stage (`pace_ns`) counts as one thread: it is busy during the whole pace, like one thread.
+        A unit with a paced stage (`pace_ns`) counts as one thread, because it is busy during the whole pace.
         """
         paced = {stage.unit for stage in self.stages if stage.pace_ns}
         return {
@@ -307,11 +311,11 @@ NOT_SAID: Final[Mapping[str, Any]] = {}
 def tables_of(
     pipeline: Pipeline, run: Mapping[str, Any], times_ms: Mapping[str, float], taken: Mapping[str, Any] = NOT_SAID
 ) -> dict[str, Any]:
-    """Return the tables of a pipeline file.
+    """Return the tables `run`, `stages` and, if rules differ, `edges` of a pipeline file that describes `pipeline`.
 
-    `run`: the table [run] without `edge` and `latency_to`, which come from the pipeline.
-    `times_ms`: mean time of a job of each stage, in ms; a stage that is missing gets no time.
-    `taken`: keys of the bypass's table that say which frames take it, `share` or `pattern`.
+    `run`: keys of the table [run] without `edge` and `latency_to`, which come from the pipeline.
+    `times_ms`: mean time of a job of each stage, in ms; a missing stage gets no time.
+    `taken`: key `share` or `pattern` that says which frames take the bypass, with its value.
     """
     joints = list(pipeline.joints.values())
     rules = {before.name: edge.rule for (before, _), edge in zip(joints, pipeline.edges, strict=True)}
@@ -335,7 +339,12 @@ def tables_of(
 
 
 def _stage(pipeline: Pipeline, place: int, payload_bytes: int, times_ms: Mapping[str, float]) -> dict[str, Any]:
-    """Return the keys of the stage at index `place`, whose output has `payload_bytes`."""
+    """Return the keys of the table of one stage.
+
+    `place`: index of the stage.
+    `payload_bytes`: size of its output; 0: it has none.
+    `times_ms`: mean time of a job of each stage, in ms.
+    """
     stage = pipeline.stages[place]
     keys: dict[str, Any] = {"python": stage.factory, "unit": stage.unit}
     if reads := _reads(pipeline, place):
@@ -352,7 +361,7 @@ def _stage(pipeline: Pipeline, place: int, payload_bytes: int, times_ms: Mapping
 def _reads(pipeline: Pipeline, place: int) -> str | dict[str, Any] | None:
     """Return the value of the key `in` of the stage at index `place`; None for a stage without inputs.
 
-    In a chain the value is the stage before it; in a graph it is a table by the names of the stages.
+    In a chain the value is the name of the stage before; in a graph it is a table with a key for each stage read.
     """
     stage: PipelineStage = pipeline.stages[place]
     if stage.inputs is None:
@@ -378,9 +387,11 @@ def unsaid(pipeline: Pipeline) -> Iterator[str]:
 
 
 def file_text(tables: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
-    """Return the tables as TOML, with a line for each key and for each stage. `comments`: lines before the tables.
+    """Return the text of a pipeline file, TOML with one line for each key of a table.
 
-    Names of stages and units need no quotes as keys.
+    A stage is one key of the table [stages]. Keys are written without quotes, which names of stages and units allow.
+
+    `tables`: tables of the file, such as from `tables_of`. `comments`: lines before the tables.
     """
     lines = [f"# {each}" for each in comments]
     for name, table in tables.items():

@@ -24,7 +24,7 @@ DEFAULT_FRAMES: Final = 1000
 
 
 def graph_of(file: PipelineFile, rules: Mapping[str, str]) -> Graph:
-    """Return the scheduler's graph of a file. It is a chain if each stage takes every frame of the stage before it.
+    """Return the scheduler's graph of a file. It is a chain if each stage reads only the stage before, in every frame.
 
     `rules`: edge rule of each stream, by the name of the stage that writes it.
     """
@@ -52,7 +52,7 @@ def bypass_of(file: PipelineFile) -> tuple[str, str] | None:
 def skips_of(file: PipelineFile, seed: int = 0) -> Skips:
     """Return a function that says whether a frame takes the bypass in virtual time.
 
-    If the file does not say which frames take it, no frame does.
+    If the file states neither `share` nor `pattern`, no frame takes the bypass.
 
     `seed`: seed of the random choice by the file's `share`.
     """
@@ -63,7 +63,10 @@ def skips_of(file: PipelineFile, seed: int = 0) -> Skips:
 
 
 def shares_of(file: PipelineFile) -> dict[str, Fraction]:
-    """Return the share of frames that do not skip a stage, 0 to 1, for each stage that some frames skip."""
+    """Return the share (0 to 1) of the frames that do not skip a stage, for each stage that some frames skip.
+
+    The result is empty if no frame takes a bypass.
+    """
     if file.bypass is None or not (taken := file.bypass[1].taken):
         return {}
     names, (begin, end) = list(file.stages), (file.bypass[0], file.bypass[1].to)
@@ -94,12 +97,12 @@ def settings_of(file: PipelineFile, frames: int = 0, seed: int = 0, **others: An
 def edge_rules(file: PipelineFile, times_ns: Mapping[str, int] | None = None) -> dict[str, str]:
     """Return the edge rule of each stream, by the name of the stage that writes it.
 
-    If the file states no rule, a stream has two slots. If branches meet, it may have more: the fewest that do not make
-    the period longer with the file's times. If the file does not state all times, all stages count as equally long, and
-    each stage has a unit of its own. These slots are enough for any times, because no cycle has more stages than slots.
-    A run and all predictions of a file have the same slots.
+    If the file states no rule, a stream has two slots. Where branches meet, a stream may need more slots, so that they
+    do not make the period longer with the file's times. If the file does not state all times, the slots are those for
+    equally long stages, each on a unit of its own. These slots are enough for any times, because no cycle has more
+    stages than slots. A run and all predictions of a file have the same slots.
 
-    `times_ns`: time of a job of each stage, in place of the file's times.
+    `times_ns`: time in ns of a job of each stage, in place of the file's times; None: the file's times.
     """
     given = {name: file.run.edge for name in file.readers} if file.run.edge else {}
     given |= file.edges
@@ -120,6 +123,6 @@ def _own_times_ns(file: PipelineFile) -> dict[str, int]:
 
 
 def in_flight_of(file: PipelineFile) -> int:
-    """Return the limit of frames in flight, the smaller of the file's and its policy's; 0: no limit."""
+    """Return the limit of frames in flight: the smaller of the file's limit and its policy's limit; 0: no limit."""
     limits = [each for each in (file.run.in_flight, POLICIES[file.run.policy].in_flight) if each]
     return min(limits, default=0)

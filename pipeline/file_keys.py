@@ -53,7 +53,7 @@ TYPES: Final = {
 
 
 def shown(value: object) -> str:
-    """Return the text that stands for a wrong value in a message."""
+    """Return a text of at most 80 characters that stands for a wrong value in a message."""
     if isinstance(value, Mapping):
         return "a table"
     if isinstance(value, list):
@@ -63,7 +63,7 @@ def shown(value: object) -> str:
 
 
 def is_number(value: object) -> bool:
-    """Return whether a value of the file is a number; true and false are no numbers."""
+    """Return whether a value of the file is a number; true and false do not count as numbers."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
@@ -147,7 +147,7 @@ class UnitKeys(Keys):
 
 @dataclass(frozen=True)
 class PortType:
-    """What a port carries: `dtype` is a key of TYPES, `shape` has the sizes of its axes."""
+    """The type of the data at a port. `dtype`: key of TYPES. `shape`: sizes of the axes."""
 
     dtype: str
     shape: tuple[int, ...]
@@ -179,7 +179,10 @@ def port_type(text: object) -> PortType:
 
 
 def _ports(value: object) -> object:
-    """Return the ports that a stage writes, by name; a single port has an empty name."""
+    """Return the type of each port that a stage writes, by the port's name; a single port has an empty name.
+
+    `value`: value of the key `out`.
+    """
     if not isinstance(value, dict):
         return {"": port_type(value)}
     if not value:
@@ -192,13 +195,13 @@ def _ports(value: object) -> object:
 
 @dataclass(frozen=True)
 class PortInput:
-    """What a port of a stage reads.
+    """The input of one port of a stage.
 
-    `port`: name of the reading port; empty if the stage has one port.
-    `stage`: stage that is read.
-    `from_port`: port of that stage; empty if it has one port.
+    `port`: name of the reading port; empty if the reading stage has one port.
+    `stage`: name of the stage that is read.
+    `from_port`: port of `stage` that is read; empty if `stage` has one port.
     `latest`: whether the port takes the newest frame instead of the frame of the other inputs.
-    `max_age_ms`: age in ms from which on the newest frame counts as absent; 0: no such age.
+    `max_age_ms`: longest age in ms at which the newest frame is taken; an older frame counts as absent. 0: any age.
     """
 
     port: str
@@ -233,7 +236,10 @@ class InputKeys(Keys):
 
 
 def read_input(port: str, value: object) -> PortInput:
-    """Return one input from its value in the file. `port`: name of the reading port, or empty.
+    """Return one input from its value in the file.
+
+    `port`: name of the reading port; empty if the stage has one port.
+    `value`: a text, or a table with the keys of InputKeys.
 
     Raises UnexpectedValue or pydantic's ValidationError.
     """
@@ -251,7 +257,7 @@ def read_input(port: str, value: object) -> PortInput:
 
 
 def _inside(text: str) -> str:
-    """Return the path; raise UnexpectedValue if it leads out of the file's folder, as a stranger's file may try."""
+    """Return the path `text`. Raise UnexpectedValue if it leads out of the file's folder, as a stranger's file may."""
     normal = posixpath.normpath(text)
     if not text or "\0" in text or "\\" in text or normal in (".", "..") or normal.startswith(("/", "../")):
         remedy = "copy the file there, or put a link to it there"
@@ -260,7 +266,10 @@ def _inside(text: str) -> str:
 
 
 def _mp4(text: str) -> str:
-    """Return the path; raise UnexpectedValue if it is no .mp4, so that no code or network of the folder is replaced."""
+    """Return the path `text`. Raise UnexpectedValue if it does not end with .mp4.
+
+    Without this rule, a run could replace code or a network in the folder.
+    """
     if not text.endswith(".mp4"):
         raise UnexpectedValue(repr(text), "a video to write, such as out.mp4", "let the name end with .mp4")
     return text
@@ -327,7 +336,7 @@ class StageTime(Keys):
 
     @property
     def mean_ms(self) -> float:
-        """The mean of the times."""
+        """The mean of the times in ms."""
         if self.samples:
             return math.fsum(self.samples) / len(self.samples)
         return (self.mean if self.exponential is None else self.exponential) or 0.0
@@ -342,7 +351,7 @@ class StageTime(Keys):
 
     @property
     def varies(self) -> bool:
-        """Whether one job's time may differ from another's."""
+        """Whether the jobs may have different times."""
         return bool(self.sd or self.exponential or len(set(self.samples)) > 1)
 
 
@@ -391,7 +400,7 @@ class BypassKeys(Keys):
         return None if self.share is None else Fraction(str(self.share))
 
     def takes(self, frame: int, seed: int = 0) -> bool:
-        """Return whether a frame takes the bypass. `seed`: seed of the random choice by `share`."""
+        """Return whether frame number `frame` takes the bypass. `seed`: seed of the random choice by `share`."""
         if self.pattern is not None:
             return self.pattern[frame % len(self.pattern)] == "1"
         drawn = blake2b(f"{seed} {frame}".encode(), digest_size=8).digest()
@@ -420,7 +429,7 @@ SIZE_HELP = "Width and height in pixels, such as '640x480'"
 
 
 def _sizes(value: object) -> object:
-    """Return the sizes in a text such as `1x3x224x224`, as a tuple."""
+    """Return the sizes of the axes, as a tuple, from a text such as `1x3x224x224`."""
     found = re.fullmatch(r"\d{1,7}(x\d{1,7}){0,7}", value) if isinstance(value, str) else None
     if found is None or 0 in (sizes := tuple(map(int, found[0].split("x")))):
         raise UnexpectedValue(shown(value), "sizes, such as '1x3x224x224'")

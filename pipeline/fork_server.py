@@ -4,11 +4,11 @@
 every unit needs, then forks a unit for each request. Therefore a unit starts in milliseconds, without imports of its
 own.
 
-A request is one packet on a SOCK_SEQPACKET socket: JSON with descriptors. The descriptors are the unit's spec (in a
-memory file), its stderr, its lifeline, and the descriptors that the spec names. The answer is the unit's process id
-with its pidfd and a pipe. When the unit has ended, the server writes its exit code to that pipe, negative for a signal.
-A request with `call` names a function instead. Its result goes to the pipe that comes with the request, and there is no
-other answer.
+A request is one packet on a SOCK_SEQPACKET socket: JSON with descriptors. The descriptors are the unit's spec (a memory
+file with JSON for the unit's loop), its stderr, its lifeline, and the descriptors that the spec names. The answer is
+the unit's process id with its pidfd and a pipe. When the unit has ended, the server writes the exit code to this pipe,
+negative for a signal. A request with the key `call` names a function to call in place of a unit to start. The
+function's result goes to a pipe that comes with the request; the server gives no other answer.
 
 A lifeline is a pipe whose other end only the parent has: the kernel kills the unit when that end is closed.
 """
@@ -43,12 +43,12 @@ THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "
 
 
 def process_name(unit: str) -> str:
-    """Return the kernel's name for the process of `unit` (`ps -o comm`): 15 bytes at most."""
+    """Return the kernel's name for the process of `unit` (`ps -o comm`), which has at most 15 bytes."""
     return f"trilane-{unit}"[:15]
 
 
 def serve(requests: socket.socket) -> None:
-    """Fork a unit for each request, until the other end is closed and every unit has ended."""
+    """Fork a unit for each request, until the other end of `requests` is closed and every unit has ended."""
     server_pid = os.getpid()
     codes: dict[int, int] = {}  # pipe for the exit code of each living unit, by process id
     signal.signal(signal.SIGCHLD, lambda _number, _frame: _reap(codes, os.WNOHANG))
@@ -84,7 +84,7 @@ def _reap(codes: dict[int, int], options: int) -> None:
     """Reap the units that have ended, and write their exit codes to their pipes.
 
     `codes`: pipe of each living unit, by process id.
-    `options`: options of waitpid; WNOHANG: only units that have ended already. 0: wait for all units.
+    `options`: options of waitpid. WNOHANG: reap only units that have ended already; 0: wait for all units.
     """
     with contextlib.suppress(ChildProcessError):
         while (ended := os.waitpid(-1, options))[0]:
@@ -95,7 +95,11 @@ def _reap(codes: dict[int, int], options: int) -> None:
 
 
 def _run_unit(request: dict[str, Any], fds: Sequence[int]) -> int:
-    """Run the whole life of a unit in the forked process, and return its exit code."""
+    """Run the whole life of a unit in the forked process, and return its exit code.
+
+    `request`: JSON object of the request: name, cores and threads of the unit, and names of its descriptors.
+    `fds`: descriptors of the request.
+    """
     try:
         spec_fd, stderr_fd, lifeline, *passed = fds
         _die_with(lifeline)
@@ -143,9 +147,10 @@ def _leave_server() -> None:
 
 
 def _die_with(lifeline: int) -> None:
-    """Let the kernel kill this process when the pipe's other end is closed; end it now if that end is closed already.
+    """Let the kernel kill this process when the other end of its lifeline is closed.
 
-    Unlike a parent-death signal, this does not depend on which process or thread forked this one.
+    If the other end is closed already, this process ends now. Unlike a parent-death signal, a lifeline does not depend
+    on which process or thread forked this process.
     """
     fcntl.fcntl(lifeline, F_SETSIG, signal.SIGKILL)
     fcntl.fcntl(lifeline, fcntl.F_SETOWN, os.getpid())
@@ -159,7 +164,9 @@ def _die_with(lifeline: int) -> None:
 def die_with_parent(parent_pid: int, number: int = signal.SIGKILL) -> None:
     """Let the kernel send this process the signal `number` when its parent ends.
 
-    End the process now if the parent has ended already.
+    If the parent has ended already, end this process now.
+
+    `parent_pid`: process id of the parent.
     """
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.prctl(PR_SET_PDEATHSIG, number, 0, 0, 0) != 0:

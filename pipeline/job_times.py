@@ -1,11 +1,11 @@
 """Measures the jobs of a unit in the unit's process: times by the kernel, and counts by the processor.
 
-Rule for times: the kernel counts, and its counts are read when no frame waits for the answer. A unit is busy for at
-most its CPU time.
+Rule for times: the kernel counts, and its counts are read at moments when no frame waits for the unit. A unit is busy
+for at most its CPU time.
 
-CPU time is CLOCK_PROCESS_CPUTIME_ID, over all threads. The run delay of a thread is the time in ns in which it was
-ready and another thread had the core. It is the second number of `/proc/self/task/TID/schedstat`
-(Documentation/scheduler/sched-stats.rst of the kernel). The file is opened once and read again.
+CPU time is CLOCK_PROCESS_CPUTIME_ID, over all threads. The run delay of a thread is the time in ns in which the thread
+was ready but another thread had the core. Run delay is the second number of `/proc/self/task/TID/schedstat`
+(Documentation/scheduler/sched-stats.rst of the kernel). This file is opened once, and read again and again.
 
 A piece of time is a job, or the time between two jobs. Every ns of CPU time is in one piece. Each piece has three
 numbers, in ns:
@@ -20,15 +20,15 @@ Before a job, counts are read only in three cases:
 - other threads may have run between the jobs.
 
 docs/decisions/preempted-time.md says what the two thresholds can hide. It derives preempted time and sleep from the
-three numbers, and proves that units which share cores are never busy for longer than those cores.
+three numbers. It also proves that the busy times of units that share cores never exceed the time of these cores.
 
 Rule for counts: instructions and cache misses are the processor's counts (perf_event_open), or are reported as absent.
-Only user mode counts. A counter covers the thread that opens it and all threads that begin later in this thread or in
-its children; the kernel adds them up (`inherit`). A processor with fewer counters than events counts each event for a
-part of the time; such counts are scaled to the whole time.
+Only user mode counts. A counter covers the thread that opens it, and all threads that this thread or its children begin
+later; the kernel adds up their counts (`inherit`). A processor with fewer counters than events counts each event for a
+part of the time. Counts for a part of the time are scaled to the whole time.
 
 Each event is opened and read by itself, because `inherit` does not work with a group (`man 2 perf_event_open`). Some
-kernels refuse to read such a group (ECHILD). If a count cannot be read, the job goes on without it.
+kernels refuse to read a group with `inherit` (ECHILD). If a count cannot be read, the job goes on without it.
 """
 
 from __future__ import annotations
@@ -63,9 +63,9 @@ def counts_run_delay(process: str = PROCESS) -> bool:
 
 
 class CoreMeter:
-    """Counts CPU time and run delay from its creation on. `look` finds threads that begin later.
+    """Counts CPU time and run delay of this process from its creation on. `look` finds threads that begin later.
 
-    `others`: ids of threads that are not counted.
+    `others`: ids of threads whose run delay is not counted.
     `process`: path of the kernel's folder of this process.
     """
 
@@ -81,7 +81,7 @@ class CoreMeter:
 
     @property
     def threads(self) -> int:
-        """The number of threads that the last look found."""
+        """The number of threads that the last call of `look` found."""
         return len(self._files)
 
     def cpu_ns(self) -> int:
@@ -104,7 +104,7 @@ class CoreMeter:
         return delay_ns
 
     def look(self) -> None:
-        """Find the threads that have begun and ended since the last look, if the number of threads has changed."""
+        """If the number of threads has changed, find the threads that have begun or ended since the last call."""
         if self._folder < 0:
             return
         threads = os.fstat(self._folder).st_nlink - _LINKS_BESIDE_THREADS
@@ -133,7 +133,7 @@ class CoreMeter:
         self._born_ns += delay_ns
 
     def close(self) -> None:
-        """Close every file."""
+        """Close all files of the kernel that the meter has opened."""
         for file in self._seen_ns:
             os.close(file)
         self._files.clear()
@@ -146,8 +146,8 @@ class CoreMeter:
 class Lost(NamedTuple):
     """Parts of a piece of time in which a unit did not work, in ns.
 
-    `preempted_ns`: time for which it waited for a core.
-    `asleep_ns`: time for which it slept.
+    `preempted_ns`: time for which the unit waited for a core.
+    `asleep_ns`: time for which the unit slept.
     """
 
     preempted_ns: int
@@ -155,22 +155,26 @@ class Lost(NamedTuple):
 
 
 def most_preempted_ns(wall_ns: int, cpu_ns: int, cores: int) -> int:
-    """Return the longest time in ns within `wall_ns` that a unit can have waited for its cores.
+    """Return the longest time in ns for which a unit can have waited for its cores.
 
-    It is the rest of `wall_ns` if the unit's CPU time is divided evenly among its cores.
+    It is `wall_ns` less the CPU time for each core, if the CPU time is divided evenly among the cores.
 
+    `wall_ns`: length of the piece of time.
+    `cpu_ns`: CPU time of the unit's threads in it, summed over the threads.
     `cores`: number of the unit's cores.
     """
     return max(wall_ns - -(-cpu_ns // cores), 0)
 
 
 def preempted_ns(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int) -> int:
-    """Return the time in ns within `wall_ns` that a unit waited for its cores.
+    """Return the time in ns for which a unit waited for its cores.
 
-    Its threads were ready for cpu + delay in sum. Therefore m = (cpu + delay) / wall threads were ready at a time, but
-    at least one. They waited for delay / m, and at most for the time that the CPU time leaves of the cores. With one
+    The sum of the times in which a thread was ready is cpu + delay. Therefore m = (cpu + delay) / wall threads were
+    ready at a time, but at least one. The unit waited for delay / m, but not longer than `most_preempted_ns`. With one
     core the result is min(delay, wall - cpu).
 
+    `wall_ns`: length of the piece of time.
+    `cpu_ns`, `delay_ns`: CPU time and run delay of the unit's threads in it, summed over the threads.
     `cores`: number of the unit's cores.
     """
     if not delay_ns:
@@ -180,9 +184,9 @@ def preempted_ns(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int) -> int:
 
 
 def lost_in_job(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int, has_device: bool) -> Lost:
-    """Return the times that a job lost because its unit was preempted or asleep.
+    """Return the parts of a job in which its unit was preempted or asleep.
 
-    The unit was busy for the rest of the job. Without a device, the rest is at most `cpu_ns`.
+    In all other time of the job the unit was busy. Without a device, this busy time is at most `cpu_ns`.
 
     `wall_ns`: length of the job.
     `cpu_ns`, `delay_ns`: CPU time and run delay of the unit's threads in the job, summed over the threads.
@@ -200,7 +204,7 @@ JOBS_PER_LOOK: Final = 64  # jobs between two searches for new threads, if no jo
 
 
 class Meter(Protocol):
-    """The part of `CoreMeter` that a `JobClock` uses."""
+    """The methods of `CoreMeter` that a `JobClock` uses."""
 
     @property
     def threads(self) -> int: ...
@@ -213,9 +217,10 @@ class Meter(Protocol):
 
 
 class JobClock:
-    """Measures the jobs of a unit with `cores` cores and `stages` stages.
+    """Measures the jobs of a unit.
 
-    `meter`: counts of the unit's process.
+    `meter`: meter of the unit's process.
+    `cores`, `stages`: number of cores and of stages of the unit.
     `now_ns`: function that returns the time in ns.
     """
 
@@ -233,7 +238,7 @@ class JobClock:
         self.restart()
 
     def restart(self) -> None:
-        """Begin the time between two jobs now, with the threads that exist."""
+        """Begin the time between two jobs now, and count from now on all threads that exist."""
         self._look()
         self._meter.delay_ns()
         self._meter.cpu_ns()
@@ -283,8 +288,8 @@ class JobClock:
     def answered(self) -> None:
         """Read the counts of the time since the job's end; called after the answer was sent.
 
-        If the run delay was not read at the job's end, part of it belongs to the job. Therefore at most the time since
-        that end counts, because this thread did not sleep in it.
+        If the run delay was not read at the job's end, part of it belongs to the job. Therefore the run delay counts
+        only up to the length of the time since the job's end. In this time the calling thread did not sleep.
         """
         delay_ns = self._meter.delay_ns()
         self._cpu_before_ns = self._meter.cpu_ns()
@@ -325,9 +330,9 @@ class CountedEvent(NamedTuple):
 class Reading(NamedTuple):
     """One reading of a counter.
 
-    `value`: its count.
-    `enabled_ns`: time for which the counter was enabled.
-    `running_ns`: part of this time in which the processor counted.
+    `value`: count so far.
+    `enabled_ns`: time in ns for which the counter was enabled so far.
+    `running_ns`: part of `enabled_ns` in which the processor counted.
     """
 
     value: int
@@ -339,9 +344,10 @@ KINDS: Final = (CountedEvent("instructions", HARDWARE, 1), CountedEvent("cache_m
 
 
 class HardwareCounters:
-    """Counts the events `kinds` that the kernel allows, for this thread and for all threads that it begins later.
+    """Counts events of the processor, for this thread and for all threads that it begins later.
 
-    Raises OSError if none of them can be counted.
+    `kinds`: events to count; an event that the kernel refuses is left out.
+    Raises OSError if no event can be counted.
     """
 
     def __init__(self, kinds: Sequence[CountedEvent] = KINDS) -> None:
@@ -363,13 +369,13 @@ class HardwareCounters:
         return list(self._files)
 
     def begin(self) -> None:
-        """Note that a job begins."""
+        """Begin to count for a new job."""
         self._before = self._read()
 
     def figures(self) -> dict[str, float]:
-        """Return the counts since `begin`, by name.
+        """Return the counts since `begin`, by the event's name.
 
-        A count that the processor did not make, or that cannot be read, is left out.
+        An event that the processor did not count, or whose count cannot be read, is left out.
         """
         figures = {}
         for name, now in self._read().items():
@@ -402,7 +408,7 @@ class NoCounters:
     def begin(self) -> None: ...
 
     def figures(self) -> dict[str, float]:
-        """Return no counts."""
+        """Return an empty dict: there are no counts."""
         return {}
 
     def close(self) -> None: ...
@@ -461,7 +467,7 @@ def paranoid_level() -> int | None:
 
 
 def remedy(why: str) -> str:
-    """Return the command, or the condition, that removes a reason. `why`: reason, from `absence`."""
+    """Return the remedy for a reason: a command, or part of a sentence. `why`: reason, from `absence`."""
     if "perf_event_paranoid" in why:
         return f"sysctl kernel.perf_event_paranoid={MOST_PARANOID}"
     return "needs a machine of its own" if "virtual" in why else "allow perf_event_open"

@@ -1,11 +1,12 @@
 """The journal of a run: one file that records what happens, in order, during the run. Readers may follow it.
 
-Rule: nothing of a run is kept in memory only because it may be needed later. A reader takes it from the journal, during
-the run or after it, from the same bytes.
+Rule: a run keeps nothing in memory only because a reader may need it later. Readers take everything from the journal,
+during the run or after it.
 
-The file is MessagePack. Each record is an array: the index of the record's type in RECORDS, then its fields. The first
-record is a `Begun`. A step comes before the accounts, jobs and counts that follow from it, and all of these before the
-next step. A journal that ends within a record, or without `Ended`, belongs to a run that was killed or still goes on.
+The file is MessagePack. Each record is an array: the index of the record's type in RECORDS, then the record's fields.
+The first record is a `Begun`. The record of a step is followed by the accounts, jobs and counts that result from the
+step, and only then by the next step. A journal that ends within a record, or without `Ended`, belongs to a run that was
+killed or still goes on.
 """
 
 from __future__ import annotations
@@ -81,9 +82,9 @@ class Worked(NamedTuple):
 
 
 class Counted(NamedTuple):
-    """Numbers of frames `lost` and `dropped` until `now_ns`, by the cause's key in the report.
+    """Numbers of frames that were `lost` and `dropped` until `now_ns`, each by the cause's key in the report.
 
-    The record is written when a number has changed.
+    The record is written after each step that changes one of these numbers.
     """
 
     now_ns: int
@@ -92,28 +93,28 @@ class Counted(NamedTuple):
 
 
 class Sampled(NamedTuple):
-    """Readings at `now_ns`, by dotted name, such as `temperature_c.device` or `duty.gpu`."""
+    """Measured values at `now_ns`, by dotted name, such as `temperature_c.device` or `duty.gpu`."""
 
     now_ns: int
     values: Mapping[str, float]
 
 
 class Said(NamedTuple):
-    """A message to a person."""
+    """A message of the run to its user, at `now_ns`."""
 
     now_ns: int
     text: str
 
 
 class Ended(NamedTuple):
-    """The last record. `report`: figures of the whole run, as `RunMetrics.as_json()` returns them."""
+    """The last record. `report`: report of the whole run, as `RunMetrics.as_json()` returns it."""
 
     now_ns: int
     report: Mapping[str, Any]
 
 
 class Stopped(NamedTuple):
-    """At `now_ns` the process of `unit` was seen stopped by a signal; there is one record for each stop."""
+    """A signal has stopped the process of `unit`, as seen at `now_ns`; there is one record for each stop."""
 
     now_ns: int
     unit: str
@@ -125,14 +126,15 @@ _PLACES = {kind: place for place, kind in enumerate(RECORDS)}
 
 
 class JournalWriter:
-    """Context manager that writes records: `add` buffers one, and `flush` or the end writes all to the file.
+    """Context manager that writes records: `add` buffers a record, and `flush` or the end writes all to the file.
 
-    If the file cannot be written, such as on a full disk, one method raises an UnwrittenError. After that, nothing more
-    is written.
+    If the file cannot be written, such as on a full disk, the method that notices this raises an UnwrittenError. After
+    that, nothing more is written.
 
     `path`: path of a file that does not exist yet.
-    Raises OSError if the file cannot be made.
     `failure`: the UnwrittenError that was raised, or None.
+
+    Raises OSError if the file cannot be made.
     """
 
     def __init__(self, path: Path) -> None:
@@ -152,9 +154,9 @@ class JournalWriter:
             self._fail(UnwrittenError(self._path, error))
 
     def flush(self) -> None:
-        """Write all added records to the file, so that its readers see them.
+        """Write all added records to the file, so that the file's readers see them.
 
-        A file that was removed counts as a file that cannot be written.
+        Raises UnwrittenError if the file cannot be written, or was removed.
         """
         if self.failure is not None:
             return
@@ -184,9 +186,9 @@ class JournalWriter:
 
 
 class JournalReader:
-    """Reads the journal at `path` while it grows. If the file is moved, set `path` to its new path.
+    """Reads the journal at `path` while the journal grows. If the file is moved, set `path` to its new path.
 
-    Raises BadInputError for a file that is no journal, and for a bad record, with the record's number from 1 on.
+    Raises BadInputError for a file that is no journal. For a bad record, the error names the record's number, from 1.
     """
 
     def __init__(self, path: Path) -> None:
@@ -231,7 +233,7 @@ class JournalReader:
             raise self._refused(f"more than {MAX_RECORD_BYTES} bytes")
 
     def _refused(self, found: str) -> BadInputError:
-        """Return the error for the next record, which cannot be read. `found`: its defect."""
+        """Return the error for the next record, which cannot be read. `found`: the record's defect."""
         return BadInputError(f"{self.path}, record {self._count + 1}", found, EXPECTED)
 
     def _record(self, row: Any) -> Record:
@@ -252,7 +254,10 @@ class JournalReader:
 
 
 def journal_in(folder: Path) -> Path | None:
-    """Return the path of a run folder's journal, or None. Raises BadInputError for anything that is not a file."""
+    """Return the path of a run folder's journal; None without a journal.
+
+    Raises BadInputError if the path exists but is not a file.
+    """
     path = folder / NAME
     if path.exists() and not path.is_file():
         require_file(path, EXPECTED)
@@ -262,7 +267,7 @@ def journal_in(folder: Path) -> Path | None:
 def read_journal(path: Path) -> Iterator[Record]:
     """Yield every whole record of the journal at `path`.
 
-    Raises BadInputError, also for an empty file and for a pipe.
+    Raises BadInputError for a file that is no journal, an empty file and a pipe.
     """
     require_file(path, EXPECTED)
     reader = JournalReader(path)
@@ -275,14 +280,18 @@ def read_journal(path: Path) -> Iterator[Record]:
 
 
 def records_of(recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[Record]:
-    """Yield the records, of a run in memory, that are needed to find what bounded it: steps, accounts and jobs."""
+    """Yield the records of a run in memory from which its bound is found: steps, accounts and jobs.
+
+    `recording`: recording of the run.
+    `jobs`: finished jobs of the run.
+    """
     for stepped, others in _steps_of(recording, jobs):
         yield stepped
         yield from others
 
 
 def _steps_of(recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[tuple[Stepped, list[Record]]]:
-    """Yield each step's record, with the records of the accounts that it changed and of the jobs that it ended."""
+    """Yield pairs (record of a step, records of the accounts that changed and the jobs that ended with the step)."""
     accounts = deque(recording.accounts)
     left: dict[str, deque[JobRecord]] = {unit: deque() for unit in recording.graph.units}
     for job in sorted(jobs, key=lambda job: job.begin_ns):
@@ -300,12 +309,13 @@ def _steps_of(recording: Recording, jobs: Iterable[JobRecord]) -> Iterator[tuple
 def journal_of(
     recording: Recording, jobs: Iterable[JobRecord], facts: Mapping[str, Any], report: Mapping[str, Any]
 ) -> Iterator[Record]:
-    """Yield the records of a run in memory, such as one in virtual time (`Simulation` with `keep`).
+    """Yield the records of a run in memory, such as a run in virtual time (`Simulation` with `keep`).
 
     A second `Core` takes the same events, and counts the lost and dropped frames.
 
-    `facts`: facts of `Begun`.
-    `report`: report of `Ended`.
+    `recording`, `jobs`: recording and finished jobs of the run.
+    `facts`: facts of the first record, `Begun`.
+    `report`: report of the last record, `Ended`.
     """
     core, counted, now_ns = Core(recording.graph, recording.settings), 0, 0
     yield Begun(SCHEMA, recording.graph, recording.settings, facts)
@@ -321,9 +331,9 @@ def journal_of(
 
 
 def config_of(begun: Begun) -> Mapping[str, Any]:
-    """Return the configuration in a journal's first record; empty for a journal without one.
+    """Return the configuration (`config` of report.json) in a journal's first record; empty if there is none.
 
-    Raises BadInputError for a configuration that no run writes.
+    Raises BadInputError for a configuration of a form that no run writes.
     """
     config = begun.facts.get("config", {})
     if not isinstance(config, Mapping) or not all(
@@ -353,7 +363,7 @@ _FIELDS: dict[type[Any], Callable[[Any], list[Any]]] = {
 }
 
 
-#: The defect of the bytes, by the exception that the MessagePack reader raises.
+#: Pairs of an exception that the MessagePack reader raises, and the defect of the bytes that this exception means.
 _UNREADABLE: tuple[tuple[type[Exception], str], ...] = (
     (msgpack.FormatError, "bytes that are no MessagePack"),
     (msgpack.StackError, "lists inside lists, too deep"),
@@ -366,7 +376,10 @@ _Checks = tuple[tuple[Callable[[Any], Any], ...], ...]
 
 
 def _checks(run: RunValues) -> _Checks:
-    """Return the checks of the fields of each type of record, in the order of RECORDS."""
+    """Return one function for each field of each type of record, in the order of RECORDS.
+
+    Each function takes a field's value from the file, and returns the checked value.
+    """
     of: dict[type[Any], tuple[Callable[[Any], Any], ...]] = {
         Begun: (),
         Stepped: (run.step_ns, run.events, run.actions),

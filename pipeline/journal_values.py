@@ -1,7 +1,7 @@
 """Checks the values of a journal's records.
 
-Rule: a check takes a value that was read from an untrusted file. It returns the checked value, or raises
-UnexpectedValue in plain words. The state that checks keep does not grow with the run.
+Rule: each function takes a value that was read from an untrusted file. It returns the checked value, or raises
+UnexpectedValue in plain words. What the checks remember of earlier records does not grow with the run.
 """
 
 from __future__ import annotations
@@ -36,27 +36,27 @@ _NAMED: Final = {
 
 
 def shown(value: Any) -> str:
-    """Return the text that stands for a value in a message."""
+    """Return a text that stands for a value in a message; a long text is cut to LONGEST_FOUND characters."""
     text = repr(value)
     return text if len(text) <= LONGEST_FOUND else f"{text[:LONGEST_FOUND]}…"
 
 
 def time_ns(value: Any) -> int:
-    """Return a time of the run's clock in ns."""
+    """Return a time of the run's clock in ns, 0 to NEVER."""
     if type(value) is not int or not 0 <= value <= NEVER:
         raise UnexpectedValue(f"time {shown(value)}", A_TIME)
     return value
 
 
 def text(value: Any) -> str:
-    """Return a text."""
+    """Return `value`, which must be a text."""
     if type(value) is not str:
         raise UnexpectedValue(f"text {shown(value)}", "a text")
     return value
 
 
 def numbers(value: Any) -> Mapping[str, float]:
-    """Return finite numbers by name."""
+    """Return `value`, which must be a map from names to finite numbers."""
     if type(value) is not dict:
         raise UnexpectedValue(shown(value), "numbers by name")
     if not (set(map(type, value)) <= {str} and set(map(type, value.values())) <= NUMBERS):
@@ -67,7 +67,7 @@ def numbers(value: Any) -> Mapping[str, float]:
 
 
 def counts(value: Any) -> Mapping[str, int]:
-    """Return whole numbers by name, each at least 0."""
+    """Return `value`, which must be a map from names to whole numbers of at least 0."""
     found: Any = numbers(value)
     if any(type(each) is not int or each < 0 for each in found.values()):
         raise UnexpectedValue(shown(value), "whole numbers from 0 on, by name")
@@ -75,7 +75,7 @@ def counts(value: Any) -> Mapping[str, int]:
 
 
 def facts(value: Any) -> Mapping[str, Any]:
-    """Return values that JSON can contain, by name."""
+    """Return the facts of a record, by name: values that JSON can contain, at most MOST_NESTED levels deep."""
     if type(value) is not dict:
         raise UnexpectedValue(shown(value), "facts by name")
     waiting: list[tuple[Any, int]] = [(value, 1)]
@@ -93,7 +93,7 @@ def facts(value: Any) -> Mapping[str, Any]:
 
 
 def graph(value: Any) -> Graph:
-    """Return the graph of a run, with names that a terminal can show."""
+    """Return the graph of a run from its JSON object. Its names must be printable."""
     try:
         found = graph_of(value)
         names = [name for stage in found.stages for name in (stage.name, stage.unit)]
@@ -109,7 +109,10 @@ def graph(value: Any) -> Graph:
 
 
 def settings(value: Any, of_graph: Graph) -> Settings:
-    """Return the settings of a run with the graph `of_graph`, after making a scheduler `Core` from both."""
+    """Return the settings of a run from their JSON object. A scheduler `Core` must accept them.
+
+    `of_graph`: graph of the run.
+    """
     try:
         found = settings_of(value)
         for name, kind in SETTINGS_TYPES.items():
@@ -135,7 +138,7 @@ def _check_setting(name: str, kind: type[Any], value: Any) -> None:
 
 
 class RunValues:
-    """Checks values against the graph of a run or against earlier records: times of steps, names, jobs."""
+    """Checks values against the graph of a run, and against earlier records: times of steps, names, jobs."""
 
     def __init__(self, of_graph: Graph) -> None:
         self._unit_of = {stage.name: stage.unit for stage in of_graph.stages}
@@ -144,7 +147,7 @@ class RunValues:
         self._step_ns = 0
 
     def step_ns(self, value: Any) -> int:
-        """Return the time of a step in ns, which is not before the last step's time."""
+        """Return the time of a step in ns, which must not be before the last step's time."""
         if type(value) is not int or not self._step_ns <= value <= NEVER:
             raise UnexpectedValue(
                 f"time {shown(value)} of a step", f"{A_TIME}, not before the last step's {self._step_ns}"
@@ -159,14 +162,14 @@ class RunValues:
         return value
 
     def account(self, value: Any) -> int:
-        """Return an account of the ledger."""
+        """Return the number of an account of the ledger."""
         if type(value) is not int or value not in ACCOUNTS:
             known = ", ".join(f"{number} ({name})" for number, name in ACCOUNTS.items())
             raise UnexpectedValue(f"account {shown(value)}", f"one of {known}")
         return value
 
     def events(self, rows: Any) -> tuple[Event, ...]:
-        """Return the events of a step."""
+        """Return the events of a step from their rows (`recording.row_of`)."""
         found = events_of(_rows(rows))
         for row in rows:
             self._check_row(row)
@@ -175,16 +178,16 @@ class RunValues:
         return found
 
     def actions(self, rows: Any) -> tuple[Action, ...]:
-        """Return the actions of a step."""
+        """Return the actions of a step from their rows (`recording.row_of`)."""
         found = actions_of(_rows(rows))
         for row in rows:
             self._check_row(row)
         return found
 
     def _check_row(self, row: tuple[Any, ...]) -> None:
-        """Check that a row names a unit and a stage of the graph, and that its numbers are in range.
+        """Check that a row names only units and stages of the graph, and that its numbers are in range.
 
-        The types of its values are already checked.
+        `row`: row of an event or action, whose types are already checked.
         """
         unit, stage = _NAMED.get(row[0], (0, 0))
         if unit and row[unit] not in self._units:
@@ -196,7 +199,10 @@ class RunValues:
                 raise UnexpectedValue(f"{value} in {row[0]}", f"a whole number from -1 to {NEVER}")
 
     def job(self, row: Any) -> JobRecord:
-        """Return a job that has ended. Each stage does frames in order, and no frame twice."""
+        """Return a job that has ended, from the values of its fields.
+
+        Its frame must be newer than the last frame of its stage.
+        """
         if type(row) is not tuple or tuple(map(type, row)) not in (JOB_TYPES, JOB_TYPES[:-1]):
             raise UnexpectedValue(f"job {shown(row)}", f"texts and whole numbers: {', '.join(JobRecord._fields)}")
         job = JobRecord(*row)

@@ -1,16 +1,16 @@
 """The memory that the units of a run share, for edges and assets, and counts of the bytes that move through it.
 
-Rule: the parent makes a region for each edge, and always closes it. Assets are written once, sealed, mapped, and never
-copied.
+Rule: the parent process makes a region for each edge, and always closes it. Assets are written once, sealed, mapped,
+and never copied.
 
-One region of anonymous memory contains all assets. It begins with 8 bytes for the length of the index, then the index
-as JSON, then the arrays, each on its own page. A unit maps the region read-only. The kernel frees it when the last
-process that has it ends.
+One region of anonymous memory contains all assets. It begins with 8 bytes for the length of the index. The index as
+JSON follows, and after it the arrays, each from the begin of a page. A unit maps the region read-only. The kernel frees
+the region when the last process that has it ends.
 
 A stage counts the bytes that it moves for a frame, and the least number of bytes that the frame needs. A byte counts at
 each memory from which it is read or to which it is written. A copy from a slot to the GPU counts as read and as
 uploaded; a copy back counts as read back and as written. Therefore the four counts add up to all bytes that passed
-through the memories. A stage that copies nothing between its input and its output moves its least.
+through the memories. A stage that copies nothing between its input and its output moves only its least.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ from trilane.transport.slots import edge_rule
 
 
 class EdgeRegion(Model):
-    """A region that a unit maps.
+    """The shared memory of an edge, which units map.
 
-    `fd`: descriptor of the region, which the unit's process inherits.
+    `fd`: descriptor of the memory, which the units' processes inherit.
     `slots`: number of slots.
     `header`: dtype of every packet's header.
     `payload_bytes`: bytes of every packet's payload.
@@ -63,7 +63,7 @@ class EdgeRegion(Model):
 
 @contextlib.contextmanager
 def edge_regions(pipeline: Pipeline) -> Iterator[dict[str, EdgeRegion]]:
-    """Within the context, each edge has a region of memory: yield the regions by the edges' names.
+    """Make a region of memory for each edge, and yield the regions by the edges' names; close them at the end.
 
     Raises TrilaneError if there is too little memory.
     """
@@ -89,7 +89,7 @@ _KINDS = "?biufcmMSU"  # kinds of NumPy types whose values contain no Python obj
 def share_assets(assets: Assets) -> int:
     """Return a descriptor of sealed memory that holds `assets`.
 
-    Raises TrilaneError if there is too little memory, and for arrays of another kind than numbers, times and text.
+    Raises TrilaneError if there is too little memory, or if an array contains anything but numbers, times and text.
     """
     index, end = _index(assets)
     free = machine.here.free_bytes()
@@ -113,7 +113,7 @@ def share_assets(assets: Assets) -> int:
 
 
 def map_assets(fd: int) -> dict[str, NDArray[Any]]:
-    """Return read-only views of the arrays in `fd`, in the order in which they were given."""
+    """Return read-only views of the assets by name. `fd`: descriptor from `share_assets`."""
     view = memoryview(mmap.mmap(fd, os.fstat(fd).st_size, prot=mmap.PROT_READ))
     length = int.from_bytes(view[:_LENGTH_BYTES], "little")
     index: dict[str, Any] = json.loads(bytes(view[_LENGTH_BYTES : _LENGTH_BYTES + length]))
@@ -127,9 +127,10 @@ def map_assets(fd: int) -> dict[str, NDArray[Any]]:
 
 
 def _index(assets: Assets) -> tuple[dict[str, dict[str, Any]], int]:
-    """Return (type, shape and offset of every array by its name, end of the last array in bytes).
+    """Return (index, end of the last array in bytes).
 
-    Offsets count from the first page after the index.
+    The index has `dtype`, `shape` and `offset` of each array, by the array's name. Offsets are bytes from the begin of
+    the first page after the index.
     """
     index, offset = {}, 0
     for name, array in assets.items():
@@ -151,7 +152,7 @@ def _write_all(fd: int, array: NDArray[Any], offset: int) -> None:
         data, offset = data[written:], offset + written
 
 
-#: Key in report.json of each count, and name of the metric by which a stage reports it.
+#: Name of the metric with which a stage reports each count, by the count's key in report.json.
 NAMES = {
     "read": "bytes_read",
     "written": "bytes_written",
@@ -171,8 +172,8 @@ class ByteCounter:
     `written`: bytes written into the output slot or the file.
     `uploaded`: bytes moved from the CPU's memory into the GPU's.
     `read_back`: bytes moved from the GPU's memory into the CPU's.
-    `least`: bytes that the frame needs: the part of the input that it depends on, read once, and the output, written
-    once.
+    `least`: bytes that the frame needs. They are the part of the input on which the frame depends, read once, and the
+    output, written once.
     """
 
     read: int = 0
@@ -182,7 +183,7 @@ class ByteCounter:
     least: int = 0
 
     def start(self, passed_on: int = 0) -> None:
-        """Begin a frame. `passed_on`: size in bytes of the header, which is copied from input slot to output slot."""
+        """Begin a frame. `passed_on`: bytes of the header that is copied from input slot to output slot; 0: none is."""
         self.read = self.written = passed_on
         self.uploaded = self.read_back = self.least = 0
 
@@ -203,10 +204,10 @@ class ByteCounter:
 
 
 def add_bytes(report: dict[str, Any], sums: Mapping[str, Mapping[str, float]]) -> None:
-    """Add the mean bytes that each stage moved for a presented frame, and their total, to `report`.
+    """Add `bytes` to each stage of a report, and to the report: mean bytes moved for a presented frame.
 
-    A stage without a job moved nothing; a stage that does not count bytes gets no row. If no frame was presented or no
-    stage counts, nothing is added.
+    A stage without a job moved nothing. A stage whose jobs do not count bytes gets no `bytes`. If no frame was
+    presented, or no stage counts bytes, nothing is added.
 
     `report`: keys of report.json.
     `sums`: sums of each stage's metrics over its jobs, by stage and metric.
@@ -225,7 +226,13 @@ def add_bytes(report: dict[str, Any], sums: Mapping[str, Mapping[str, float]]) -
 
 
 def _per_frame(sums: Mapping[str, float], frames: int) -> dict[str, float | None]:
-    """Return the mean bytes per frame by key, and `ratio`, all moved bytes over the least; None if the least is 0."""
+    """Return the mean bytes per frame by the keys of `NAMES`, and `ratio`: all moved bytes over the least.
+
+    `ratio` is None if the least is 0.
+
+    `sums`: sums over the run, by metric.
+    `frames`: number of presented frames.
+    """
     least = sums[NAMES[_LEAST]]
     means = {key: sums[name] / frames for key, name in NAMES.items()}
     return {**means, "ratio": _moved(sums) / least if least else None}

@@ -80,12 +80,12 @@ AnyKeys = TypeVar("AnyKeys", bound=Keys)
 class PipelineFile:
     """A checked pipeline file.
 
-    `path`: path of the file; paths in it are relative to its folder.
+    `path`: path of the file; paths in the file are relative to the file's folder.
     `run`: keys of the table [run].
-    `stages`: stages by name, each after the stages that it reads, otherwise in the order of the file.
+    `stages`: stages by name, in the order of the file; but each stage comes after the stages that it reads.
     `units`: every unit that a stage names, in the order of the stages.
     `edges`: rules that the table [edges] states, by the stage that writes the stream.
-    `tables`: unchanged tables of the file.
+    `tables`: tables of the file as they were read, without checks.
     """
 
     path: Path
@@ -100,7 +100,7 @@ class PipelineFile:
         return self.path.parent
 
     def hardware(self, unit: str) -> str | None:
-        """Return the unit of a hardware profile (cpu, gpu or dsp) that `unit` stands for; None if it is unknown."""
+        """Return the unit of a hardware profile (cpu, gpu or dsp) for which `unit` stands; None if there is none."""
         return self.units[unit].hardware or (unit if unit in UNITS else None)
 
     @property
@@ -114,7 +114,10 @@ class PipelineFile:
 
     @property
     def periods(self) -> dict[str, int]:
-        """The distance in frames between the frames that each stage takes, by its own and its inputs' `every`."""
+        """The distance, in frames, between the frames that each stage takes, by the stage's name.
+
+        It is the least common multiple of `every` of the stage and of the stages before it.
+        """
         found: dict[str, int] = {}
         for name, stage in self.stages.items():
             found[name] = lcm(stage.every, *(found[each.stage] for each in stage.inputs if not each.latest))
@@ -122,7 +125,10 @@ class PipelineFile:
 
     @property
     def out_of_row(self) -> str:
-        """The first stage that leaves out frames, or does not read only the stage before it; "" in a chain."""
+        """The first stage that is not as in a chain; "" in a chain.
+
+        It leaves out frames, or does not read exactly the stage before it.
+        """
         before: tuple[PortInput, ...] = ()
         for name, stage in self.stages.items():
             if stage_inputs(stage) != before or stage.every != 1:
@@ -132,12 +138,12 @@ class PipelineFile:
 
     @property
     def is_chain(self) -> bool:
-        """Whether each stage takes every frame, and only from the stage before it."""
+        """Whether each stage takes every frame, and reads only the stage before it."""
         return not self.out_of_row
 
     @property
     def bypass(self) -> tuple[str, BypassKeys] | None:
-        """The stage at which the bypass begins, and the bypass's keys; None without a bypass."""
+        """(Name of the stage at which the bypass begins, keys of the bypass); None without a bypass."""
         return next(((name, stage.bypass) for name, stage in self.stages.items() if stage.bypass is not None), None)
 
     @property
@@ -146,7 +152,10 @@ class PipelineFile:
         return self.run.latency_to or [name for name in self.stages if name not in self.readers][-1]
 
     def changed(self, assignments: Sequence[str]) -> PipelineFile:
-        """Return the file with changed values. `assignments`: such as `stages.seg.unit=dsp`. Raises BadInputError."""
+        """Return the file with changed values. Raises BadInputError.
+
+        `assignments`: texts KEY=VALUE, such as `stages.seg.unit=dsp`.
+        """
         tables = dict(self.tables)
         for text in assignments:
             tables = _assigned(tables, text)
@@ -160,7 +169,7 @@ def read_pipeline(path: Path) -> PipelineFile:
 
 
 def tables_of(path: Path) -> dict[str, Any]:
-    """Return the tables of a pipeline file, not checked yet. Raises BadInputError."""
+    """Return the tables of a pipeline file by name, not checked yet. Raises BadInputError if it is no TOML."""
     data = read_bytes(path, MOST_BYTES, FORM, IF_EMPTY)
     try:
         return tomllib.loads(data.decode("utf-8-sig"))
@@ -183,7 +192,7 @@ def is_pipeline_file(path: Path) -> bool:
 
 
 def _of_toml(path: Path, message: str) -> BadInputError:
-    """Return the error for a message of the TOML reader."""
+    """Return the error for a defect in TOML. `message`: message of the TOML reader."""
     place = re.search(r" \(at line (\d+), column \d+\)$", message)
     where = f"{path}, line {place[1]}" if place else str(path)
     text = message[: place.start()] if place else message
@@ -193,7 +202,7 @@ def _of_toml(path: Path, message: str) -> BadInputError:
 
 
 def checked_tables(tables: Mapping[str, Any], path: Path) -> PipelineFile:
-    """Check the tables of a file. `path`: file to name in errors. Raises BadInputError."""
+    """Check the tables of a file, and return the file. `path`: path of the file. Raises BadInputError."""
     for name in tables:
         if name not in TABLES:
             found = f"the unknown key {name!r}"
@@ -226,10 +235,9 @@ def checked_tables(tables: Mapping[str, Any], path: Path) -> PipelineFile:
 
 
 def _slip(unit: str, known: Sequence[str]) -> str:
-    """Return the known unit that a misspelt name most likely means; "" if the name is probably meant as it is.
+    """Return the known unit that a name probably misspells; "" if the name is probably right.
 
-    A name that differs from a known one only in a number or a letter at its end, such as gpu2 or npu_b, is meant as it
-    is.
+    A name that differs from a known unit only in a number or a letter at its end, such as gpu2 or npu_b, is right.
     """
     stem = unit.rstrip("0123456789")
     if unit in known or any(stem == name.rstrip("0123456789") or unit[:-1] == name[:-1] for name in known):
@@ -246,7 +254,13 @@ def _table(tables: Mapping[str, Any], name: str, path: Path) -> Mapping[str, Any
 
 
 def _checked(model: type[AnyKeys], values: object, where: str) -> AnyKeys:
-    """Return a table as an instance of its model. Raises BadInputError that names the key after `where`."""
+    """Return a table of the file as an instance of `model`.
+
+    `values`: the table, not checked yet.
+    `where`: place of the table, for the error.
+
+    Raises BadInputError, which names the wrong key.
+    """
     if not isinstance(values, dict):
         raise BadInputError(where, shown(values), f"a table with {', '.join(model.known())}", IN_BRACES)
     try:
@@ -256,7 +270,13 @@ def _checked(model: type[AnyKeys], values: object, where: str) -> AnyKeys:
 
 
 def _bad_input(model: type[Keys], error: ValidationError, where: str) -> BadInputError:
-    """Return the error for the first defect that pydantic found; an unknown key comes first: it may be misspelt."""
+    """Return the error for one of the defects that pydantic found: an unknown key, else the first defect.
+
+    An unknown key may be misspelt, and so explain the other defects.
+
+    `model`: class of the checked table.
+    `where`: place of the table.
+    """
     errors = error.errors(include_url=False)
     first = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])
     place = [str(part) for part in first["loc"]]
@@ -277,14 +297,17 @@ def _bad_input(model: type[Keys], error: ValidationError, where: str) -> BadInpu
 
 
 def _meaning(model: type[Keys], key: str) -> str:
-    """Return a key and its description as part of a sentence; empty for a key without one."""
+    """Return `key` and its description as part of a sentence; empty for a key without a description."""
     fields = {one.alias or name: one for name, one in model.model_fields.items()}
     text = (fields[key].description or "") if key in fields else ""
     return f"{key}: {text[:1].lower()}{text[1:].rstrip('.')}" if text else ""
 
 
 def _stage(name: str, values: object, path: Path) -> StageKeys:
-    """Check one stage by its kind."""
+    """Check the table of one stage, and return the stage as an instance of its kind. Raises BadInputError.
+
+    `name`: name of the stage. `values`: its table, not checked yet. `path`: path of the file.
+    """
     where = f"{path}: stages.{name}"
     if not isinstance(values, dict):
         expected = "a table with a unit and one of onnx, python, block, time_ms"
@@ -315,7 +338,11 @@ def _stage(name: str, values: object, path: Path) -> StageKeys:
 
 
 def _with_times(stage: StageKeys, where: str, folder: Path) -> StageKeys:
-    """Return the stage with the times of the file that its `time_ms` names, if it names one. Raises BadInputError."""
+    """Return the stage; if its `time_ms` names a file, `time_ms` gets the times from this file. Raises BadInputError.
+
+    `where`: place of the key, for the error.
+    `folder`: folder of the pipeline file.
+    """
     time = stage.time_ms
     if time is None or time.source is None:
         return stage
@@ -324,7 +351,7 @@ def _with_times(stage: StageKeys, where: str, folder: Path) -> StageKeys:
 
 
 def time_of(measurement: Measurement) -> StageTime:
-    """Return a measurement as the time of a stage: its samples, or else its mean and its standard deviation, if any."""
+    """Return a measurement as the time of a stage: its samples, or else its mean and standard deviation."""
     if measurement.samples_ms:
         return StageTime(samples=measurement.samples_ms[:MOST_SAMPLES])
     mean, sd = measurement.mean_ms or 0.0, measurement.sd_ms or 0.0
@@ -332,7 +359,11 @@ def time_of(measurement: Measurement) -> StageTime:
 
 
 def _inputs(value: object, where: str) -> tuple[PortInput, ...]:
-    """Return the inputs of a stage from its key `in`: a stage, stage.port, or a table of ports."""
+    """Return the inputs of a stage.
+
+    `value`: value of its key `in`: a stage, stage.port, or a table of ports.
+    `where`: place of the key, for errors.
+    """
     ports = value if isinstance(value, dict) and not _is_input(value) else {"": value}
     if not ports:
         raise BadInputError(where, "an empty table", "a port, such as { frame = 'camera' }", "a source has no `in`")
@@ -379,7 +410,7 @@ def _check_ports(stage: StageKeys, where: str) -> None:
 
 
 def _in_order(stages: Mapping[str, StageKeys], path: Path) -> dict[str, StageKeys]:
-    """Return the stages in an order in which each follows the stages that it reads; otherwise their order stays.
+    """Return the stages in their own order, changed only so that each stage follows the stages that it reads.
 
     Raises BadInputError for an unknown stage or port, and for stages that wait for each other in a circle.
     """
@@ -407,7 +438,11 @@ def _in_order(stages: Mapping[str, StageKeys], path: Path) -> dict[str, StageKey
 
 
 def _check_sources(name: str, stage: StageKeys, stages: Mapping[str, StageKeys], path: Path) -> None:
-    """Check that the stages and ports that a stage reads exist, and that it may read them as it does."""
+    """Check the inputs of one stage. Raises BadInputError.
+
+    The stages and ports that it reads must exist, and the stages must write something. It may read at most MOST_INPUTS
+    stages, and must read all ports of a stage with the same `sync` and age.
+    """
     synced: dict[str, PortInput] = {}
     for each in stage.inputs:
         where = f"{path}: stages.{name}.in" + (f".{each.port}" if each.port else "")
@@ -439,9 +474,11 @@ def _check_sources(name: str, stage: StageKeys, stages: Mapping[str, StageKeys],
 
 
 def _circle(waits: Mapping[str, set[str]]) -> list[str]:
-    """Return a circle of stages that wait for each other, in the direction of frames; first and last are the same.
+    """Return the names of stages that wait for each other in a circle, in the direction in which frames go.
 
-    `waits`: stages for which each stage waits.
+    The first name comes again at the end.
+
+    `waits`: for each stage, the stages for which it waits.
     """
     seen: list[str] = []
     name = next(iter(waits))
@@ -452,7 +489,7 @@ def _circle(waits: Mapping[str, set[str]]) -> list[str]:
 
 
 def _check_together(file: PipelineFile) -> None:
-    """Check that the tables of the file fit each other. Raises BadInputError."""
+    """Check that the tables of the file agree with each other. Raises BadInputError."""
     _check_run(file)
     _check_edges(file)
     _check_written(file)
@@ -552,7 +589,7 @@ def _check_bypass(file: PipelineFile) -> None:
 
 
 def assignments(text: str) -> list[str]:
-    """Return the assignments in a value of `--set`, which commas separate."""
+    """Return the assignments in `text`, a value of `--set`; commas separate them."""
     return BETWEEN.split(text)
 
 
@@ -572,7 +609,11 @@ def _assigned(tables: Mapping[str, Any], text: str) -> dict[str, Any]:
 
 
 def _check_new_stages(tables: Mapping[str, Any], names: Sequence[str]) -> None:
-    """Raise BadInputError for a stage that --set names, if the file does not have it and --set gives it no kind."""
+    """Raise BadInputError for a new stage without a kind, because its name in --set is probably misspelt.
+
+    `tables`: tables after the assignments.
+    `names`: stages of the file before the assignments.
+    """
     for name, keys in tables["stages"].items():
         if name not in names and isinstance(keys, dict) and not {*keys} & {*KINDS}:
             expected = f"a stage of the file: {', '.join(names)}"
@@ -592,5 +633,8 @@ def _with_value(tables: Mapping[str, Any], parts: Sequence[str], value: object) 
 
 
 def stage_inputs(stage: StageKeys) -> tuple[PortInput, ...]:
-    """Return one input for each stage that `stage` reads; several ports of a stage belong to one stream."""
+    """Return one input, without names of ports, for each stage that `stage` reads.
+
+    All ports of a stage belong to one stream.
+    """
     return tuple({each.stage: replace(each, port="", from_port="") for each in stage.inputs}.values())

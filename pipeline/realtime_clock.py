@@ -1,13 +1,13 @@
-"""The clock of this machine, for the scheduler's loop, and the CPU time of units in the report of such a run.
+"""The host clock, for the scheduler's loop, and the CPU time of units in the report of a run on this machine.
 
 Rule: the clock waits and carries out the core's actions; it decides nothing. `wait` turns messages of the units,
 signals and the governor's duties into events; `perform` turns actions into messages. The shares of the units include
-the time for which a viewer held the run, and a message says how long that was (`HeldTime`).
+the time for which a viewer held the run, and a message states this time (`HeldTime`).
 
-Rule: CPU time counts only within the run, and no core does more than it can. If figures contradict each other, or were
-not measured, a message says so. A unit's CPU time covers all threads of its process, including threads that a runtime
-lets spin between jobs. Units that may only run on a set of cores cannot have more CPU time than these cores had time.
-If they have more, a thread has run elsewhere or a clock is wrong.
+Rule: CPU time counts only within the run. If figures contradict each other, or were not measured, a message says so. A
+unit's CPU time covers all threads of its process, including threads that a runtime lets spin between jobs. Units that
+may run only on a set of cores cannot have more CPU time than these cores had time. If they seem to have more, a thread
+has run elsewhere or a clock is wrong.
 """
 
 from __future__ import annotations
@@ -57,10 +57,12 @@ CLOCKS_DIFFER = 0.001  # CLOCK_MONOTONIC is slewed by up to 500 ppm; the clock o
 
 
 class CoreUse(NamedTuple):
-    """The use of a set of cores by the units that run on `cores` and nowhere else.
+    """The use of a set of cores by the units that run only on these cores.
 
+    `cores`: numbers of the cores.
+    `units`: names of the units.
     `cpu`: sum of the units' CPU time, as a share of the time that the cores had.
-    `busy`: sum of the units' busy time, as a share of the same time.
+    `busy`: sum of the units' busy time, as a share of the time that the cores had.
     """
 
     cores: tuple[int, ...]
@@ -79,6 +81,8 @@ class CpuTimes:
 
     `cores`: number of cores of each unit.
     `sketch`: function that makes a sketch, as for `trilane.scheduler.stats.Samples`.
+    `in_jobs_ns`, `between_ns`: CPU time of each unit in its jobs, and before or between them.
+    `stage_ns`: CPU time of each job of a stage, by the stage's name.
     """
 
     def __init__(self, cores: Mapping[str, int], sketch: Callable[[], Sketch] | None = None) -> None:
@@ -91,11 +95,11 @@ class CpuTimes:
     def add(self, unit: str, stage: str, done: Done, run_begin_ns: int) -> None:
         """Book a job.
 
-        CPU time before a unit's first job is limited to the time that its cores had since the run began. CPU time
-        between two jobs is not limited: an impossible figure must stay visible (`is_possible`).
+        CPU time before a unit's first job counts only up to the time that the unit's cores had since the run began. CPU
+        time between two jobs has no such limit, because an impossible figure must stay visible (`is_possible`).
 
         `done`: the unit's answer to the job.
-        `run_begin_ns`: time at which the run began.
+        `run_begin_ns`: time in ns at which the run began.
         """
         self.in_jobs_ns[unit] += done.cpu_ns
         self.stage_ns[stage].add(done.cpu_ns)
@@ -106,21 +110,18 @@ class CpuTimes:
         self.between_ns[unit] += before_ns
 
     def of_unit_s(self, unit: str) -> float:
-        """Return the unit's CPU time in seconds, in jobs and between them.
-
-        It counts from the begin of the run to the end of the unit's last job.
-        """
+        """Return the unit's CPU time in seconds, from the begin of the run to the end of the unit's last job."""
         return (self.in_jobs_ns[unit] + self.between_ns[unit]) / NS_PER_S
 
 
 def use_of_cores(
     cores: Mapping[str, Sequence[int]], cpu_s: Mapping[str, float], busy: Mapping[str, float], duration_s: float
 ) -> list[CoreUse]:
-    """Return one row for each set of cores that a unit has, and one for all cores.
+    """Return the use of each set of cores that is the set of a unit, and of all cores together.
 
-    `cores`: cores of each unit.
+    `cores`: numbers of the cores of each unit.
     `cpu_s`: CPU time of each unit in seconds.
-    `busy`: busy share of each unit.
+    `busy`: busy time of each unit, as a share of the run's time (0 to 1).
     `duration_s`: time of the run in seconds.
     """
     sets = {frozenset(own) for own in cores.values()} | {frozenset().union(*cores.values())}
@@ -140,11 +141,11 @@ NO_RUN_DELAY = (
 
 
 def add_accounts(report: dict[str, Any], pipeline: Pipeline, cpu: CpuTimes, log: RunLog) -> None:
-    """Add `cpu_s`, `cpu_ms` and `core_shares` to a ledger's report.
+    """Add CPU times to a ledger's report: `cpu_s` and `cpu_in_jobs_s` of units, `cpu_ms` of stages, and `core_shares`.
 
     `pipeline`: pipeline that ran.
-    `cpu`: CPU time of its units and stages.
-    `log`: log for messages about missing or contradictory figures.
+    `cpu`: CPU time of the pipeline's units and stages.
+    `log`: log that gets messages about missing or contradictory figures.
     """
     for unit, row in report["units"].items():
         row.update(cpu_s=cpu.of_unit_s(unit), cpu_in_jobs_s=cpu.in_jobs_ns[unit] / NS_PER_S)
@@ -169,24 +170,26 @@ LONGEST_STEP_NS = PING_NS + 250_000_000  # between two steps, unless this proces
 
 
 class ClockGovernor(Protocol):
-    """Limits each unit to a share of the time. `due_ns`: time at which the clock calls `tick` next."""
+    """A governor: limits each unit to a share of the time. `due_ns`: time at which the clock next calls `tick`."""
 
     due_ns: int
 
     def begin(self, now_ns: int) -> list[SetDuty]:
-        """Return the duties at the start of the run."""
+        """Return an event for the duty of each unit at the start of the run."""
 
     def tick(self, now_ns: int, busy_ns: dict[str, int]) -> list[SetDuty]:
-        """Return the duties that change now. `busy_ns`: busy time of each unit in ns since the run began."""
+        """Return an event for each duty that changes now. `busy_ns`: busy time of each unit in ns since the start."""
 
 
 class RealtimeClock:
     """The `trilane.scheduler.core.Clock` of one run of `core` on the unit processes `processes`.
 
-    `metrics`: sums of each stage's metrics, over the jobs that `ended` has returned.
-    `reported`: number of these jobs that reported each metric, by stage.
-    `cpu`: CPU time of units and stages over the same jobs.
-    `first`: events that come before all other events.
+    `on_progress`: function that is called with (number of presented frames, number of frames of the run); None: none.
+    `sketch`: function that makes a sketch, as for `trilane.scheduler.stats.Samples`.
+    `metrics`: sums of each stage's metrics over the jobs that `ended` has returned, by stage and metric.
+    `reported`: number of these jobs that reported each metric, by stage and metric.
+    `cpu`: CPU time of units and stages in these jobs.
+    `first`: events that the core gets before all other events.
     """
 
     def __init__(
@@ -222,12 +225,12 @@ class RealtimeClock:
             processes.watch(requests.fd)
 
     def heed(self, controls: RunControls) -> None:
-        """Take requests from `controls` from now on."""
+        """From now on, take requests from `controls`."""
         self._controls = controls
         self._processes.watch(controls.fd)
 
     def wait(self, deadline_ns: int) -> tuple[int, tuple[Event, ...]]:
-        """Wait for an event, until `deadline_ns` at the latest, and return the time in ns and the events."""
+        """Wait for an event, until `deadline_ns` at the latest, and return (time in ns, events)."""
         self._show_progress()
         self._tell_unanswered()
         events = self._listen(deadline_ns) if self._begun else self._begin()
@@ -241,7 +244,7 @@ class RealtimeClock:
         return now_ns, tuple(events)
 
     def perform(self, now_ns: int, actions: tuple[Action, ...]) -> None:
-        """Send the actions to the units."""
+        """Carry out the actions: send jobs to units, and kill or start the processes of units."""
         for action in actions:
             if isinstance(action, Dispatch):
                 self._dispatch(now_ns, action.job)
@@ -255,11 +258,14 @@ class RealtimeClock:
 
     @property
     def waiting(self) -> int:
-        """The number of jobs that `ended` would return now."""
+        """The number of jobs that have ended since the last call of `ended`."""
         return len(self._unbooked)
 
     def ended(self) -> list[Worked | None]:
-        """Book and return the jobs that have ended since the last call; None stands for a job whose frame is gone."""
+        """Book and return the jobs that have ended since the last call.
+
+        None stands for a job whose frame was dropped or lost meanwhile.
+        """
         found: list[Worked | None] = []
         for job, dispatch_ns, ready_ns, done in self._unbooked:
             if ready_ns is None:
@@ -288,7 +294,7 @@ class RealtimeClock:
         self._show_progress(final=True)
 
     def _start(self, unit: str) -> None:
-        """Start the unit again; if no process can be made for it, the run is aborted at the next step."""
+        """Start the unit again; if no process can be made for the unit, the next step aborts the run."""
         try:
             self._processes.start(unit)
         except (TrilaneError, OSError) as error:
@@ -345,7 +351,7 @@ class RealtimeClock:
         return events
 
     def _ping(self, now_ns: int) -> list[Event]:
-        """Ping the units without a job; a busy unit shows with the end of its job that it lives."""
+        """Ping the units without a job, and return an event for each. The job of a busy unit ends, or is too late."""
         self._ping_ns = now_ns + PING_NS
         with contextlib.suppress(OSError):  # starting the next unit tries again
             if why := self._processes.renew_starter():
@@ -357,7 +363,7 @@ class RealtimeClock:
         return [Pinged(unit) for unit in units]
 
     def _tell_stopped(self, now_ns: int) -> None:
-        """Note units that a signal has stopped, and log for how long a unit was stopped once it runs again."""
+        """Note units that a signal has stopped. When a stopped unit runs again, log how long it was stopped."""
         stopped = self._processes.stopped
         for unit in stopped - self._stopped_ns.keys():
             self._stopped_ns[unit] = now_ns
@@ -367,7 +373,10 @@ class RealtimeClock:
             self._log.say(f"unit {unit} was stopped by a signal for about {seconds:.1f} s")
 
     def _tell_stalled(self, ns: int) -> None:
-        """Log that a signal had stopped this process for `ns`; without a signal, the process had no core."""
+        """If a signal had stopped this process, log for how long; do nothing if the process only had no core.
+
+        `ns`: time in ns for which the process did nothing.
+        """
         if self._interrupts.continued > self._continued:
             frame = min(self._core.frames, default=self._core.ledger.presented_count)
             seconds = ns / NS_PER_S
@@ -414,7 +423,7 @@ class RealtimeClock:
         self._processes.send(job.unit, RunJob(*fields))
 
     def _tell_unanswered(self) -> None:
-        """Report dropped and lost frames to the queue of frame requests."""
+        """Tell the queue of frame requests the number of dropped and lost frames by cause."""
         if self._requests is None:
             return
         ledger = self._core.ledger
@@ -429,14 +438,14 @@ class RealtimeClock:
 
 
 class HeldTime:
-    """Measures how long the run was held. A hold lasts until the run goes on, even if single frames are released."""
+    """Measures how long the run was held. A hold lasts until it is ended, even if it releases single frames."""
 
     def __init__(self) -> None:
         self._total_ns = 0
         self._since_ns: int | None = None
 
     def hear(self, now_ns: int, events: Iterable[Event]) -> None:
-        """Take the events that were requested at `now_ns`; only `Hold` counts."""
+        """Take the events that were requested at `now_ns`; all events but `Hold` are ignored."""
         for event in events:
             if not isinstance(event, Hold):
                 continue
@@ -450,7 +459,7 @@ class HeldTime:
         return self._total_ns + (0 if self._since_ns is None else now_ns - self._since_ns)
 
     def sentence(self, now_ns: int) -> str:
-        """Return the sentence for the report; empty if the run was never held."""
+        """Return the message that states how long the run was held; empty if the run was never held."""
         held_s = self.until(now_ns) / NS_PER_S
         if not held_s:
             return ""

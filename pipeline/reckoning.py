@@ -1,18 +1,19 @@
-"""Computes what bounded a run and how well it used its cores.
+"""Computes what bounded a run, and how well the run used its cores.
 
 Rule: report.json, the table, `trilane explain`, the dashboard and Python show these figures; no other module computes
 them. The memory for reading a run is bounded, however long the run lasts. Nothing is measured here; equal journals give
 equal answers.
 
-A replay of the run in virtual time, with one stage slower, says what slowing the stage costs (`WhatIf`). The stage that
-costs most bounds the run.
+The bound is found by replays in virtual time (`WhatIf`). Each replay makes one stage slower, and shows what this costs.
+The stage that costs most bounds the run.
 
-A share of the critical path says how the time was spent. It does not say how a run reacts: a longer job is moved to
-another core more often, and takes that core from a unit that was on no path. Therefore some of the run's frames are
-replayed (`trilane.scheduler.virtual`), with the CPU times of their own jobs, the run's placement and the run's
-scheduler. After that they are replayed once more for each stage, with all jobs of the stage longer by SLOWER.
+A share of the critical path says how the time was spent. The share does not say how a run reacts to a longer job: the
+kernel moves a longer job to another core more often, and takes that core from a unit that was on no path. Therefore
+some of the run's frames are replayed (`trilane.scheduler.virtual`), with the CPU times of their own jobs, the run's
+placement and the run's scheduler. For each stage these frames are replayed once more, with all jobs of the stage longer
+by SLOWER.
 
-The replay knows no other programs, caps or restarts. Therefore it is trusted only if its frame time is near the frame
+A replay contains no other programs, caps or restarts. Therefore it is trusted only if its frame time is near the frame
 time of the run.
 """
 
@@ -36,12 +37,12 @@ from trilane.scheduler.stats import LEAST_FRAMES, batch_interval
 from trilane.scheduler.virtual import Need, SharedCores
 
 SLOWER: Final = 0.2  # share by which the jobs of a stage take longer
-#: Largest difference between the frame times of the replay and of the run, as a share, for which the replay is trusted.
+#: Largest difference between the frame times of replay and run, as a share of the run's, at which a replay is trusted.
 TRUSTED: Final = 0.15
-#: Least cost of the bound, as a share; if no stage costs that much, no stage is the bound.
+#: Least cost of the bound, as a share of the frame time; if every stage costs less, no stage is the bound.
 LEAST_COST: Final = 0.01
-#: Most blocks of frames that are kept. From more blocks, this number is drawn at random: evenly spaced blocks might all
-#: show the same part of a motion that repeats.
+#: Most blocks of frames that are kept. If there are more, the kept blocks are drawn at random. Evenly spaced blocks
+#: might all show the same part of a motion that repeats.
 MOST_BLOCKS: Final = 12
 HAND_OVERS: Final = 512  # measured times of hand-over that are kept
 #: Number of later frames after which a frame that was not presented counts as lost; more than can be in flight.
@@ -51,15 +52,15 @@ MOST_OPEN: Final = 64
 class Cost(NamedTuple):
     """The cost of slowing a stage, or all stages of a unit.
 
-    `share`: growth of the frame time as a share.
-    `of_blocks`: growth for each block of LEAST_FRAMES frames.
+    `share`: growth of the frame time, as a share of the frame time.
+    `of_blocks`: growth in each block of LEAST_FRAMES frames, as a share of the block's time.
     """
 
     share: float
     of_blocks: tuple[float, ...]
 
     def half_width(self, other: Cost | None = None) -> float | None:
-        """Return half the 95 % interval of `share`, or of its difference from `other`; None for too few blocks."""
+        """Return half the 95 % interval of `share`, less the share of `other` if given; None for too few blocks."""
         others = other.of_blocks if other is not None else (0.0,) * len(self.of_blocks)
         return batch_interval([a - b for a, b in zip(self.of_blocks, others, strict=True)])
 
@@ -67,10 +68,9 @@ class Cost(NamedTuple):
 class ReplayFindings(NamedTuple):
     """The results of the replays.
 
-    `costs`: cost of slowing each stage by SLOWER.
+    `costs`: cost of slowing each stage by SLOWER, by the stage's name.
     `frames`: number of frames that were replayed and counted.
-    `over_measured`: frame time of the replay without a slower stage, divided by the run's frame time in the same
-    frames.
+    `over_measured`: frame time of the replay without a slower stage, divided by the same frames' time in the run.
     """
 
     costs: Mapping[str, Cost]
@@ -84,7 +84,7 @@ class ReplayFindings(NamedTuple):
         return abs(self.over_measured - 1) <= TRUSTED and worst >= LEAST_COST
 
     def by(self, name_of: Mapping[str, str]) -> dict[str, Cost]:
-        """Return the summed cost of each group of stages, such as a unit. `name_of`: group of each stage."""
+        """Return the sum of the stages' costs for each group, such as a unit. `name_of`: group of each stage."""
         found: dict[str, Cost] = {}
         for stage, cost in self.costs.items():
             was = found.get(name_of[stage], Cost(0.0, (0.0,) * len(cost.of_blocks)))
@@ -105,10 +105,10 @@ class _Block(NamedTuple):
 
 
 class WhatIf:
-    """Takes the jobs of a run in order, and replays a bounded number of its frames, spread over the run.
+    """Takes the jobs of a run in order, and replays a bounded number of the run's frames, spread over the run.
 
     `graph`, `settings`: graph and settings of the run.
-    `places`: cores and threads of its units, as far as they are known.
+    `places`: cores and threads of the run's units; a unit whose place is not known is missing.
     """
 
     def __init__(self, graph: Graph, settings: Settings, places: Placement) -> None:
@@ -123,7 +123,7 @@ class WhatIf:
         self._handed_ns: list[int] = []
 
     def add(self, explained: ExplainedJob) -> None:
-        """Keep what a job needed, for the replays. Call it in the order of the jobs' ends."""
+        """Keep the needs of a job for the replays; call this in the order of the jobs' ends."""
         if not self._is_known:
             return
         job = explained.job
@@ -154,7 +154,7 @@ class WhatIf:
         self._presented = []
 
     def close(self) -> ReplayFindings | None:
-        """Return what slowing each stage costs; None for fewer than two blocks, or a run that cannot be replayed."""
+        """Return the results of the replays; None for fewer than two blocks, or a run that cannot be replayed."""
         if len(self._blocks) < 2:
             return None
         # While the first frames fill the pipeline and the last ones empty it, frame times do not count.
@@ -172,8 +172,9 @@ class WhatIf:
         return ReplayFindings(costs, count * LEAST_FRAMES, sum(plain_ns) / len(plain_ns) / LEAST_FRAMES / whole_ns)
 
     def _replayed(self, frames: Sequence[Mapping[str, Need]], slowed: str, message_ns: int) -> list[int]:
-        """Return the times in ns of each LEAST_FRAMES presented frames of a replay, except the first and the last.
+        """Replay frames, and return the time in ns of each block of LEAST_FRAMES frames but the first and the last.
 
+        `frames`: for each frame, the needs of its jobs by stage.
         `slowed`: name of the slowed stage; "" for none.
         `message_ns`: time from the end of a job until the next job is handed over.
         """
@@ -198,14 +199,14 @@ def _stage_cost(slowed_ns: Sequence[int], plain_ns: Sequence[int]) -> Cost:
 
 
 class RunEfficiencies:
-    """Computes the three efficiencies: work as a share of the time between first and last presented frame, at most 1.
+    """Computes the three efficiencies: work as a share (0 to 1) of the time from first to last presented frame.
 
-    A job may begin before this time or end after it. Such a job counts only the CPU time that must lie within: its CPU
-    time less the time that its cores had outside. Therefore the counted work of a unit or of a set of cores fits into
-    the time.
+    If a job begins before this time or ends after it, only the CPU time that must lie within this time counts. It is
+    the job's CPU time less the time that the unit's cores had outside. Therefore the work of a unit, or of a set of
+    cores, is never longer than the time.
 
-    A unit's work is the CPU time of its jobs divided by the unit's threads. Busy time beyond the CPU time is added,
-    because in it a device of the unit worked while the threads slept.
+    A unit's work is the CPU time of its jobs, divided by the number of the unit's threads. Busy time beyond the CPU
+    time is added, because a device of the unit worked then while the threads slept.
 
     `places`: cores and threads of each unit.
     """
@@ -219,10 +220,7 @@ class RunEfficiencies:
         self._unsettled: list[JobRecord] = []  # jobs since the last presented frame
 
     def add(self, job: JobRecord, *, presents: bool) -> None:
-        """Count a job; jobs come in the order of their ends.
-
-        `presents`: whether this job presents a frame.
-        """
+        """Count a job; call this in the order of the jobs' ends. `presents`: whether this job presents a frame."""
         self._unsettled.append(job)
         if not presents:
             return
@@ -233,13 +231,12 @@ class RunEfficiencies:
         self._book(settled, self._first_ns)
 
     def close(self) -> dict[str, float | None]:
-        """Return `efficiency`, `core_efficiency` and `machine_efficiency` of a report; all are None for one frame.
+        """Return `efficiency`, `core_efficiency` and `machine_efficiency` of a report; called after all jobs.
 
         `efficiency` is the work of the slowest unit, as a share of the time. `core_efficiency` is the CPU time of the
-        units that have only the cores of the fullest set, as a share of the time that this set had.
-        `machine_efficiency` is the CPU time of all units, as a share of the time that all cores had.
-
-        Called after all jobs.
+        units that run only on the fullest set of cores, as a share of the time that this set had.
+        `machine_efficiency` is the CPU time of all units, as a share of the time that all cores had. All are None for
+        fewer than two presented frames.
         """
         had_ns = self._last_ns - (self._first_ns or 0)
         if self._first_ns is None or had_ns <= 0:
@@ -254,7 +251,10 @@ class RunEfficiencies:
         }
 
     def _book(self, jobs: Sequence[JobRecord], first_ns: int) -> None:
-        """Book the part of each job that must lie between the first and the last presented frame."""
+        """Add the work and CPU time of `jobs` that must lie between the first and the last presented frame.
+
+        `first_ns`: time in ns of the first presented frame.
+        """
         for job in jobs:
             cores, threads = self._places[job.unit]
             length_ns = job.end_ns - job.begin_ns
@@ -268,8 +268,8 @@ class RunEfficiencies:
 class Reckoned(NamedTuple):
     """What bounded a whole run.
 
-    `budget`: time of the critical path in ns, by kind and stage.
-    `taken`: for each stage, times without a core, and which stages had the core then.
+    `budget`: time of the critical path in ns, by (kind, stage).
+    `taken`: for each stage, its time without a core, and the stages that had the core then.
     `figures`: `bottleneck`, `bound`, `efficiency`, `core_efficiency` and `machine_efficiency` of a report.
     """
 
@@ -282,8 +282,8 @@ class Reckoning:
     """Takes the explained jobs of a run in order, and computes what bounded the run.
 
     `graph`, `settings`: graph and settings of the run.
-    `places`: places of its units, as far as they are known.
-    `timeline`: timeline of the run, whose explained jobs are added here.
+    `places`: cores and threads of the run's units; a unit whose place is not known is missing.
+    `timeline`: timeline of the run, which gives the explained jobs.
     `paths`, `sharing`: paths and core sharing of the jobs so far.
     """
 
@@ -299,11 +299,11 @@ class Reckoning:
 
     @property
     def bound(self) -> Mapping[str, Any] | None:
-        """The `bound` of a report from the path so far; None for fewer than 63 presented frames."""
+        """The key `bound` of a report, from the path so far and without replays; None until 63 frames are presented."""
         return _bound(self._budget, self._unit_of, None).get("bound")
 
     def add(self, explained: ExplainedJob) -> None:
-        """Count a job; jobs come in the order of their ends."""
+        """Add a job; call this in the order of the jobs' ends."""
         self.paths.add(explained)
         self.sharing.add(explained.job)
         presents = explained.presented is not None
@@ -313,17 +313,21 @@ class Reckoning:
             self._budget.present(explained)
 
     def close(self) -> Reckoned:
-        """Return the result. It is called after the last job."""
+        """Return what bounded the run; called after the last job."""
         budget = self._budget.close()
         bound = _bound(self._budget, self._unit_of, self._what_if.close())
         return Reckoned(budget, self.sharing.close(), {**self._efficiencies.close(), **bound})
 
 
 def _bound(budget: Budget, unit_of: Mapping[str, str], slowed: ReplayFindings | None) -> dict[str, Any]:
-    """Return `bottleneck` and `bound` of a report; both are None if there is no path.
+    """Return the keys `bottleneck` and `bound` of a report; both values are None if there is no path.
 
-    The bound is the unit, and the stage, that costs most if it is slowed. If the replay cannot be trusted, it is the
-    one with the largest part of the path. If that part belongs to no unit, its owner is the bottleneck in any case.
+    The bound is the unit, and the stage, whose slowing costs most. If the replays cannot be trusted, the bound is the
+    unit, and the stage, with the largest share of the path. If the largest share belongs to no unit (other programs,
+    release), its name is the bottleneck even if the replays can be trusted.
+
+    `unit_of`: unit of each stage.
+    `slowed`: results of the replays; None: none were made.
     """
     names = budget.names(unit_of)
     path = {kind: budget.largest(name_of) for kind, name_of in names.items()}
@@ -352,7 +356,10 @@ def _bound(budget: Budget, unit_of: Mapping[str, str], slowed: ReplayFindings | 
 
 
 def _costs_most(costs: Mapping[str, Cost], name: str) -> dict[str, Any]:
-    """Return the cost of `name`, which is the largest, and its rivals: the others whose cost may be as large."""
+    """Return the keys of `_cost` for the largest cost, and `rivals`: the other names whose cost may be as large.
+
+    `name`: name with the largest cost.
+    """
     most = costs[name]
     rivals = None
     if most.half_width() is not None:
@@ -368,9 +375,9 @@ def _cost(cost: Cost) -> dict[str, float | None]:
 
 
 def places_of(begun: Begun) -> dict[str, Place]:
-    """Return the cores and threads of each unit, as far as the journal's first record has them.
+    """Return the cores and threads of each unit (`Pipeline.places`) from the journal's first record.
 
-    They are those of `Pipeline.places`. Raises BadInputError for a configuration of another form.
+    A unit that the record does not describe is missing. Raises BadInputError for a configuration of another form.
     """
     config = config_of(begun)
     units, pace_ns = config.get("units", {}), config.get("pace_ns", {})
@@ -383,7 +390,7 @@ def places_of(begun: Begun) -> dict[str, Place]:
 
 
 def reckoned(graph: Graph, settings: Settings, places: Placement, records: Iterable[Record]) -> Reckoned:
-    """Return what bounded a run. `records`: records of the run after the first."""
+    """Return what bounded a run. `records`: all records of the run but the first."""
     timeline = Timeline(graph, settings, waits=True)
     reckoning = Reckoning(graph, settings, places, timeline)
     for record in records:

@@ -3,16 +3,16 @@
 The rehearsal measures the work of each unit for a frame. Rule: frames go through the stages in the order of a run, one
 frame at a time.
 
-Every frame goes through all stages before the next frame begins, and the slots of an edge are used in turn. That
-matters because the time of a stage depends on its last frame, on the content of its slot, and on its rest before. Only
-time in which the unit had its cores counts, because other programs may use the machine.
+Every frame goes through all stages before the next frame begins, and the slots of an edge are used in turn. This
+matters because the time of a stage depends on the stage's last frame, on the content of its slot, and on how long the
+stage has rested. Only time in which the unit had its cores counts, because other programs may use the machine.
 
 The trial measures the frame times of a few placements. Rule: placements run in turns, a few frames each, and all do the
 same frames.
 
-Running units are moved from the cores of one placement to the cores of the next, while frames go through them. A slice
-of frames takes a fraction of a second. Therefore a disturbance that lasts a second slows all placements alike. Between
-two runs, the machine may differ by more than two placements differ. Placements with other numbers of threads need
+Running units are moved from the cores of one placement to the cores of the next, while frames go through them. A turn
+of a placement takes a fraction of a second. Therefore a disturbance that lasts a second slows all placements alike. In
+separate runs, the machine may change by more than two placements differ. Placements with other numbers of threads need
 processes of their own, which are idle while other placements have their turn.
 """
 
@@ -50,8 +50,9 @@ LIMIT_S = 0.5  # seconds after the warm-up after which no further frame begins
 class Chain:
     """Sends single frames through the stages of `graph`, which must be a chain.
 
-    `processes`: by unit, the `UnitProcesses` that has the unit's process. The process must be ready and have no job.
-    `whole`: whether the last stage takes part.
+    `processes`: for each unit, the `UnitProcesses` with the unit's process, which must be ready and have no job.
+    `interrupts`: signals, which end the wait for an answer.
+    `whole`: whether the last stage, which may write files, takes part.
     """
 
     def __init__(
@@ -65,7 +66,9 @@ class Chain:
         self._frames = self._jobs = 0
 
     def frame(self, number: int, rung: int = 0) -> dict[str, Done]:
-        """Let every stage do frame `number`, one stage after the other, and return the answers by stage.
+        """Let every stage do frame `number`, one stage after the other, and return the units' answers by stage.
+
+        `rung`: rung of the frame's work.
 
         Raises UnitError if a stage fails or does not answer, and KeyboardInterrupt when interrupted.
         """
@@ -95,10 +98,13 @@ def on_rungs(chain: Chain, frames: Sequence[int], rungs: int, follow: Sequence[s
     """Return the isolated time of each stage of `follow` on each rung of a ladder.
 
     Each time is the median over `frames`. All frames are done on one rung before the next rung, so that no stage does
-    the same frame twice in a row. With several frames, the first frame of each rung warms up. If a further rung does
-    not make a stage faster, the stage is left out. An example is a scene with nobody on the screen in these frames.
+    the same frame twice in a row. With several frames, the first frame of each rung warms up and does not count. If a
+    further rung does not make a stage faster, the stage is left out. An example is a scene with nobody on the screen in
+    these frames.
 
+    `frames`: numbers of the frames that are done.
     `rungs`: number of rungs.
+    `follow`: names of the stages whose time follows the work.
 
     Raises as `Chain.frame` does.
     """
@@ -118,8 +124,8 @@ def on_rungs(chain: Chain, frames: Sequence[int], rungs: int, follow: Sequence[s
 class Rehearsed(NamedTuple):
     """The results of a rehearsal.
 
-    `times`: work of each unit, by number of threads.
-    `took_ns`: time of each frame in ns, by stage, with the settings of the first pipeline.
+    `times`: work of each unit, by the unit's name and number of threads.
+    `took_ns`: for each stage, the time of its job in ns in each frame that counts, with the settings of `pipeline`.
     """
 
     times: Times
@@ -129,7 +135,7 @@ class Rehearsed(NamedTuple):
 def rehearse(
     pipeline: Pipeline, variants: Sequence[Pipeline], frames: Sequence[int], assets: Assets, starter: UnitStarter
 ) -> Rehearsed:
-    """Measure the work of each unit for a frame; the caller removes the files that the last stage writes.
+    """Measure the work of each unit for a frame. The caller must remove the files that the last stage writes.
 
     `pipeline`: pipeline whose units are all measured.
     `variants`: the same pipeline with other settings of some units; only these units are measured again.
@@ -166,10 +172,10 @@ def rehearse(
 
 
 def timed(chain: Chain, frames: Sequence[int]) -> list[dict[str, Done]]:
-    """Return the answers of all stages for each frame that counts, by stage.
+    """Send `frames` through the chain; return the units' answers by stage, for each frame that counts.
 
-    The first WARM_UP frames do not count. If there are no more frames than that, the last one counts. After LIMIT_S no
-    further frame begins.
+    The first WARM_UP frames do not count. If there are no further frames, the last frame counts. After LIMIT_S no frame
+    begins.
     """
     warm_up = min(WARM_UP, len(frames) - 1)
     for frame in frames[:warm_up]:
@@ -183,9 +189,9 @@ def timed(chain: Chain, frames: Sequence[int]) -> list[dict[str, Done]]:
 
 
 def works_of(pipeline: Pipeline, done: Sequence[Mapping[str, Done]]) -> dict[str, UnitWork]:
-    """Return the work of each unit for a frame: the sum over its stages of their median times in `done`.
+    """Return the work of each unit for a frame: the sum of the median times of the unit's stages.
 
-    `done`: for each frame, the answers of all stages.
+    `done`: for each frame, the units' answers by stage.
     """
     works = {}
     for unit, settings in pipeline.units.items():
@@ -213,10 +219,10 @@ Cores = Mapping[str, tuple[int, ...]]
 
 
 class Group(NamedTuple):
-    """Placements that the same processes can have in turn.
+    """Placements with the same numbers of threads, which the same processes can have in turn.
 
-    `pipeline`: pipeline of these processes; its own cores do not matter.
-    `places`: cores of each unit, for each placement.
+    `pipeline`: pipeline of these processes; the cores in its settings do not matter.
+    `places`: for each placement, the cores of each unit.
     """
 
     pipeline: Pipeline
@@ -224,10 +230,10 @@ class Group(NamedTuple):
 
 
 class Round(NamedTuple):
-    """A turn of every placement.
+    """The result of one turn of every placement.
 
-    `frame_ns`: mean frame time of each placement in ns, group by group.
-    `others`: share of other programs, see `OtherPrograms.share`.
+    `frame_ns`: mean frame time of each placement in ns, in the order of the groups and of their placements.
+    `others`: share of the cores' time that other programs had (`OtherPrograms.share`).
     """
 
     frame_ns: tuple[float, ...]
@@ -241,12 +247,12 @@ def try_in_turns(
     starter: UnitStarter,
     is_enough: Callable[[Sequence[Round]], bool] = lambda _: False,
 ) -> list[Round]:
-    """Return the measured rounds: one for each of `windows`, or fewer if `is_enough` says that the rounds are enough.
+    """Run the placements in turns, and return the measured rounds: one for each of `windows`, or fewer.
 
-    `groups`: placements to try; each round begins with another placement of a group.
-    `windows`: for each round, the first of the SLICE frames that every placement does.
+    `groups`: placements to try. Within a group, each round begins with another placement.
+    `windows`: for each round, the number of the first of the SLICE frames that every placement does.
     `assets`, `starter`: arrays and fork server, as for a run.
-    `is_enough`: function that is called with the rounds so far.
+    `is_enough`: function that takes the rounds so far, and returns whether to end here.
 
     Raises TrilaneError if a unit cannot start or a stage fails, and KeyboardInterrupt when interrupted.
     """
@@ -268,7 +274,7 @@ def try_in_turns(
 
 
 class _Replaying(UnitProcesses):
-    """Units that do the same SLICE frames of the scene in every slice. `first`: number of the first of them."""
+    """Units that do the same SLICE frames of the scene again and again. `first`: number of the first frame."""
 
     first = 0
 
@@ -286,7 +292,7 @@ def _started(group: Group, assets: Assets, starter: UnitStarter, interrupts: Int
 
 
 class _Live:
-    """A group whose processes run."""
+    """A `Group` together with its running processes."""
 
     def __init__(self, group: Group, processes: _Replaying, interrupts: Interrupts) -> None:
         self._group, self._processes, self._interrupts = group, processes, interrupts
@@ -296,10 +302,10 @@ class _Live:
         return list(self._processes.pids.values())
 
     def one_round(self, turn: int, first: int) -> list[float]:
-        """Return the frame time of each placement in ns.
+        """Let every placement of the group have one turn, and return their mean frame times in ns.
 
         `turn`: index of the placement that begins, modulo the number of placements.
-        `first`: number of the first frame that every placement does.
+        `first`: number of the first of the SLICE frames that every placement does.
         """
         count = len(self._group.places)
         order = [(turn + number) % count for number in range(count)]
@@ -320,7 +326,11 @@ class _Live:
 
 
 class _Turns:
-    """A `trilane.scheduler.core.Clock` that moves the units to the next placement after each SLICE frames."""
+    """A `trilane.scheduler.core.Clock` that moves the units to the next placement whenever SLICE frames are presented.
+
+    `clock`: clock that does all other work.
+    `places`: for each placement in the order of its turn, the cores of each unit.
+    """
 
     def __init__(self, core: Core, clock: RealtimeClock, processes: UnitProcesses, places: Sequence[Cores]) -> None:
         self._core, self._clock, self._processes, self._places = core, clock, processes, places
@@ -342,7 +352,7 @@ class _Turns:
         self._clock.perform(now_ns, actions)
 
     def frame_ns(self) -> list[float]:
-        """Return the mean frame time of each placement in ns, without the first SKIPPED frames of its slice."""
+        """Return the mean frame time of each placement in ns, without the first SKIPPED frames of its turn."""
         presented_ns = self._core.ledger.presented_ns
         ends = [*self._begun[1:], SLICE * len(self._places)]
         spans = [(begin + SKIPPED, end) for begin, end in zip(self._begun, ends, strict=True)]

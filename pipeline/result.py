@@ -4,9 +4,9 @@ Rule: only the first failure counts; the result also has the messages. A result 
 only if the caller asks for it.
 
 Steps and jobs of a run are kept either in memory or in the run's journal, never in both. Memory is for a caller that
-runs a few frames and needs all of them. With a journal, no data is kept in memory that grows with the number of frames.
-Steps are written many at a time, after the actions of the last step were sent to the units. Written one by one, they
-would take three times as long, because the code that writes them would never be in the caches.
+runs a few frames and needs all steps and jobs. With a journal, memory does not grow with the number of frames. Steps
+are written many at a time, after the actions of the last step were sent to the units. To write each step alone would
+take three times as long, because the code that writes would never be in the caches.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ from trilane.writing import WRITABLE
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a run ended early.
+    """The reason why a run ended early.
 
-    `message`: one sentence.
+    `message`: reason as one sentence.
     `exit_code`: exit code of the program after this failure.
     """
 
@@ -64,9 +64,9 @@ class Failure:
 class RunResult:
     """A finished run.
 
-    `report`: measured figures; the caller adds the machine and the configuration.
-    `requested`, `presented`: numbers of frames.
-    `lost`, `dropped`: numbers of frames by cause.
+    `report`: figures of the run, without machine and configuration, which the caller adds.
+    `requested`, `presented`: numbers of requested and of presented frames.
+    `lost`, `dropped`: numbers of lost and of dropped frames, by cause.
     `pids`: process id of each unit.
     `startup_ms`: start-up time of each unit in ms.
     `jobs`, `recording`: jobs and steps of a run without a journal. With a journal both are empty, because the journal
@@ -76,7 +76,7 @@ class RunResult:
     `rung_switches`: how often a frame had another rung than the frame before.
     `messages`: messages about problems during the run, such as a unit that died and was restarted.
     `interrupted`: whether a signal ended the run.
-    `failure`: failure that ended the run; None without one. The other fields cover the time until then.
+    `failure`: failure that ended the run; None without one. The other fields then cover the time until the failure.
     """
 
     report: RunMetrics
@@ -111,8 +111,8 @@ class UnitError(TrilaneError):
 class RunLog:
     """The messages and the failure of a run.
 
-    `hears`: functions that are called with every message.
-    `messages`: the first MOST_MESSAGES messages, in order, and a note about further ones.
+    `hears`: functions that are called with the text of every message.
+    `messages`: the first MOST_MESSAGES messages, in order, and a note about the number of further messages.
     `failure`: the run's first failure.
     """
 
@@ -136,18 +136,24 @@ class RunLog:
             hear(text)
 
     def fail(self, text: str, exit_code: int = 1) -> None:
-        """Note the failure of the run if it is the first."""
+        """Note the first failure of the run; do nothing for later failures.
+
+        `text`: reason as one sentence. `exit_code`: exit code of the program after this failure.
+        """
         self.failure = self.failure or Failure(text, exit_code)
 
     def fail_with(self, message: Failed) -> None:
-        """Note a stage's error as failure and as message if it is the first failure."""
+        """If it is the first failure of the run, note a stage's error as failure and as message."""
         if self.failure is None:
             self.fail(message.message, message.exit_code)
             self.say(message.message)
 
 
 def after_stderr(tail: str) -> str:
-    """Return the last line of a unit's stderr as part of a sentence; empty if it wrote nothing. `tail`: stderr tail."""
+    """Return the last line of a unit's stderr as part of a sentence; empty if the unit wrote nothing.
+
+    `tail`: stderr tail of the unit.
+    """
     lines = tail.splitlines()
     return f"it wrote last: {lines[-1]}" if lines else ""
 
@@ -160,11 +166,11 @@ PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 @dataclass(frozen=True)
 class JournalFile:
-    """The journal file of a run, and further content for it.
+    """The path of a run's journal, and content for the journal that the run itself does not know.
 
     `path`: path of a file that does not exist yet.
-    `facts`: facts of the journal's `Begun`.
-    `sensors`: function that returns readings by dotted name; it is called every `SAMPLE_NS`.
+    `facts`: facts of the journal's first record, `Begun`.
+    `sensors`: function that returns measured values by dotted name (`Sampled`); it is called every `SAMPLE_NS`.
     """
 
     path: Path
@@ -173,21 +179,21 @@ class JournalFile:
 
 
 class JobSource(Protocol):
-    """The part of `trilane.pipeline.realtime_clock.RealtimeClock` from which a run's result takes the jobs."""
+    """The methods of `trilane.pipeline.realtime_clock.RealtimeClock` with which a record of the run reads jobs."""
 
     @property
     def waiting(self) -> int:
-        """The number of jobs that `ended` would return now."""
+        """The number of jobs that have ended since the last call of `ended`."""
 
     def ended(self) -> list[Worked | None]:
-        """Return the jobs that ended since the last call; None stands for a job of a lost frame."""
+        """Return the jobs that ended since the last call; None stands for a job whose frame is gone."""
 
     def stopped(self) -> list[Stopped]:
-        """Return the units that were seen stopped since the last call."""
+        """Return a record for each unit that a signal was seen to have stopped since the last call."""
 
 
 class CapReadings(Protocol):
-    """The part of a run's governor that is recorded."""
+    """The property of a run's governor that the journal records."""
 
     @property
     def temperatures_c(self) -> Mapping[str, float]:
@@ -197,7 +203,7 @@ class CapReadings(Protocol):
 class RunRecord(Protocol):
     """The record of a run, which the scheduler's loop fills through `add`.
 
-    `recording`, `jobs`: part of the run that is in memory.
+    `recording`, `jobs`: steps and jobs of a run in memory; without content for a run with a journal.
     `failure`: error after which nothing more can be recorded; None without one.
     """
 
@@ -208,13 +214,17 @@ class RunRecord(Protocol):
     def failure(self) -> UnwrittenError | None: ...
 
     def begin(self, source: JobSource, pids: Callable[[], Mapping[str, int]]) -> None:
-        """Note that the loop begins. `pids`: function that returns the present process id of each unit."""
+        """Note that the scheduler's loop begins.
+
+        `source`: object that gives the jobs that have ended.
+        `pids`: function that returns the present process id of each unit.
+        """
 
     def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
         """Record a step of `core` whose actions were carried out. Raises `failure` if there is one."""
 
     def say(self, text: str) -> None:
-        """Record a message to a person."""
+        """Record a message of the run to its user."""
 
     def reckoned(self, places: Placement) -> Reckoned:
         """Return what bounded the whole run; called after the loop. `places`: cores and threads of the run's units.
@@ -227,7 +237,7 @@ class RunRecord(Protocol):
 
 
 class _KeptRun:
-    """A record of the run in memory."""
+    """A `RunRecord` in memory."""
 
     def __init__(self, graph: Graph, settings: Settings) -> None:
         self.recording = Recording(graph, settings)
@@ -236,7 +246,7 @@ class _KeptRun:
         self._source: JobSource | None = None
 
     def begin(self, source: JobSource, pids: Callable[[], Mapping[str, int]]) -> None:  # noqa: ARG002 - a `RunRecord`
-        """Keep the source. Jobs are read after the run, because units may share the scheduler's core."""
+        """Keep the source. Its jobs are read after the run, so that units on the scheduler's core are not slowed."""
         self._source = source
 
     def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
@@ -255,14 +265,14 @@ class _KeptRun:
         """Do nothing, because everything is in memory."""
 
 
-#: A step, the records that follow from it, and the number of jobs that had ended by then since the last writing.
+#: A step, the records that result from it, and the number of jobs that ended from the last writing to this step.
 _Step = tuple[Stepped, list[Accounted | Counted], int]
 
 
 class _JournaledRun:
-    """A record of the run in the journal `file`. Its `recording` has no steps, and its `jobs` stay empty.
+    """A `RunRecord` in the journal `file`. Its `recording` has no steps, and its `jobs` stay empty.
 
-    `writer`: writer of that file.
+    `writer`: writer of the journal.
     `caps`: governor that sets the units' duties; duties and temperatures are sampled.
     """
 
@@ -315,7 +325,7 @@ class _JournaledRun:
             self._sample(now_ns, core)
 
     def _write(self) -> None:
-        """Write the steps and jobs since the last call. Raises UnwrittenError if they cannot be written."""
+        """Add the steps and jobs since the last call to the journal. Raises UnwrittenError if this fails."""
         add, told = self._writer.add, 0
         jobs = self._source.ended() if self._source is not None else []
         for stopped in self._source.stopped() if self._source is not None else []:
@@ -351,12 +361,12 @@ class _JournaledRun:
             self._writer.flush()
 
     def flush(self) -> None:
-        """Write everything that was recorded to the file. Raises UnwrittenError if it cannot be written."""
+        """Write everything that was recorded to the file. Raises UnwrittenError if this fails."""
         self._write()
         self._writer.flush()
 
     def _sample(self, now_ns: int, core: Core) -> None:
-        """Write the readings that are due, and flush, so that readers of the journal see them."""
+        """Write the measured values that are due, and flush, so that readers of the journal see them."""
         self._flush_ns = now_ns + FLUSH_NS
         values: dict[str, float] = {}
         if self._caps is not None:
@@ -376,10 +386,9 @@ class _JournaledRun:
 def recorded(
     file: JournalFile | None, graph: Graph, settings: Settings, caps: CapReadings | None, target_period_ns: int
 ) -> Iterator[RunRecord]:
-    """Yield the record of one run, in `file`, or in memory if `file` is None.
+    """Yield the record of one run. At the end of the context the file is complete, however the run ended.
 
-    At the end everything is written to the file, however the run ended.
-
+    `file`: journal of the run; None: the record is in memory.
     `caps`: governor that sets the units' duties, or None.
     `target_period_ns`: as for `trilane.scheduler.stats.due_ns`; the journal names it.
 

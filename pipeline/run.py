@@ -1,9 +1,9 @@
 """Runs a pipeline on this machine. Rule: whatever happens, the units' processes are gone when `run_pipeline` returns.
 
-A run with a journal keeps at most MOST_EXACT times of each kind. After that, percentiles come from the library
-ddsketch, within RELATIVE_ERROR of the exact values. Masson, Rim, Lee, "DDSketch: A Fast and Fully-Mergeable Quantile
-Sketch with Relative-Error Guarantees", PVLDB 12 (2019). The sketch counts values in bins, and each bin is wider than
-the last by a constant factor. Therefore each value is known within that factor. _BINS bins reach from a nanosecond to
+A run with a journal keeps at most MOST_EXACT times of each kind. Percentiles of more times come from the library
+ddsketch, within RELATIVE_ERROR of the exact values. Source: Masson, Rim, Lee, "DDSketch: A Fast and Fully-Mergeable
+Quantile Sketch with Relative-Error Guarantees", PVLDB 12 (2019). The sketch counts values in bins. Each bin is wider
+than the bin before by the same factor, so each value is known within this factor. _BINS bins reach from a nanosecond to
 centuries.
 """
 
@@ -53,7 +53,7 @@ SKETCHED = f"of more than {MOST_EXACT} samples by ddsketch, within {RELATIVE_ERR
 
 
 class DdSketch:
-    """A `trilane.scheduler.stats.Sketch` of values of at least 0."""
+    """A `trilane.scheduler.stats.Sketch` of values that are not negative."""
 
     def __init__(self) -> None:
         self._sketch = LogCollapsingLowestDenseDDSketch(RELATIVE_ERROR, _BINS)
@@ -85,7 +85,7 @@ class ReportingGovernor(ClockGovernor, Protocol):
         """The temperatures on which the governor's decisions depend, in degrees Celsius, by name."""
 
     def report(self) -> dict[str, Any]:
-        """Return the report's keys `caps` and `temperature_c`."""
+        """Return the keys `caps` and `temperature_c` of report.json with their values."""
 
 
 def run_pipeline(
@@ -112,32 +112,34 @@ def run_pipeline(
     """Run `frames` frames through the units of `pipeline`, and return the result.
 
     `policy`: sequential, pipelined, latest or deadline.
-    `fps`: target rate in frames a second. If frames have no deadline, a longer frame time counts as a missed deadline.
-    `pace_fps`: rate at which frames are released, in frames a second. None: under `latest` and `deadline` they are
+    `fps`: target rate in frames a second. If frames have no deadline, a frame time above 1 / `fps` counts as a missed
+    deadline.
+    `pace_fps`: rate at which frames are released, in frames a second. None: under `latest` and `deadline` frames are
     released at the rate `fps`, under other policies as soon as they can be taken.
     `assets`: arrays that every stage may read.
     `hang_ns`: longest time of a job in ns; a unit whose job takes longer is restarted.
     `latch_ms`: margin in ms by which the first stage should end before the second can take its frame; 0: the first
     stage begins at once.
-    `works`: work of each rung of a ladder in thousandths, the most first; it needs frames that are released at a rate.
-    A frame that would be late gets less work (`trilane.scheduler.policy`), and the first stage gets the rung
-    (`SteppedStage`).
-    `follow`: names of the stages whose time follows the work.
+    `works`: work of each rung of a ladder in thousandths of all the work, from 1000 downwards; empty: no ladder. A
+    ladder counts only if frames are released at a rate. A frame that would be late gets less work
+    (`trilane.scheduler.policy`), and the first stage gets the rung (`SteppedStage`).
+    `follow`: names of the stages that take less time for less work.
     `settings`: settings of the scheduler, which replace `frames` and the options above except `fps`.
-    `requests`: queue of frame requests, at most `frames` in sum; it is closed when this returns.
-    `controls`: requests to the run, closed when this returns. With `controls` or `requests`, only released frames count
-    as requested in the report.
+    `requests`: queue of frame requests, at most `frames` in sum; this function closes it.
+    `controls`: requests to the run; this function closes them. With `controls` or `requests`, only released frames
+    count as requested in the report.
     `governor`: governor that holds the units to shares of the time, and adds caps and temperatures to the report.
-    `journal`: file that records the run while it goes on. With it, `RunResult.recording` and `RunResult.jobs` stay
-    empty; None: they have all steps and jobs.
-    `starter`: fork server that was started earlier; None makes one for this run.
-    `on_progress(presented, requested)`, `on_message(text)`: functions that are called from this thread.
+    `journal`: file that records the run while it goes on. With a journal, `RunResult.recording` and `RunResult.jobs`
+    stay empty; without one, they have all steps and jobs.
+    `starter`: fork server that was started earlier; None: one is made for this run.
+    `on_progress(presented, requested)`: function that is called, in this thread, with numbers of frames.
+    `on_message(text)`: function that is called, in this thread, with each message about a problem.
 
     SIGINT, SIGTERM, SIGHUP or SIGQUIT ends the run cleanly, and its result is `interrupted`. A second signal ends the
     units at once. Before the first frame, a signal raises KeyboardInterrupt.
 
-    Raises BadInputError for bad settings, and if a unit's process calls it. Raises TrilaneError, with the exit code of
-    the unit's error, if a unit cannot start; a later failure is in `RunResult.failure`.
+    Raises BadInputError for bad settings, and if a unit's process calls this function. Raises TrilaneError, with the
+    exit code of the unit's error, if a unit cannot start; a later failure is in `RunResult.failure`.
     """
     refuse_in_a_unit()
     check_open_files()
@@ -221,7 +223,7 @@ class _Run:
         self._outcome = Outcome(OutcomeKind.ABORTED)
 
     def execute(self) -> None:
-        """Do all steps. Raises as `run_pipeline` does."""
+        """Do all steps of the run. Raises as `run_pipeline` does."""
         self._startup_ms = start_units(self._processes, self._core.graph.units, self._interrupts)
         self.pids = self._processes.pids
         graph, settings = self._core.graph, self._core.settings
@@ -269,7 +271,7 @@ class _Run:
         )
 
     def _mean_metrics(self) -> Mapping[str, Mapping[str, float]]:
-        """Return the mean of each metric of each stage, over the jobs that reported it.
+        """Return the mean of each metric, over the jobs that reported it, by stage and metric.
 
         Counts of bytes are left out, because `add_bytes` reports them.
         """
@@ -305,11 +307,11 @@ def _settings(
 
 
 def _stepped(settings: Settings, works: tuple[int, ...], follow: tuple[str, ...]) -> Settings:
-    """Return the settings with the ladder if frames are released at a rate; without a rate no frame can be late."""
+    """Return the settings, with the ladder `works` if frames are released at a rate; else no frame can be late."""
     return replace(settings, works=works, follow=follow) if works and settings.period_ns else settings
 
 
 def _spread(frames: int, count: int) -> list[int]:
-    """Return `count` frame numbers, spread evenly over the run."""
+    """Return at most `count` frame numbers, spread evenly over a run of `frames` frames."""
     count = min(count, frames)
     return [index * frames // count for index in range(count)]

@@ -13,8 +13,8 @@ from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from trilane.pipeline.description import Model
 
-#: Keys of older reports that nothing writes now: isolated times of stages, a second computation of the shares in
-#: `units`, and whether the core was compiled.
+#: Keys that only older reports have: isolated times of stages, a second computation of the shares in `units`, and
+#: whether the core was compiled.
 GONE: Final = frozenset({"isolated_ms", "accounts", "scheduler_core"})
 
 
@@ -22,7 +22,7 @@ class Record(Model):
     """Base class of everything that is written to report.json."""
 
     def as_json(self) -> dict[str, Any]:
-        """Return the keys that were set, as JSON values, in the order of the fields."""
+        """Return the fields that were set, by their keys in report.json, as JSON values in the order of the fields."""
         return self.model_dump(mode="json", by_alias=True, exclude_unset=True)
 
     @model_validator(mode="before")
@@ -40,10 +40,10 @@ class FrameCounts(Record):
     `requested`: number of frames that the run was asked for.
     `presented`: number of frames that reached the end of the last stage.
     `lost`: number of frames that were begun and not presented, because a unit died or a stage failed.
-    `lost_by_cause`: numbers of lost frames by `cause:unit`; `failed` has the stage in place of the unit.
+    `lost_by_cause`: numbers of lost frames by `cause:unit`; for the cause `failed` by `failed:stage`.
     `dropped`: numbers of dropped frames, by `edge:cause`.
-    `not_begun`: number of frames that were never taken because the run ended before; null in older reports.
-    `skipped`: number of presented frames that took the pipeline's bypass; absent if the pipeline has none.
+    `not_begun`: number of frames that no stage took before the run ended; null in older reports.
+    `skipped`: number of presented frames that took the pipeline's bypass; absent without a bypass.
     """
 
     requested: int
@@ -86,7 +86,7 @@ class TimeSummary(Record):
     @model_validator(mode="before")
     @classmethod
     def _know_nothing_of_no_times(cls, document: Any) -> Any:
-        """Replace the zeros of a summary without times by null; older reports have such zeros too."""
+        """Replace the zeros of a summary without times by null. Ledgers and older reports have these zeros."""
         if not isinstance(document, dict) or document.get("samples") != 0:
             return document
         return {key: value if key == "samples" else None for key, value in document.items()}
@@ -109,9 +109,9 @@ class FrameTimes(TimeSummary):
 
 
 class XrBench(Record):
-    """XRBench's scores (Kwon et al., MLSys 2023, section 3), 0 to 1.
+    """XRBench's scores (Kwon et al., MLSys 2023, section 3), from 0 (worst) to 1 (best).
 
-    `real_time`: score of how well frames kept their deadlines; null if no frame had a deadline.
+    `real_time`: score that is 1 if all frames came long before their deadlines; null if no frame had a deadline.
     `qoe`: quality of experience: presented frames divided by requested frames.
     `energy`: energy score; null if the power is not known.
     """
@@ -128,7 +128,7 @@ class MovedBytes(Record):
     `written`: bytes written into slots and files.
     `uploaded`, `read_back`: bytes moved into the GPU's memory, and out of it.
     `least`: bytes that a frame needs, without copies.
-    `ratio`: sum of the first four divided by `least`; null if `least` is 0.
+    `ratio`: all moved bytes, without `least`, divided by `least`; null if `least` is 0.
     """
 
     read: float
@@ -173,7 +173,7 @@ class StageTimes(Record):
 
 
 class IdleShares(Record):
-    """Why a unit did not work, as shares of the run's time.
+    """Shares of the run's time in which a unit did not work, by cause.
 
     `starved`: share in which the unit had no input.
     `blocked`: share in which the unit had input, but no free output slot, or the limit of frames in flight was reached.
@@ -192,20 +192,20 @@ class IdleShares(Record):
 
 
 class UnitShares(Record):
-    """Shares and figures of one unit; `busy` and the five parts of `idle` sum to 1.
+    """Shares and figures of one unit; `busy` and all parts of `idle` sum to 1.
 
     On the virtual clock `cpu_s` and the fields after it are not set.
 
     `busy`: share of the time in which a job ran.
-    `idle`: the rest of the time, by cause.
+    `idle`: shares of the time in which no job ran, by cause.
     `jobs`: number of the unit's jobs that have ended.
     `restarts`: number of the unit's processes after the first.
-    `cpu_s`: CPU time in seconds of all its threads in the run, including threads that spin between jobs.
+    `cpu_s`: CPU time in seconds of all the unit's threads in the run, including threads that spin between jobs.
     `cpu_in_jobs_s`: part of `cpu_s` within jobs.
-    `pid`: process id of its last process.
+    `pid`: process id of the unit's last process.
     `cores`: numbers of the cores that the unit may use.
-    `threads`: number of threads that its stages may use.
-    `spin`: whether those threads may spin between jobs.
+    `threads`: number of threads that the unit's stages may use.
+    `spin`: whether these threads may spin between jobs.
     """
 
     busy: float
@@ -221,11 +221,12 @@ class UnitShares(Record):
 
 
 class CoreShare(Record):
-    """Use of a set of cores by the units that may run on `cores` and nowhere else.
+    """Use of a set of cores by the units that may run only on these cores.
 
-    `units`: names of these units.
-    `cpu`: CPU time of the units as a share of the time that these cores had; at most 1.
-    `busy`: busy time of the units as a share of the same time; at most 1 if no unit has a device of its own.
+    `cores`: numbers of the cores.
+    `units`: names of the units.
+    `cpu`: CPU time of the units as a share of the time that the cores had; at most 1.
+    `busy`: busy time of the units as a share of the time that the cores had; at most 1 if no unit has a device.
     """
 
     cores: tuple[int, ...]
@@ -235,11 +236,11 @@ class CoreShare(Record):
 
 
 class UnitCap(Record):
-    """The cap of one unit.
+    """The cap of one unit: the corner, and so the share of the time, that the governor allowed it.
 
     `corner`: corner at the run's end.
-    `duty`: allowed share of the time at the run's end.
-    `duty_mean`: mean allowed share over the run.
+    `duty`: duty at the run's end, 0 to 1.
+    `duty_mean`: mean duty over the run, 0 to 1.
     """
 
     corner: str
@@ -248,7 +249,7 @@ class UnitCap(Record):
 
 
 class Caps(Record):
-    """The caps of the units. All fields except `how` are present only if a performance profile was requested.
+    """The caps of the units (`UnitCap`). All fields but `how` are present only if a performance profile was requested.
 
     `how`: meaning of a cap on this clock, or a note that there was none.
     `profile`: name of the hardware profile whose corners and limits were used.
@@ -291,7 +292,7 @@ class ProcessorState(Record):
     """The state of the run's cores; a field is null if the kernel does not show it.
 
     `clock_begin_ghz`, `clock_end_ghz`: clock of the fastest core in GHz, before the first and after the last frame.
-    `throttles`: how often heat slowed a core between the two.
+    `throttles`: how often heat slowed a core between the first and the last frame.
     """
 
     clock_begin_ghz: float | None = None
@@ -300,9 +301,9 @@ class ProcessorState(Record):
 
 
 class SlowedCost(Record):
-    """The cost if jobs take longer by the share `Slowed.by`, from replays of the run (`trilane.pipeline.reckoning`).
+    """The cost of jobs that take longer by the share `Slowed.by`, from replays (`trilane.pipeline.reckoning`).
 
-    `cost`: growth of the frame time, as a share.
+    `cost`: growth of the frame time, as a share of the frame time.
     `cost_low`, `cost_high`: bounds of the 95 % interval of `cost`, from the scatter over the run's frames; null for
     fewer than 60 frames.
     """
@@ -319,7 +320,7 @@ class PathShare(SlowedCost):
     are absent if the bound was found from the path alone.
 
     `name`: name of the unit or stage, or of time that belongs to neither, such as `overhead`.
-    `share`: its share of the path.
+    `share`: share of the path that belongs to this name, 0 to 1.
     `share_low`, `share_high`: bounds of the 95 % interval of `share`, from the scatter of this run's frames; null for
     fewer than 51 frames.
     `rivals`: other names whose cost may be as large; without costs, names whose share may be as large.
@@ -340,7 +341,7 @@ class PathShare(SlowedCost):
 class PathShares(Record):
     """The largest parts of the critical path.
 
-    `unit`: unit with the largest share, or another owner of time if its share is larger.
+    `unit`: unit with the largest share, or another owner of time whose share is larger.
     `stage`: stage with the largest share; null if no stage is on the path.
     """
 
@@ -356,10 +357,10 @@ class FramesBehind(Record):
 
 
 class NewestTaken(Record):
-    """Ages of the frames that inputs of the newest frame took from one stream.
+    """Ages of the frames that inputs with `latest` took from one stream.
 
-    `age_ms`: times from the sampling of a taken frame to the hand-over of the job that took it.
-    `frames_behind`: distances from a taken frame to the frame of the job.
+    `age_ms`: times from the sampling of a taken frame to the hand-over of the job that took this frame.
+    `frames_behind`: numbers of frames by which a taken frame was older than the job's own frame.
     """
 
     age_ms: TimeSummary
@@ -372,7 +373,7 @@ class Slowed(Record):
     `by`: share by which all jobs of a stage take longer.
     `frames`: number of the run's frames that were replayed.
     `over_measured`: frame time of a replay without a slower stage, divided by the frame time of the run.
-    `is_trusted`: whether the costs decide the bound: the replay is near the run, and slowing a stage costs something.
+    `is_trusted`: whether the costs decide the bound, because the replay is near the run and slowing a stage costs time.
     `costs`: cost of each stage.
     """
 
@@ -384,13 +385,13 @@ class Slowed(Record):
 
 
 class Bound(PathShares):
-    """The unit and the stage that bounded the frame time, because slowing them costs most.
+    """The unit and the stage that bounded the frame time: those whose slowing costs most.
 
     If no replay can be trusted, the largest shares of the critical path decide.
 
     `unit`: unit that bounded the run; its name is the report's `bottleneck`.
     `stage`: stage that bounded the run; null if no stage did.
-    `path`: largest parts of the path; absent if they have the same names.
+    `path`: largest parts of the path; absent if their names are those of `unit` and `stage`.
     `stages`: share of each stage in the path, the largest first; absent in older reports.
     `slowed`: cost of slowing each stage; absent if the run was not replayed.
     """
@@ -415,8 +416,8 @@ class PolicyMetrics(Record):
     `units`: shares of each unit.
     `efficiency`: work of the slowest unit's jobs, as a share of the time between the first and the last presented
     frame; null for fewer than two.
-    `core_efficiency`: the same share for the fullest cores.
-    `machine_efficiency`: the same share for all cores of the run.
+    `core_efficiency`: CPU time of the jobs on the fullest set of cores, as a share of the time that this set had.
+    `machine_efficiency`: CPU time of all jobs, as a share of the time that all cores of the run had.
     `bottleneck`: name of the bound of the frame time: a unit, or another owner of time, such as `other programs`,
     `release`, `overhead` or `held`; null without a path.
     `bound`: unit and stage that bounded the frame time, costs of slowing them, and their shares of the critical path.
@@ -445,7 +446,7 @@ class PolicyMetrics(Record):
     @field_validator("fps")
     @classmethod
     def _know_no_rate_of_one_frame(cls, fps: float | None, known: ValidationInfo) -> float | None:
-        """Replace the 0 of a run that presented fewer than two frames by null; older reports have such a 0 too."""
+        """Replace the rate 0, as ledgers and older reports have it, by null if fewer than two frames were presented."""
         frames = known.data.get("frames")
         return fps if frames is None or frames.presented > 1 else None
 
@@ -455,7 +456,7 @@ class RunMetrics(PolicyMetrics):
 
     `clock`: `host`, measured on this machine, or `virtual`, computed from a hardware profile.
     `duration_s`: time in seconds from the first job to the end of the run.
-    `percentiles`: whether percentiles are exact, or which ones come from a sketch, and its error; on the host clock.
+    `percentiles`: text that says whether percentiles are exact or from a sketch, with its error; on the host clock.
     `xrbench`: XRBench's scores.
     `edge`: edge rule of the scheduler.
     `idle_cores`: whether cores without work stayed awake; on the host clock.
@@ -479,5 +480,8 @@ class RunMetrics(PolicyMetrics):
 
 
 def metrics_of(ledger_report: Mapping[str, Any]) -> RunMetrics:
-    """Return the figures from the keys of `Ledger.report()` and further keys. Raises ValueError for a wrong key."""
+    """Return the figures of a run. Raises ValueError for a wrong key or value.
+
+    `ledger_report`: keys of `Ledger.report()`, and further keys of report.json.
+    """
     return RunMetrics.model_validate(ledger_report)

@@ -2,9 +2,9 @@
 
 Rule: a stage sees only its slots, its settings and its unit.
 
-The slots of a stage with ports contain named arrays. Rule: an array is a view of the slot's memory, never a copy. Each
-array begins on its own cache line. The types of all ports are known before a slot is made, so that a stage and its
-readers use the same offsets.
+The slots of a stage with ports contain named arrays, one for each port. Rule: an array is a view of the slot's memory,
+never a copy. Each array begins on its own cache line. The types of all ports are known before a slot is made, so that a
+stage and its readers use the same offsets.
 """
 
 from __future__ import annotations
@@ -36,30 +36,33 @@ class Skip(dict[str, float]):
 class Stage(Protocol):
     """One stage inside a unit's process, made by a `StageFactory`.
 
-    The stage at the end of `Pipeline.bypass` takes frames from two edges. Its `inputs` are the slots of its own edge,
-    then the slots of the edge on which the bypass begins.
+    The stage at the end of `Pipeline.bypass` takes frames from two edges. Its `inputs` are the slots of its own input
+    edge, followed by the slots of the edge on which the bypass begins.
     """
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
-        """Take every slot of the stage's edges; called once, before the first job. Allocate here, never later."""
+        """Keep every slot of the stage's edges; called once, before the first job. Allocate memory here, never later.
+
+        `inputs`, `outputs`: slots of the input edge and of the output edge; empty if there is no such edge.
+        """
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
         """Do `frame` from `inputs[slot_in]` to `outputs[slot_out]`, and return metrics by name, often none.
 
-        The first stage of a pipeline has no input, and the last has no output; the slot is then None. The header of the
-        output slot already has the frame's number and sampling time. If both edges have the same header, it already has
-        all fields of the input.
+        The first stage of a pipeline has no input, so `slot_in` is None; the last has no output, so `slot_out` is None.
+        The header of the output slot already has the frame's number and sampling time. If the input edge has the same
+        kind of header, the output's header already has all fields of the input's.
         """
 
     def close(self) -> None:
-        """Release the stage's resources; files are completed and renamed here."""
+        """Release the stage's resources. A stage that writes a file completes and renames it here."""
 
 
 class JoiningStage(Protocol):
-    """A stage of a graph that has several inputs, or takes the newest frame of one."""
+    """A stage of a graph with several inputs, or with an input that takes the newest frame."""
 
     def bind(self, inputs: Sequence[Sequence[Packet]], outputs: Sequence[Packet]) -> None:
-        """Take every slot of each input, in the order of the stage's inputs, and of the output, as `Stage.bind`."""
+        """Keep every slot, as `Stage.bind`. `inputs`: slots of each input, in the order of the stage's inputs."""
 
     def run(self, frame: int, slots_in: tuple[int | None, ...], slot_out: int | None) -> Mapping[str, float]:
         """Do `frame`, as `Stage.run`.
@@ -67,7 +70,7 @@ class JoiningStage(Protocol):
         The header of the output slot already has the frame's number and the sampling time of the oldest input. Inputs
         that take the newest frame do not count for this time. The header has no other fields of the inputs.
 
-        `slots_in`: slot of each input; None for an input that takes the newest frame, while there is none.
+        `slots_in`: slot of each input; None for an input that takes the newest frame, as long as there is no frame.
         """
 
     def close(self) -> None:
@@ -78,7 +81,7 @@ class SteppedStage(Stage, Protocol):
     """The first stage of a pipeline whose frames may be given less work (`run_pipeline`'s `works`)."""
 
     def step_to(self, rung: int) -> None:
-        """Give frames the work of `rung` from now on; called before `run` when the rung, first 0, has changed."""
+        """Give frames the work of `rung` from now on. The first rung is 0; called before `run` after each change."""
 
 
 class SkippingStage(Stage, Protocol):
@@ -108,7 +111,7 @@ class UnitContext:
     _devices: set[str] = field(default_factory=set)
 
     def shared(self, key: str, make: Callable[[], T]) -> T:
-        """Return the object that `make` returns; `make` is called once per `key` in this process.
+        """Return the process's only object with the name `key`; the first call makes the object with `make`.
 
         An example is the OpenGL context with which two stages draw.
         """
@@ -118,10 +121,10 @@ class UnitContext:
         return made
 
     def use_device(self, name: str) -> None:
-        """Note that hardware other than the unit's cores does its work, such as a graphics card.
+        """Note that a device `name`, such as a graphics card, works for the unit besides the unit's cores.
 
-        With a device, a job whose threads sleep counts as busy, because the device works. Without one, it counts as
-        idle.
+        With a device, time in which the threads of a job sleep counts as busy, because the device works. Without a
+        device, this time counts as idle.
         """
         self._devices.add(name)
 
@@ -135,9 +138,10 @@ class StageFactory(Protocol):
     """A function that builds a stage in the unit's process; `PipelineStage.factory` names it."""
 
     def __call__(self, settings: Mapping[str, Any], unit: UnitContext) -> Stage | JoiningStage:
-        """Return the built stage. Do all slow work, and all work that may fail, here.
+        """Return the built stage. All slow work, and all work that may fail, belongs here.
 
         `settings`: `PipelineStage.settings`.
+        `unit`: context of the unit that will run the stage.
 
         Raises BadInputError or MissingPartError.
         """
@@ -150,12 +154,15 @@ Ports = Mapping[str, str]
 
 
 def payload_bytes(ports: Mapping[str, PortType]) -> int:
-    """Return the size in bytes of a slot with these ports."""
+    """Return the size in bytes of a slot with these ports, by name."""
     return sum(-(-port.payload_bytes // LINE) * LINE for port in ports.values())
 
 
 def views(payload: U8, ports: Mapping[str, PortType]) -> dict[str, NDArray[Any]]:
-    """Return the array of each port in a slot, as views of `payload`. Raises ValueError if the slot is too small."""
+    """Return a view of a slot for each port, by the port's name. Raises ValueError if the slot is too small.
+
+    `payload`: bytes of the slot.
+    """
     found: dict[str, NDArray[Any]] = {}
     start = 0
     for name, port in ports.items():
@@ -168,11 +175,11 @@ def views(payload: U8, ports: Mapping[str, PortType]) -> dict[str, NDArray[Any]]
 
 
 class PortRead(Model):
-    """The input of a port of a stage.
+    """The input of one port of a stage.
 
-    `name`: name of the stage's port.
-    `stream`: index of the stream among the stage's inputs.
-    `port`: name of the stream's port.
+    `name`: name of the reading port.
+    `stream`: index, among the stage's inputs, of the stream that is read.
+    `port`: name of the port of this stream that is read.
     """
 
     name: str
@@ -181,10 +188,10 @@ class PortRead(Model):
 
 
 class PassedPorts(Model):
-    """The slots of frames that come to the stage by a bypass; their numbers follow those of the stage's own slots.
+    """The slots of frames that come to the stage by a bypass.
 
-    `behind`: number of slots of the stage's own stream.
-    `ports`: ports in the slots of the bypass.
+    `behind`: number of the first such slot, which is the number of slots of the stage's own input edge.
+    `ports`: types of the ports in the slots of the bypass.
     """
 
     behind: int
@@ -196,13 +203,13 @@ class PortedSettings(Model):
 
     `where`: file and key of the stage, for errors.
     `folder`: folder of the pipeline file.
-    `run_folder`: folder of the run.
+    `run_folder`: run folder, for files that the stage writes.
     `joins`: whether the stage is a `trilane.pipeline.stage.JoiningStage`.
-    `reads`: ports of the stage, in the order of the file.
-    `streams`: ports of each stream that the stage reads.
-    `writes`: ports that the stage writes; empty if no stage reads it and the file states none.
-    `keys`: keys of the file that only this kind of stage has.
-    `bypass`: ports of the bypass that ends at the stage; None without one.
+    `reads`: inputs of the stage's ports, in the order of the file.
+    `streams`: types of the ports of each stream that the stage reads.
+    `writes`: types of the ports that the stage writes; empty if the file states no ports and no stage reads this one.
+    `keys`: keys of the file that only this kind of stage has, with their values.
+    `bypass`: slots of the bypass that ends at the stage; None without one.
     """
 
     where: str
@@ -217,7 +224,7 @@ class PortedSettings(Model):
 
 
 class Read(NamedTuple):
-    """A port that a stage reads."""
+    """A port through which a stage reads: its name and its type."""
 
     name: str
     type: PortType
@@ -226,8 +233,9 @@ class Read(NamedTuple):
 class PortedStage:
     """A `Stage` or `JoiningStage` that gets arrays. A subclass implements `work`.
 
-    `reads`: ports that it reads.
-    `writes`: types of the ports that it writes, by name.
+    `settings`: settings of the stage.
+    `reads`: ports through which the stage reads.
+    `writes`: types of the ports that the stage writes, by name.
     """
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
@@ -247,7 +255,7 @@ class PortedStage:
         return min((int(header["t_sampled_ns"]) for header in taken), default=0)
 
     def bind(self, inputs: Sequence[Any], outputs: Sequence[Packet]) -> None:
-        """Make the views of all slots, then call `ready`."""
+        """Make the arrays of all slots, and then call `ready`. `inputs`, `outputs`: slots, as for `Stage.bind`."""
         streams: Sequence[Sequence[Packet]] = inputs if self.settings.joins else [inputs] if inputs else []
         self._inputs = [
             [self._views(place, packet, ports) for place, packet in enumerate(packets)]
@@ -258,9 +266,13 @@ class PortedStage:
         self.ready()
 
     def _views(self, place: int, packet: Packet, ports: Mapping[str, PortType]) -> Mapping[str, NDArray[Any] | None]:
-        """Return the arrays of a slot by port; None for a port that the writer of a slot on the bypass does not have.
+        """Return the read-only arrays of a slot, by port.
+
+        The stage at which a bypass begins may lack a port; in its slots the port has None in place of an array.
 
         `place`: number of the slot.
+        `packet`: the slot.
+        `ports`: types of the ports of the stream.
         """
         passed = self.settings.bypass
         if passed is None or place < passed.behind:
@@ -277,19 +289,19 @@ class PortedStage:
         return self.work(frame, arrays, {} if slot_out is None else self._outputs[slot_out])
 
     def ready(self) -> None:
-        """Prepare for the first frame; called once, after the views of all slots are made."""
+        """Prepare for the first frame; called once, after the arrays of all slots are made."""
 
     def work(self, frame: int, arrays: Sequence[NDArray[Any] | None], outputs: Arrays) -> Mapping[str, float]:
         """Do a frame, and return metrics by name; a `Skip` sends the frame to the bypass that begins at the stage.
 
-        `arrays`: array of each of `reads`, read-only; None if there is no newest frame yet, or if the frame took a
+        `arrays`: read-only array of each of `reads`; None if there is no newest frame yet, or if the frame took a
         bypass that lacks the port.
-        `outputs`: array of each of `writes`, to be filled; empty if no stage reads this one.
+        `outputs`: arrays to fill, by the names in `writes`; empty if no stage reads this one.
         """
         raise NotImplementedError
 
     def forget(self) -> None:
-        """Forget earlier frames: the next frame must not take the bypass because of them (`SkippingStage.forget`)."""
+        """Forget earlier frames, so that the next frame does not take the bypass (`SkippingStage.forget`)."""
 
     def close(self) -> None:
         """Release the stage's resources."""

@@ -1,7 +1,7 @@
-"""Prepares the surroundings of a run: checks, cores, memory and processes, and the share of other programs.
+"""Prepares the surroundings of a run: checks, cores, memory and processes. Measures the share of other programs.
 
 Rule: a check raises before anything is started. Whatever happens, cores, memory and processes are the same after a run
-as before. CPU time of the run's cores that is not the run's own belongs to other programs.
+as before. If a core of the run is busy but does no work of the run, the time counts for other programs.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ LEAST_FILES = 96
 
 
 def refuse_in_a_unit() -> None:
-    """Raise BadInputError if a unit is importing the module of its stages, because that would start units endlessly."""
+    """Raise BadInputError if a unit's process calls this, because its module would start units without end."""
     spec = sys.modules["__main__"].__spec__
     if spec is not None and spec.name == fork_server.__name__:
         found = "run_pipeline was called while a unit imported its stages"
@@ -57,17 +57,20 @@ def check_cores(pipeline: Pipeline) -> None:
 
 
 def check_positive(**values: float | None) -> None:
-    """Raise BadInputError for a value that is not None, not above 0 or not finite."""
+    """Raise BadInputError for the first value that is 0 or less, or is not finite; None is allowed.
+
+    `values`: values by the name that the message gives them.
+    """
     for name, value in values.items():
         if value is not None and not 0 < value < math.inf:
             raise BadInputError(name, str(value), "more than 0")
 
 
 class OtherPrograms:
-    """Counts the CPU time of other programs on some cores, from its creation on.
+    """Counts the CPU time of other programs on some cores, from the creation of this object on.
 
-    `cores`: numbers of these cores.
-    `pids`: processes that belong to the run, besides this one.
+    `cores`: numbers of the cores.
+    `pids`: ids of the run's processes besides this process; they do not count as other programs.
     """
 
     def __init__(self, cores: Sequence[int], pids: Sequence[int] = ()) -> None:
@@ -76,9 +79,9 @@ class OtherPrograms:
         self._begin_s, self._before_s = time.monotonic(), self._others_s()
 
     def share(self) -> float:
-        """Return the share of other programs in the time of the cores, at most 1.
+        """Return the share (0 to 1) of the cores' time that other programs had.
 
-        The kernel counts in steps of 10 ms, so the share of less than 0.1 s is inexact.
+        The kernel counts in steps of 10 ms, so the share is inexact if less than 0.1 s has passed.
         """
         had_s = max(time.monotonic() - self._begin_s, 1e-9) * len(self._cores)
         return min(max(self._others_s() - self._before_s, 0.0) / had_s, 1.0)
@@ -92,8 +95,8 @@ class OtherPrograms:
 def beside_units(cores: Sequence[int], pids: Mapping[str, int]) -> Callable[[Mapping[str, int]], float | None]:
     """Count the CPU time of other programs on `cores` from now on, and return a function that returns their share.
 
-    The function takes the units' present process ids. It returns None if a unit has died, because its CPU time is then
-    unknown.
+    The function takes the process id of each unit at the end. If a unit's process has changed, the CPU time of the old
+    process is not known, and the function returns None.
 
     `pids`: process id of each unit now.
     """
@@ -111,7 +114,7 @@ def beside_units(cores: Sequence[int], pids: Mapping[str, int]) -> Callable[[Map
 
 
 def processor_of(cores: Sequence[int]) -> Callable[[], ProcessorState]:
-    """Read clock and throttling of `cores` now; return a function that reads them again and returns the state."""
+    """Read clock and throttling of `cores` now. Return a function that reads them again, and returns both readings."""
     clock, throttles = machine.here.core_clock_ghz(cores), machine.here.throttles(cores)
 
     def state() -> ProcessorState:
@@ -124,10 +127,11 @@ def processor_of(cores: Sequence[int]) -> Callable[[], ProcessorState]:
 
 
 def busy_s(stat: str, cores: Sequence[int]) -> float:
-    """Return for how many seconds `cores` were not idle since the system's start, including steal time.
+    """Return the time in seconds in which `cores` were not idle since the system's start, summed over the cores.
+
+    Steal time counts as not idle. The guests' time is part of user and nice, so it is not added.
 
     `stat`: text of /proc/stat (proc_stat(5)): cpuN user nice system idle iowait irq softirq steal guest guest_nice.
-    User and nice contain the guests' time, so it is not added.
     """
     names = {f"cpu{core}" for core in cores}
     rows = [line.split() for line in stat.splitlines()]
@@ -142,7 +146,7 @@ SWITCH_S = 0.0002  # longest time in seconds for which another thread of this pr
 
 @contextlib.contextmanager
 def on_cores(cores: tuple[int, ...]) -> Iterator[None]:
-    """Run this process on `cores` inside the `with` block, away from the cores of other units."""
+    """Restrict this thread, and threads that it begins, to `cores` inside the `with` block."""
     before = machine.here.cores()
     os.sched_setaffinity(0, cores)
     try:
@@ -153,9 +157,9 @@ def on_cores(cores: tuple[int, ...]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def prompt_answers() -> Iterator[None]:
-    """Make the scheduler answer at once inside the `with` block.
+    """Make the scheduler, in this thread, answer at once inside the `with` block.
 
-    It waits neither for another unit's time slice on its core, nor for a thread that draws a progress bar. Garbage
+    It does not wait for the time slice of a unit on its core, or for a thread that draws a progress bar. Garbage
     collection is off, because a run makes no reference cycles.
     """
     switch_s, collects = sys.getswitchinterval(), gc.isenabled()
@@ -175,10 +179,10 @@ def prompt_answers() -> Iterator[None]:
 def unit_processes(
     pipeline: Pipeline, assets: Assets, starter: UnitStarter | None, kind: type[Processes]
 ) -> Iterator[Processes]:
-    """Yield `UnitProcesses` for the pipeline, with shared memory, but without a started process.
+    """Yield `UnitProcesses` for the pipeline, with shared memory, but without a started process. Close all at the end.
 
-    `starter`: fork server; None makes one.
-    `kind`: class of the result.
+    `starter`: fork server; None: one is made.
+    `kind`: class of the yielded object.
     """
     with contextlib.ExitStack() as stack:
         used = starter or stack.enter_context(UnitStarter(pipeline.preload))

@@ -1,11 +1,12 @@
 """Turns the journal of a run into frames, jobs, waits and idle time.
 
-Rule: no other module interprets a journal's events. The timeline uses parts of the scheduler: its source says which
-frames are released and wait (policy.py), and its state of a frame has the sampling time and the latency (state.py).
+Rule: no other module interprets a journal's events. The timeline uses two parts of the scheduler. The scheduler's
+source says which frames are released and wait (policy.py); its state of a frame has the sampling time and the latency
+(state.py).
 
 A frame waits before the first stage from its release on. It waits before another stage from the step in which the
-scheduler heard of its input; if branches meet, of the last input. The wait ends when the frame is handed to a unit,
-dropped or lost. A track knows before which stages the frames wait (tracks.py).
+scheduler heard of the frame's input there; where branches meet, of the last input. The wait ends when the frame is
+handed to a unit, dropped or lost. A track knows before which stages the frames wait (tracks.py).
 """
 
 from __future__ import annotations
@@ -40,12 +41,13 @@ from trilane.scheduler.state import FrameState, fates
 class Presented(NamedTuple):
     """A frame that was presented.
 
+    `frame`: its number.
     `release_ns`: time of its release.
     `end_ns`: end of its last job.
-    `interval_ns`: time since the end of the frame presented before it. None for the first frame, and if a viewer held
-    the run between the two, because that is no slow frame.
-    `latency_ns`: time from its sampling to the end of the stage that the pipeline names; None if that stage does not
-    take the frame.
+    `interval_ns`: time since the presentation of the frame before. None for the first frame, and if a viewer held the
+    run in this time, because the frame was not slow then.
+    `latency_ns`: time from its sampling to the end of the stage at which the latency ends; None if this stage did not
+    do the frame.
     `skips`: whether it took the bypass.
     `rung`: rung of its work.
     """
@@ -68,7 +70,8 @@ class Gone(NamedTuple):
     """A frame that was not presented.
 
     `frame`: its number; UNKNOWN if the journal does not show it.
-    `at_ns`: time at which the frame was counted as gone.
+    `release_ns`: time of its release.
+    `at_ns`: time at which the frame was counted as lost or dropped.
     `kind`: `lost` or `dropped`.
     `cause`: key of the cause in the report.
     """
@@ -81,7 +84,7 @@ class Gone(NamedTuple):
 
 
 class EndedJob(NamedTuple):
-    """A job that has ended, as far as the scheduler has heard. `event`: event with the job's times."""
+    """A job whose end the scheduler has heard of. `handed`: the job. `event`: event with the job's times."""
 
     handed: Handed
     event: JobDone
@@ -91,12 +94,12 @@ class ExplainedJob(NamedTuple):
     """A job in the journal with its times, and the causes of its wait.
 
     `figures`: metrics of its stage for this job, by name.
-    `waits_ns`: time of each cause of its wait, without zeros; the times add up to `job.begin_ns - job.ready_ns`.
-    `behind`: job that its unit did for the longest part of the wait; None without one.
+    `waits_ns`: time in ns of each cause of its wait, without zeros; the sum is `job.begin_ns - job.ready_ns`.
+    `behind`: job that its unit did for the longest part of the wait; None if the unit did no job in the wait.
     `after`: jobs whose end the scheduler heard of in the step that handed this job over.
-    `presented`: the presented frame, for the job that presents it.
+    `presented`: frame that this job presented; None if it presented none.
     `rung`: rung of the frame's work.
-    `skips`: whether the frame takes the bypass; set for the stage at which the bypass begins.
+    `skips`: whether the frame takes the bypass; only for a job of the stage at which the bypass begins, else False.
     `stopped_ns`: last time at which its unit was seen stopped by a signal; 0: never.
     """
 
@@ -116,7 +119,7 @@ class ExplainedJob(NamedTuple):
 
     @property
     def cause(self) -> str:
-        """The cause of the longest part of its wait; "" if it did not wait."""
+        """The cause of the longest part of the job's wait; "" if the job did not wait."""
         return max(self.waits_ns, key=self.waits_ns.__getitem__, default="")
 
 
@@ -135,7 +138,8 @@ class Down(NamedTuple):
     end_ns: int
 
 
-#: A fact that a record adds. An `EndedJob` comes from the step that heard of it, an `ExplainedJob` from its record.
+#: A fact that a record adds. An `EndedJob` comes from the step in which the scheduler heard of the job's end, an
+#: `ExplainedJob` from the job's own record.
 Fact = EndedJob | Presented | Gone | ExplainedJob | IdleSlice
 
 
@@ -145,12 +149,13 @@ class Timeline:
     `graph`, `settings`: graph and settings of the run.
     `waits`: whether to explain the waits of jobs; this takes longer than all other work.
     `idle`: whether to return idle time as slices, in the order of their ends.
-    `kept`: number of jobs and changes of each unit that are kept to explain a wait.
+    `kept`: number of last jobs, and of last changes, of each unit that are kept to explain waits.
 
-    `start_ns`: time at which the last unit became ready; None before.
+    `units`: recent past of each unit, by name.
+    `start_ns`: time at which the last unit became ready, so that the run started; None before.
     `is_over`: whether the run is over.
-    `span`: time from the step in which the last unit became ready to the step that finished the run; None until the
-    end, and for a run that never started.
+    `span`: time from the start of the run to the step that finished the run; None before this step, and for a run that
+    never started.
     `presented`: number of presented frames.
     `skipped`: number of presented frames that took the bypass.
     `downs`: latest times in which a unit was down after its start, in the order of their ends.
@@ -187,7 +192,7 @@ class Timeline:
         }
 
     def add(self, record: Record) -> list[Fact]:
-        """Return the facts that the next record, after the first, adds."""
+        """Take the next record of the run, and return the facts that it adds. Leave out the first record, `Begun`."""
         if isinstance(record, Stepped):
             return self._step(record)
         if isinstance(record, Counted):
@@ -205,7 +210,10 @@ class Timeline:
         return self._cutter.end() if self._cutter is not None else []
 
     def waiting(self, stage: str) -> list[int]:
-        """Return the frames that wait before `stage`, the oldest first; before the first stage, the released frames."""
+        """Return the numbers of the frames that wait before `stage`, the oldest first.
+
+        Before the first stage, they are the released frames.
+        """
         return self._track.waiting(stage)
 
     @property
@@ -215,7 +223,7 @@ class Timeline:
 
     @property
     def not_begun(self) -> int:
-        """The number of the run's frames that were never in flight and were not dropped before."""
+        """The number of the run's frames that were neither put in flight nor dropped before that."""
         return self._requested - self._track.left
 
     # records
@@ -270,7 +278,7 @@ class Timeline:
         return [ExplainedJob(job, worked.figures, waits_ns, behind, after, presented, rung, skips, unit.stopped_ns)]
 
     def _count(self, counted: Counted) -> Iterator[Gone]:
-        """Yield the frames that were lost or dropped since the last such record."""
+        """Yield the frames that were lost or dropped since the last record of this kind."""
         for kind, counts, gone in (
             ("lost", counted.lost, self._lost_for),
             ("dropped", counted.dropped, self._track.dropped_for),
@@ -281,7 +289,7 @@ class Timeline:
                 self._counts[kind, cause] = count
 
     def _lost_for(self, cause: str, now_ns: int) -> GoneFrame:
-        """Return the next frame that was lost."""
+        """Return the frame that was lost next. `cause`: key of the cause in the report."""
         if (gone := self._track.lost_for(cause, now_ns)) is not None:
             return gone
         return self._lost.popleft() if self._lost else GoneFrame(UNKNOWN, now_ns)
@@ -294,7 +302,10 @@ class Timeline:
         self.units[job.unit].held.append(Handed(job, self._now_ns, heard_ns, after))
 
     def _end(self, event: JobDone, after: list[Key]) -> Iterator[Fact]:
-        """Note the end of a job: its frame waits for the next stages, or is presented."""
+        """Note the end of a job, and yield the facts that follow. Its frame waits for the next stages or is presented.
+
+        `after`: list that gets the key of the job.
+        """
         handed = self.units[event.unit].take(event.job)
         if handed is None:
             return
@@ -337,7 +348,7 @@ class Timeline:
             self._track.start(self._now_ns)
 
     def _on_died(self, event: UnitDied) -> None:
-        """Note that the unit is down; its frames are lost or wait again (`fates`)."""
+        """Note that the unit's process is down; the unit's frames are lost, or wait again (`fates`)."""
         unit = self.units[event.unit]
         unit.fall(self._now_ns, is_gone=True)
         for job, is_lost in fates([handed.job for handed in unit.held], {self._first}):
@@ -350,7 +361,7 @@ class Timeline:
     def _finish(self, kind: OutcomeKind) -> None:
         """Note that the run is over. If it was aborted or a unit was given up, the frames in flight are lost.
 
-        Frames that are dropped in this step are counted after it.
+        Frames that this step has dropped are counted by a record after the step.
         """
         self.is_over = True
         if self.start_ns is not None:
@@ -362,6 +373,6 @@ class Timeline:
             unit.held.clear()
 
     def _lose(self, frame: int) -> None:
-        """Note that the frame is lost; the next `Counted` has the cause."""
+        """Note that the frame is lost; the next `Counted` record has the cause."""
         if (gone := self._track.lose(frame, self._now_ns)) is not None:
             self._lost.append(gone)

@@ -1,8 +1,8 @@
 """Follows the frames in flight of a run by its journal, along a chain or through a graph.
 
-For a graph, a second scheduler takes the run's events and decides about each frame. A chain's journal may come from an
-older scheduler, so only the jobs in it decide. Frames of a chain do not overtake each other: if several wait, the
-oldest are dropped.
+For a graph, a second scheduler takes the run's events and decides about each frame. For a chain, only the jobs in the
+journal decide, because the journal may come from an older scheduler. Frames of a chain do not overtake each other:
+among frames that wait for the same stage, a drop takes the oldest.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from trilane.scheduler.policy import Source
 from trilane.scheduler.state import FrameState
 
 SOURCE: Final = "source"
-UNKNOWN: Final = -1  # the number of a frame that is gone and cannot be told from others
+UNKNOWN: Final = -1  # number of a frame that is gone, if the journal does not show which frame it is
 
 
 class GoneFrame(NamedTuple):
@@ -53,43 +53,43 @@ class Track(Protocol):
         """Note a step of the scheduler; called before the methods for its events and actions."""
 
     def start(self, now_ns: int) -> None:
-        """Note that the last unit got ready."""
+        """Note that the last unit got ready, so that the run starts."""
 
     def advance(self, now_ns: int) -> None:
-        """Release the frames that are due; called after what follows from the events of a step, before its actions."""
+        """Release the frames that are due; called after the methods for a step's events, and before its actions."""
 
     def stop(self) -> None:
         """Note that no more frames are released, because a job failed."""
 
     @property
     def left(self) -> int:
-        """The number of frames that were in flight, or were dropped before."""
+        """The number of frames that were put in flight, or were dropped before that."""
 
     def begin(self, job: Job, now_ns: int) -> int:
-        """Note that a job is handed to its unit; return the time at which the scheduler heard of the job's input."""
+        """Note that a job is handed to its unit. Return when, in ns, the scheduler heard of the job's last input."""
 
     def end(self, job: Job, event: JobDone, now_ns: int) -> FrameState | None:
-        """Note that a job has ended; return its frame if the job presents it."""
+        """Note that a job has ended. Return the job's frame if the job presents it; else None."""
 
     def give_back(self, job: Job) -> None:
-        """Note that a job waits again because its unit died."""
+        """Note that the frame of a job waits again, because the job's unit died."""
 
     def lose(self, frame: int, now_ns: int) -> GoneFrame | None:
-        """Note that a frame is lost; return it unless `lost_for` will return it."""
+        """Note that a frame is lost, and return it. A track whose `lost_for` returns lost frames returns None here."""
 
     def lost_for(self, cause: str, now_ns: int) -> GoneFrame | None:
-        """Return the next frame that was lost for `cause`, a key of the report; None: `lose` returned it."""
+        """Return the next frame that was lost for `cause`, a key of the report; None if `lose` returns lost frames."""
 
     def dropped_for(self, cause: str, now_ns: int) -> GoneFrame:
         """Return the next frame that was dropped for `cause`, a key of the report."""
 
     def waiting(self, stage: str) -> list[int]:
-        """Return the frames that wait for a stage, the oldest first."""
+        """Return the numbers of the frames that wait for a stage, the oldest first."""
 
     def late(self, unit: str) -> list[str]:
-        """Return the stages for whose work the unit waits while it has some inputs of a frame, but not all.
+        """Return the names of the stages whose output the unit lacks for the oldest frame that has only some inputs.
 
-        They are the stages that have not done the oldest such frame. Without such a frame the list is empty.
+        If each frame before the unit has all inputs or none, the list is empty.
         """
 
 
@@ -112,7 +112,7 @@ class ChainTrack:
         return [frame for frame, _ in self._source.queue] if stage == self._first else [*self._waiting[stage]]
 
     def step(self, now_ns: int, events: tuple[Event, ...]) -> None:
-        """Tell the source what it hears; of the stages, the jobs alone count."""
+        """Pass requests, holds and stops to the source. Other events do not matter here."""
         for event in events:
             if type(event) is FrameRequest:
                 self._source.request(event.frames, now_ns)
@@ -187,13 +187,13 @@ class ChainTrack:
         self._turned_away[cause].append((frame, release_ns))
 
     def _frame(self, number: int, now_ns: int) -> FrameState:
-        """Return a frame in flight; if the journal lacks its begin, make it now."""
+        """Return the state of a frame in flight. If the journal lacks the frame's first job, make the state now."""
         if (frame := self.frames.get(number)) is None:
             frame = self.frames[number] = FrameState(now_ns, NEVER)
         return frame
 
     def _take(self, frame: int, now_ns: int) -> int:
-        """Take the frame out of the source, and return its release time."""
+        """Take the frame out of the source, and return its release time in ns."""
         for released in self._source.queue:
             if released[0] == frame:  # frames before it may still be here: drops of this step are counted after it
                 self._source.queue.remove(released)
@@ -201,7 +201,7 @@ class ChainTrack:
         return self._source.take(now_ns)[1]
 
     def _leave(self, number: int, now_ns: int) -> int:
-        """Remove the frame from all queues, and return its release time."""
+        """Remove the frame from all queues, and return its release time in ns; `now_ns` if it is not in flight."""
         for waiting in self._waiting.values():
             if number in waiting:
                 waiting.remove(number)
@@ -293,5 +293,5 @@ class GraphTrack:
 
 
 def track_of(graph: Graph, settings: Settings) -> Track:
-    """Return the track of a run."""
+    """Return a new track for a run with this graph and these settings."""
     return ChainTrack(graph, settings) if graph.is_chain else GraphTrack(graph, settings)

@@ -1,20 +1,21 @@
 """Explains the past of a unit: divides its idle time into slices with causes, and each wait of a job into causes.
 
 Rule: at any time a unit has a job, or is idle for one cause. The timeline (timeline.py) says whether the unit had a job
-and whether its process was up. The core's accounts say why the unit had no job.
+and whether its process was up. The accounts of the scheduler's ledger say why the unit had no job.
 
-Every nanosecond from a job's `ready_ns` to its `begin_ns` has one cause, the first of these that holds:
+Every nanosecond from a job's `ready_ns` to its `begin_ns` has one cause, the first of this list that holds:
 - busy: the unit did another job;
-- lost or down: the unit was at a job that was lost with its process, or its process was down;
+- lost: the unit did a job that was lost with the unit's process;
+- down: the unit's process was down;
 - overhead: the scheduler had not heard yet that the input was there;
-- throttled: the unit's cap held it;
-- blocked: no output slot was free, or enough frames were in flight;
+- throttled: the unit's duty did not let it work yet;
+- blocked: no output slot was free, or the limit of frames in flight was reached;
 - held: the policy or the order of frames held the job;
 - preempted: the job was handed over, but the unit had no core;
 - overhead: the job was handed over and on its way.
 
-The history is bounded: it keeps the last `kept` jobs and changes of each unit. The earlier part of a longer wait is
-`unknown`.
+The history is bounded: it keeps the last `kept` jobs and changes of each unit. If a wait began before these, the cause
+of its earlier part is `unknown`.
 """
 
 from __future__ import annotations
@@ -47,8 +48,8 @@ class Handed(NamedTuple):
     """A job that was handed to its unit and has not ended.
 
     `at_ns`: time of the hand-over.
-    `heard_ns`: time at which the scheduler heard of the job's input.
-    `after`: jobs whose end the scheduler heard of in the step that handed this job over.
+    `heard_ns`: time at which the scheduler heard of the job's last input.
+    `after`: keys of the jobs whose end the scheduler heard of in the step that handed this job over.
     """
 
     job: Job
@@ -60,8 +61,9 @@ class Handed(NamedTuple):
 class IdleSlice(NamedTuple):
     """A time in which no job ran on the unit, for one cause.
 
+    `cause`: one of IDLE_CAUSES, JOIN or UNEXPLAINED.
     `preempted_ns`: part of this time in which the unit had no core.
-    `late`: for JOIN, the stages whose work was missing when the slice began, joined by commas.
+    `late`: for JOIN, the stages whose output was missing when the slice began, joined by commas; else "".
     """
 
     unit: str
@@ -75,12 +77,12 @@ class IdleSlice(NamedTuple):
 class UnitHistory:
     """The recent past of one unit.
 
-    `kept`: number of last jobs and of last changes that are kept to explain waits.
-    `held`: jobs that the unit has, the running one first.
+    `kept`: number of last jobs, and of last changes of the cause of waits, that are kept to explain waits.
+    `held`: jobs that were handed to the unit, the running job first.
     `account`: account of the ledger that gets the unit's time without a job.
-    `late`: stages for whose work the unit waits, joined by commas, while `account` is JOIN.
+    `late`: stages for whose output the unit waits, joined by commas, while `account` is JOIN.
     `is_up`: whether the unit's process is up and ready, and no kill is under way.
-    `stopped_ns`: last time at which its process was seen stopped by a signal; 0: never.
+    `stopped_ns`: last time at which the unit's process was seen stopped by a signal; 0: never.
     """
 
     def __init__(self, name: str, kept: int = KEPT) -> None:
@@ -99,9 +101,9 @@ class UnitHistory:
     # its process
 
     def rise(self, now_ns: int) -> int | None:
-        """Note that the process is up; return the time since which it was down, or None if it was not up before.
+        """Note that the process is up. Return the time in ns since which it was down; None for its first start.
 
-        Nothing is noted while a kill of the process is under way.
+        While a kill of the process is under way, note nothing and return None.
         """
         if self._is_ending:
             return None
@@ -112,7 +114,7 @@ class UnitHistory:
     def fall(self, now_ns: int, *, is_gone: bool) -> None:
         """Note that the process is gone (`is_gone`), or that the scheduler kills it.
 
-        If the process was up and had a job, the time since the hand-over of that job counts as lost.
+        If the process was up and had a job, the time since the hand-over of this job counts as lost.
         """
         if self.is_up:
             if self.held:
@@ -122,7 +124,7 @@ class UnitHistory:
         self._change(now_ns)
 
     def take(self, job: int) -> Handed | None:
-        """Return the job that has ended; None for a job that was lost with its process."""
+        """Remove and return the job with the id `job`, which has ended; None if the job was lost with its process."""
         return self.held.popleft() if self.held and self.held[0].job.id == job else None
 
     # why its jobs waited
@@ -133,11 +135,12 @@ class UnitHistory:
         self._change(now_ns)
 
     def explain(self, job: JobRecord, heard_ns: int) -> tuple[dict[str, int], JobRecord | None]:
-        """Return (wait of the unit's next job in ns by cause, job that the unit did for the longest part of the wait).
+        """Return (ns of the job's wait by cause, job that the unit did for the longest part of the wait).
 
-        Causes with 0 ns are left out. The second value is None if the unit did no other job.
+        Causes with 0 ns are left out. The second value is None if the unit did no other job in the wait.
 
-        `heard_ns`: time at which the scheduler heard of the job's input.
+        `job`: next job of the unit that has ended.
+        `heard_ns`: time at which the scheduler heard of the job's last input.
         """
         others = list(self._during(job.ready_ns, job.begin_ns))
         waits_ns = self._waits(job, heard_ns, others)
@@ -162,7 +165,7 @@ class UnitHistory:
         return max(firsts, default=0)
 
     def _during(self, begin_ns: int, end_ns: int) -> Iterator[JobRecord]:
-        """Yield the unit's jobs that ran between two times, the latest first."""
+        """Yield the unit's jobs that ran at any time between two times, the latest first."""
         for job in reversed(self._jobs):
             if job.end_ns <= begin_ns:
                 return
@@ -190,7 +193,10 @@ class UnitHistory:
         return {cause: ns for cause, ns in found.items() if ns}
 
     def _add_not_handed(self, found: dict[str, int], begin_ns: int, end_ns: int, heard_ns: int) -> None:
-        """Add the causes of a time to `found`: the job was not handed over yet, and the unit did no other job."""
+        """Add to `found` the causes of a time in which the job was not handed over, and the unit did no other job.
+
+        `found`: time in ns by cause.
+        """
         if end_ns <= begin_ns:
             return
         explained_ns = 0
@@ -202,7 +208,10 @@ class UnitHistory:
         found[OVERHEAD] += end_ns - begin_ns - explained_ns
 
     def _causes(self, begin_ns: int, end_ns: int) -> Iterator[tuple[str, int, int]]:
-        """Yield (cause, begin in ns, end in ns), the latest first; time before the first change is left out."""
+        """Yield (cause, begin in ns, end in ns) for the time between two times, the latest first.
+
+        Time before the first kept change is left out.
+        """
         for since_ns, cause in reversed(self._changes):
             if since_ns < end_ns:
                 yield cause, max(since_ns, begin_ns), end_ns
@@ -214,16 +223,16 @@ class UnitHistory:
 
     @property
     def idle_cause(self) -> str:
-        """The cause of the unit's idle time now: overhead while it has a job or its process is not up."""
+        """The cause of the unit's idle time now: OVERHEAD while the unit has a job, or its process is not up."""
         return OVERHEAD if self.held or not self.is_up else NAMES.get(self.account, UNEXPLAINED)
 
     @property
     def cut_until_ns(self) -> int:
-        """The earliest possible end in ns of the next slice, while the unit has a job."""
+        """The time in ns up to which the unit's time is already divided; no slice can end earlier from now on."""
         return self._cut_ns
 
     def note_idle(self, now_ns: int, cause: str) -> Iterator[IdleSlice]:
-        """Set the cause of the idle time from `now_ns` on; if it changes, yield the rest of the slice before."""
+        """Set the cause of idle time from `now_ns` on. If the cause changes, yield the slice that ends now."""
         if cause != self._idle_cause:
             if self._idle_cause and now_ns > self._cut_ns:
                 yield IdleSlice(self.name, self._idle_cause, self._cut_ns, now_ns, late=self._idle_late)
@@ -231,9 +240,9 @@ class UnitHistory:
             self._idle_late = self.late if cause == JOIN else ""
 
     def cut(self, job: JobRecord) -> Iterator[IdleSlice]:
-        """Yield the idle slice between the unit's last job and this job.
+        """Yield the idle slice, if any, between the unit's last job and this job.
 
-        Only overhead has such slices: during any other cause the unit has no job.
+        Only the cause OVERHEAD has slices between jobs: during any other cause the unit has no job.
         """
         if self._idle_cause == OVERHEAD:
             if job.begin_ns > self._cut_ns:
@@ -245,9 +254,9 @@ class UnitHistory:
 class IdleCutter:
     """Divides the idle time of `units` into slices, in the order of their ends, during a run or after it.
 
-    For each step the caller calls `settle` and then `step`. After that it calls `account` for each account that follows
-    the step, and `job` for each job whose end the scheduler heard in the step. After the last step it calls `end`.
-    `settle` and `end` return the slices that are complete.
+    For each step the caller calls `settle` and then `step`. The next calls are `account` for each account that the step
+    changed, and `job` for each job whose end the scheduler heard of in the step. The last call is `end`. `settle` and
+    `end` return the slices that are complete.
     """
 
     def __init__(self, units: Iterable[UnitHistory]) -> None:
@@ -257,7 +266,7 @@ class IdleCutter:
         self._count = 0
 
     def settle(self) -> list[IdleSlice]:
-        """Note the state of each unit after the last step, and return the slices that end before all later slices."""
+        """Note the state of each unit after the last step, and return all slices that no later slice can precede."""
         if self._now_ns is None:
             return []
         until_ns = NEVER
@@ -271,19 +280,19 @@ class IdleCutter:
         self._now_ns = now_ns
 
     def account(self, since_ns: int, unit: UnitHistory, account: int) -> None:
-        """Note that the unit's time without a job goes to `account` from `since_ns` on.
+        """Note that the unit's time goes to `account` from `since_ns` on.
 
-        `since_ns`: time of the last step, or of an earlier release that this step handled late.
+        `since_ns`: time of the last step; or an earlier time, at which a frame was due that this step released late.
         """
         if account == ledger.ASSIGNED and self._now_ns is not None and since_ns < self._now_ns:
             self._hold(unit.note_idle(since_ns, OVERHEAD))
 
     def job(self, unit: UnitHistory, job: JobRecord) -> None:
-        """Note a job whose end the last step heard; a unit's jobs come in the order of their ends."""
+        """Note a job of which the scheduler heard in the last step; a unit's jobs come in the order of their ends."""
         self._hold(unit.cut(job))
 
     def end(self) -> list[IdleSlice]:
-        """Return the remaining slices up to the last step; nothing may be noted after it."""
+        """Return all slices up to the last step that were not returned yet; this is the last call."""
         if self._now_ns is not None:
             for unit in self._units:
                 self._hold(unit.note_idle(self._now_ns, ""))

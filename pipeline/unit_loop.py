@@ -1,7 +1,7 @@
 """A unit's process: its `UnitSpec`, its stages with their slots, and the loop that answers messages.
 
-Rule: each message has one answer, and an error is an answer too. Slots are bound once, before the first job. The loop
-copies the headers from input to output; the stages need not.
+Rule: each message has one answer, and an error is an answer too. Slots are bound once, before the first job. The loop,
+not the stage, copies a packet's header from the input slot to the output slot.
 
 A process gets its `UnitSpec` as one JSON document of plain data and numbers of descriptors.
 """
@@ -51,19 +51,19 @@ from trilane.units import NS_PER_S
 
 
 class UnitSpec(Model):
-    """One unit of a run.
+    """The description of one unit of a run for the unit's process.
 
     `unit`: name of the unit.
-    `endpoint`: address of the heartbeat socket.
+    `endpoint`: ZeroMQ address of the heartbeat socket.
     `job_pipe`, `assets_fd`: descriptors of the job pipe and the assets.
     `settings`: settings of the unit.
     `scheduler_cores`: cores of the scheduler.
     `run_cores`: cores of all units.
     `stages`: stages of this unit; messages name a stage by its index in this list.
     `module_folders`: folders that come first in the module search path.
-    `edges`: regions with their descriptors, by the edge's name.
-    `inputs`: names of the input edges of each stage that has inputs.
-    `outputs`: name of the output edge of each stage that has one.
+    `edges`: shared memory of each edge of the unit's stages, by the edge's name.
+    `inputs`: names of the input edges of each stage that has inputs, by the stage's name.
+    `outputs`: name of the output edge of each stage that has an output, by the stage's name.
     `may_skip`: name of the stage at which the pipeline's bypass begins, or "".
     """
 
@@ -83,11 +83,11 @@ class UnitSpec(Model):
 
     @property
     def fds(self) -> list[int]:
-        """The numbers, in this process, of the descriptors that the unit's process needs."""
+        """The descriptors that the unit's process needs."""
         return [*self.job_pipe, self.assets_fd, *(edge.fd for edge in self.edges.values())]
 
     def renumbered(self, number_of: Mapping[int, int]) -> UnitSpec:
-        """Return the same spec, with descriptor n replaced by `number_of[n]`."""
+        """Return this spec with every descriptor n replaced by `number_of[n]`."""
         edges = {name: edge.model_copy(update={"fd": number_of[edge.fd]}) for name, edge in self.edges.items()}
         return self.model_copy(
             update={
@@ -98,7 +98,7 @@ class UnitSpec(Model):
         )
 
 
-WAKE_UP_NS = 150_000  # about how much too late a sleep ends
+WAKE_UP_NS = 150_000  # time by which a sleep usually ends too late
 
 
 class BoundStage:
@@ -117,10 +117,11 @@ class BoundStage:
     ) -> None:
         """Bind `stage` to its slots.
 
-        `pace_ns`: least time of a job; a shorter job waits until its end.
+        `inputs`, `outputs`: slots of the input edges and of the output edge; empty if there is no such edge.
+        `pace_ns`: least time of a job in ns; a shorter job is made longer by a wait at its end. 0: none.
         `unit`: context of the unit that runs the stage.
         `may_skip`: whether a bypass begins at the stage.
-        `join`: inputs of a `JoiningStage`; `inputs` is then empty.
+        `join`: inputs of a `JoiningStage`, for which `inputs` is empty; None for any other stage.
         """
         self.name, self._pace_ns, self._may_skip = name, pace_ns, may_skip
         self._stage, self._outputs, self._unit, self._join = cast(Stage, stage), outputs, unit, join
@@ -135,12 +136,13 @@ class BoundStage:
     def run(
         self, frame: int, slot_in: int, slot_out: int, epoch: int, fresh: bool = False, rung: int = 0
     ) -> Mapping[str, float]:
-        """Do the job, wait until its pace has passed, and return the stage's metrics; a `Skip` if the frame skips.
+        """Do a job, wait until its pace has passed, and return the stage's metrics; a `Skip` if the frame skips.
 
-        `slot_in`, `slot_out`: slots of the job; -1 if the stage has no input or no output.
+        `frame`: number of the frame.
+        `slot_in`, `slot_out`: slots of the job, as in `Job`; -1 if the stage has no input or no output.
         `epoch`: epoch of the output edge, for the packet's header.
         `fresh`: whether the stage must not rely on what earlier frames brought to the end of the bypass.
-        `rung`: rung of the frame's work; the first stage gets it.
+        `rung`: rung of the frame's work, which is passed to the first stage.
 
         Raises TrilaneError for a `Skip` of a stage that may not skip.
         """
@@ -171,16 +173,16 @@ class BoundStage:
 
     @property
     def works_asleep(self) -> bool:
-        """Whether a job counts as busy while its threads sleep.
+        """Whether time in which the threads of a job sleep counts as busy.
 
-        It does if a device works for the job, or if the stage has a pace, which models the time of a chip.
+        This is so if a device works for the job, or if the stage has a pace, which models the time of a chip.
         """
         return self._pace_ns > 0 or self._unit.has_device
 
     def sampled_ns(self, slot_in: int, slot_out: int) -> int:
-        """Return the time in ns at which the stage sampled the frame of its last job.
+        """Return the time in ns at which the stage sampled the frame of its last job; 0 if another stage sampled it.
 
-        It is 0 for a stage that takes frames from another stage by number.
+        `slot_in`, `slot_out`: slots of the last job.
         """
         if not self._is_first or (slot_in >= 0 and self._join is None):
             return 0
@@ -197,7 +199,7 @@ class Join:
     """
 
     def __init__(self, inputs: Sequence[list[Packet]], latest: Sequence[bool]) -> None:
-        """Take the slots. `latest`: whether each input takes the newest frame."""
+        """Keep the slots. `latest`: for each input, whether it takes the newest frame."""
         self.inputs = list(inputs)
         self._by_frame = [place for place, is_latest in enumerate(latest) if not is_latest]
 
@@ -207,11 +209,15 @@ class Join:
         return not self._by_frame
 
     def slots(self, packed: int) -> tuple[int | None, ...]:
-        """Return the slot of each input from `packed`, a `Job.slot_in`; None for an input without a frame."""
+        """Return the slot of each input of a job; None for an input without a frame. `packed`: `Job.slot_in`."""
         return tuple(slot if slot >= 0 else None for slot in unpacked(packed, len(self.inputs)))
 
     def sampled_ns(self, slots: Sequence[int | None], now_ns: int) -> int:
-        """Return the sampling time in ns of the oldest input by frame; `now_ns` if all inputs take the newest frame."""
+        """Return the earliest sampling time, in ns, of the inputs that do not take the newest frame.
+
+        `slots`: slot of each input.
+        `now_ns`: result if all inputs take the newest frame.
+        """
         found = [int(self.inputs[place][slots[place] or 0].header["t_sampled_ns"]) for place in self._by_frame]
         return min(found, default=now_ns)
 
@@ -224,9 +230,9 @@ def hold_until(end_ns: int) -> None:
 
 
 def _header_copier(inputs: list[Packet], outputs: list[Packet]) -> Callable[[int, int], None]:
-    """Return a function of (input slot, output slot) that copies the header from one to the other.
+    """Return a function of (input slot, output slot) that copies the header from the first to the second.
 
-    If the edges have different headers, it copies only FRAME_FIELDS.
+    If the edges have different kinds of headers, the function copies only FRAME_FIELDS.
     """
     if inputs and outputs and inputs[0].header.dtype != outputs[0].header.dtype:
         return lambda slot_in, slot_out: _copy_fields(inputs[slot_in].header, outputs[slot_out].header)
@@ -251,7 +257,7 @@ def serve(raw_spec: dict[str, Any], number_of: Mapping[int, int]) -> int:
     """Build the unit's stages, answer messages until Close, and return the process's exit code.
 
     `raw_spec`: a `UnitSpec` as JSON values.
-    `number_of`: number in this process of each descriptor that the spec names.
+    `number_of`: number in this process of each descriptor, by the number that the spec states.
     """
     spec = UnitSpec.model_validate(raw_spec).renumbered(number_of)
     context = context_on_cores(spec.scheduler_cores)
@@ -319,7 +325,7 @@ def _threads() -> set[int]:
 
 
 def build_stages(spec: UnitSpec) -> list[BoundStage]:
-    """Return the unit's stages, bound to their slots, in the order of `spec.stages`. Raises what a factory raises."""
+    """Return the unit's stages, bound to their slots, in the order of `spec.stages`. Raises any error of a factory."""
     sys.path[:0] = map(str, spec.module_folders)
     unit = UnitContext(spec.unit, spec.settings, map_assets(spec.assets_fd))
     stages = [factory_named(stage.factory)(stage.settings, unit) for stage in spec.stages]
@@ -373,7 +379,7 @@ def _close(unit: str, link: Link, stages: Iterable[BoundStage]) -> int:
 
 
 def _fail(link: Link, job_id: int, where: str, error: Exception) -> int:
-    """Send the error as one sentence, and return its exit code. The traceback goes to stderr.
+    """Send the error to the scheduler as one sentence, and return its exit code. The traceback goes to stderr.
 
     `job_id`: id of the failed job; BUILDING or CLOSING outside a job.
     `where`: place of the error, for the sentence.

@@ -3,7 +3,8 @@
 Rule: every process that is started here is ended here, and its end is always noticed. This file has the time limits for
 starts and ends.
 
-A unit's messages come over its link, its stderr over a pipe, and its end over a pidfd; one poller waits for all three.
+A unit's messages come over its link (job pipe and heartbeat socket), its stderr over a pipe, and the end of its process
+over a pidfd. One poller waits for all of these.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ from trilane.transport.messages import (
 
 TAIL_BYTES = 8192
 END_S = 2.0
-#: Longest wait for a unit's exit code from the fork server, which sends it at once.
+#: Longest wait in ms for a unit's exit code from the fork server, which sends the code at once.
 CODE_MS = 200
 
 
@@ -66,7 +67,7 @@ class _Process:
         os.set_blocking(stderr_fd, False)
 
     def read_stderr(self) -> bool:
-        """Read all available bytes and keep the last TAIL_BYTES; return False if the pipe is closed."""
+        """Read all available bytes of stderr, and keep the last TAIL_BYTES. Return False if the pipe is closed."""
         with contextlib.suppress(BlockingIOError):
             while chunk := os.read(self.stderr_fd, TAIL_BYTES):
                 self.tail = (self.tail + chunk)[-TAIL_BYTES:]
@@ -88,9 +89,9 @@ class _Process:
             os.killpg(self.pid, signal.SIGKILL)
 
     def killed_by(self) -> int:
-        """Return the number of the signal that ended the process, but 0 for a signal of this class.
+        """Return the number of the signal from elsewhere that ended the process; 0 if this is not known.
 
-        It is 0 too if no signal ended the process, or if the fork server is gone.
+        It is 0 if `kill` or no signal ended the process, or if the fork server is gone.
         """
         poller = select.poll()
         poller.register(self.code_fd, select.POLLIN)
@@ -107,12 +108,12 @@ class _Process:
 class UnitProcesses:
     """The processes of the units of `pipeline`.
 
-    `regions`: memory of each edge, by the edge's name.
+    `regions`: shared memory of each edge, by the edge's name.
     `assets_fd`: descriptor of the assets.
     `starter`: fork server.
-    `stderr_tails`: end of the stderr of each ended process, by unit.
-    `signals`: number of the signal from elsewhere that ended a process, by unit; 0 for none.
-    `places`: index of each stage among the stages of its unit, as in messages.
+    `stderr_tails`: stderr tail of each unit's last process that has ended.
+    `signals`: number of the signal from elsewhere that ended this process, by unit; 0: none.
+    `places`: index of each stage among the stages of its unit, by the stage's name; messages use this index.
     """
 
     def __init__(
@@ -140,14 +141,14 @@ class UnitProcesses:
         return {unit: process.pid for unit, process in self._live.items()}
 
     def watch(self, fd: int) -> None:
-        """Let `listen` return early when `fd` becomes readable; further calls for `fd` do nothing."""
+        """Let `listen` return early when `fd` becomes readable. Further calls for the same `fd` do nothing."""
         if fd not in self._reactions:
             self._register(fd, partial(_swallow, fd))
 
     def start(self, unit: str) -> None:
         """Start a new process for the unit. Raises TrilaneError or OSError.
 
-        The next message of the unit is `Ready`, `Failed` or the end of the process.
+        The unit's next message is `Ready` or `Failed`, or None for the end of the process.
         """
         with contextlib.ExitStack() as undo:
             folder = SocketFolder()
@@ -177,9 +178,9 @@ class UnitProcesses:
             self._live[unit].release_folder()
 
     def send(self, unit: str, message: Message) -> None:
-        """Send `message` to the unit; nothing is sent to a unit that is gone or does not read.
+        """Send `message` to the unit. If the unit is gone or does not read, do nothing.
 
-        The scheduler notices such a unit by the end of its process, or by its deadline.
+        The scheduler notices this by the end of the unit's process, or by the unit's deadline.
         """
         process = self._live.get(unit)
         if process is not None:
@@ -197,7 +198,7 @@ class UnitProcesses:
                     os.sched_setaffinity(int(thread.name), cores)
 
     def listen(self, timeout_ms: int) -> list[UnitMessage]:
-        """Return the next messages, after at most `timeout_ms`; a unit's last messages come before its end."""
+        """Wait for messages for at most `timeout_ms`, and return them. A unit's last messages come before its end."""
         messages: list[UnitMessage] = []
         for fd, _ in self._poller.poll(timeout_ms / 1000):
             messages += self._reactions[fd]()
@@ -211,7 +212,10 @@ class UnitProcesses:
         return messages
 
     def why_ended(self, unit: str) -> str:
-        """Return the end of a sentence about a unit's death: its signal, its last line of stderr, a lack of memory."""
+        """Return the end of a sentence about a unit's death, with all that is known about the cause.
+
+        It names the signal, the last line of stderr, and a lack of memory.
+        """
         number = self.signals.get(unit, 0)
         killed = f"it was killed by signal {number}" if number else ""
         ends = (killed, after_stderr(self.stderr_tails.get(unit, "")), ended_by_system())
@@ -227,7 +231,7 @@ class UnitProcesses:
         return self._starter.renew()
 
     def close(self) -> None:
-        """End every process, whatever its state."""
+        """Kill every process that still lives, and free all resources."""
         for process in list(self._live.values()):
             process.kill()
         for process in list(self._live.values()):
@@ -236,13 +240,16 @@ class UnitProcesses:
         self._poller.close()
 
     def wait_for_end(self, units: list[str], timeout_s: float = END_S) -> None:
-        """Give units that were told to close up to `timeout_s` seconds to end by themselves."""
+        """Wait at most `timeout_s` seconds for the ends of the processes of `units`, which were told to close."""
         end = time.monotonic() + timeout_s
         while any(unit in self._live for unit in units) and time.monotonic() < end:
             self.listen(50)
 
     def _job_messages(self, process: _Process) -> list[UnitMessage]:
-        """Return the next message of the job pipe, if any; the pipe stays readable while more messages wait."""
+        """Return the next message of the job pipe as a list; empty if there is none.
+
+        As long as more messages wait, the pipe stays readable.
+        """
         try:
             message = process.link.job_pipe.receive()
         except MessageError as error:
@@ -328,7 +335,7 @@ POLL_MS = 200
 
 
 def start_units(processes: UnitProcesses, units: Iterable[str], interrupts: Interrupts) -> dict[str, float]:
-    """Start every unit, wait until all are ready, and return the start-up time of each unit in ms.
+    """Start `units`, wait until all are ready, and return the start-up time of each unit in ms.
 
     Raises UnitError if a unit cannot start, and KeyboardInterrupt if interrupted.
     """
@@ -351,7 +358,10 @@ def start_units(processes: UnitProcesses, units: Iterable[str], interrupts: Inte
 
 
 def listen_before_run(processes: UnitProcesses, interrupts: Interrupts) -> list[UnitMessage]:
-    """Return the next messages. Raises UnitError if a unit failed or ended, KeyboardInterrupt when interrupted."""
+    """Return the next messages, after at most POLL_MS.
+
+    Raises UnitError if a unit failed or ended, and KeyboardInterrupt when interrupted.
+    """
     messages = processes.listen(POLL_MS)
     if interrupts.count:
         raise KeyboardInterrupt
@@ -365,9 +375,10 @@ def listen_before_run(processes: UnitProcesses, interrupts: Interrupts) -> list[
 
 
 def close_units(processes: UnitProcesses, log: RunLog, interrupts: Interrupts) -> None:
-    """Tell the units to close, and wait until their stages have completed their files and their processes have ended.
+    """Tell all units to close, and wait for the ends of their processes. Their stages complete their files before.
 
-    `UnitProcesses.close` kills a process that does not end.
+    A unit that fails, dies or takes too long is noted in `log` as a failure of the run. A process that does not end is
+    left to `UnitProcesses.close`, which kills it.
     """
     waiting = set(processes.pids)
     for unit in waiting:

@@ -1,7 +1,7 @@
-"""The parent's end of the fork server. Rule: it starts units, and leaves no process behind when it is closed.
+"""The unit starter, the parent process's end of the fork server. Rule: after its end, no process is left behind.
 
-Units outlive the server. A server that has ended or was stopped is replaced. The caller calls `renew` from time to
-time, so that a new server has imported its modules before the next unit must start.
+Units outlive the fork server. A server that has ended, or that a signal has stopped, is replaced. The caller calls
+`renew` from time to time, so that a new server has imported its modules before the next unit must start.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from trilane.pipeline.unit_loop import UnitSpec
 
 ANSWER_S = 60.0  # longest wait for an answer; the modules to preload may come from a slow disk
-LOOK_S = 0.1  # between two looks at a fork server that has not answered
+LOOK_S = 0.1  # time between two checks of a fork server that has not answered
 CLOSE_S = 5.0
 NOTICE_S = 0.2  # longest time from a failed call or a closed socket to the end of the fork server
 TAIL_BYTES = 8192
@@ -35,13 +35,13 @@ SERVERS = 3  # number of servers that are tried for one unit
 
 
 class StartedUnit(NamedTuple):
-    """A unit's process. The caller closes the descriptors.
+    """A unit's process. The caller must close the descriptors.
 
     `pid`: process id.
-    `pidfd`: descriptor that is readable when the process has ended.
-    `lifeline`: descriptor whose closing kills the process; the end of this process closes it too.
-    `code_fd`: pipe from which the exit code can be read as text soon after the process's end. The code is negative for
-    a signal, and empty if the fork server has ended.
+    `pidfd`: descriptor that is readable when the unit's process has ended.
+    `lifeline`: descriptor whose closing kills the unit's process. It also closes when the calling process ends.
+    `code_fd`: pipe from which the exit code can be read as text soon after the end of the unit's process. The code is
+    negative for a signal, and empty if the fork server has ended.
     """
 
     pid: int
@@ -55,10 +55,10 @@ class _ServerError(Exception):
 
 
 class ForkedCall:
-    """A call of a function in a process forked by the server of `starter`.
+    """A call of a function in a process that the fork server of `starter` forks.
 
     `function`: function as `module:name`.
-    `reads`: end of the pipe from which its result is read.
+    `reads`: descriptor from which the function's result is read.
     """
 
     def __init__(self, starter: UnitStarter, function: str, reads: int) -> None:
@@ -66,9 +66,9 @@ class ForkedCall:
         self._is_open = True
 
     def result(self) -> Any | None:
-        """Return the function's result; None if it failed, its process died, or no answer came in time. Call it once.
+        """Return the function's result; None if the function failed or gave no result in ANSWER_S. Call this once.
 
-        If the call's fork server had to be replaced, the call is made once more.
+        If the fork server ended or was stopped meanwhile, the function is called once more by a new server.
         """
         answer = self._answer()
         self.close()
@@ -103,7 +103,7 @@ class ForkedCall:
 class UnitStarter:
     """A fork server that imports the modules `preload` in the background.
 
-    Close it when its units have ended. Raises OSError if no process can be made.
+    Close the starter when its units have ended. Raises OSError if no process can be made.
     """
 
     def __init__(self, preload: Sequence[str] = ()) -> None:
@@ -141,9 +141,9 @@ class UnitStarter:
         )
 
     def renew(self, wait_s: float = 0.0) -> str:
-        """Replace a fork server that has ended or was stopped, and return the reason; "" if it runs.
+        """If the fork server has ended or was stopped, replace it and return the reason; else return "".
 
-        `wait_s`: longest time to wait for its end, in seconds.
+        `wait_s`: longest time in seconds to wait for its end.
 
         Raises OSError if no process can be made.
         """
@@ -153,7 +153,10 @@ class UnitStarter:
         return why
 
     def trouble(self, wait_s: float = 0.0) -> str:
-        """Return why the fork server no longer answers, after at most `wait_s` seconds; "" if it may still answer."""
+        """Return the reason why the fork server no longer answers; "" if it may still answer.
+
+        `wait_s`: longest time in seconds to wait for its end.
+        """
         try:
             code = self._server.wait(wait_s)
         except subprocess.TimeoutExpired:
@@ -165,7 +168,7 @@ class UnitStarter:
         self._launch()
 
     def start(self, spec: UnitSpec, stderr_fd: int) -> StartedUnit:
-        """Return a new process for the unit. `stderr_fd`: descriptor that becomes its stderr.
+        """Start a process for the unit, and return it. `stderr_fd`: descriptor that becomes the process's stderr.
 
         Raises TrilaneError if the unit cannot be started.
         """
@@ -187,7 +190,10 @@ class UnitStarter:
         raise TrilaneError(f"unit {spec.unit} could not be started: {why}")
 
     def _ask(self, spec: UnitSpec, fds: Sequence[int]) -> StartedUnit:
-        """Return the unit's process; after an error none is left. `fds`: descriptors of its spec and its stderr."""
+        """Request the unit's process from the fork server, and return it. After an error no process is left.
+
+        `fds`: descriptors of the unit's spec and its stderr.
+        """
         self._has_units = True
         settings = spec.settings
         request = {"unit": spec.unit, "cores": settings.cores, "threads": settings.threads, "fds": spec.fds}
@@ -211,9 +217,9 @@ class UnitStarter:
         return StartedUnit(int(answer), received[0], lifeline, received[1])
 
     def _received(self) -> tuple[bytes, list[int]]:
-        """Return the answer and its descriptors.
+        """Return (answer, descriptors that came with the answer).
 
-        Both are empty if the server has ended, was stopped, or takes too long.
+        Both are empty if the server has ended, was stopped, or takes longer than ANSWER_S.
         """
         end = time.monotonic() + ANSWER_S
         while time.monotonic() < end:
@@ -225,13 +231,16 @@ class UnitStarter:
         return b"", []
 
     def call(self, function: str) -> ForkedCall:
-        """Call the function `module:name` in a process of its own; it takes no argument and returns JSON values."""
+        """Call a function in a process of its own.
+
+        `function`: function as `module:name`; it must take no argument and return JSON values.
+        """
         return ForkedCall(self, function, self.send_call(function))
 
     def send_call(self, function: str) -> int:
-        """Request the call, and return the end of the pipe from which its result is read.
+        """Request a call of `function`, and return the descriptor from which its result is read.
 
-        Without a fork server the pipe is closed without a result.
+        If the fork server is gone, the descriptor gives no bytes.
         """
         reads, writes = os.pipe2(os.O_CLOEXEC)
         try:
@@ -242,7 +251,7 @@ class UnitStarter:
         return reads
 
     def close(self) -> None:
-        """End the fork server, which waits for units that still live."""
+        """End the fork server; if it has started units, it first waits for those that still live."""
         self._end()
         os.close(self._stderr)
 
@@ -257,7 +266,7 @@ class UnitStarter:
             self._server.wait()
 
     def _why(self) -> str:
-        """Return why the server does not answer: the signal that killed or stopped it, or its last line of stderr."""
+        """Return the reason why the server does not answer: a signal, or the last line of its stderr."""
         trouble = self.trouble(NOTICE_S)
         if trouble and self._server.returncode not in range(1, 256):
             return trouble
@@ -275,7 +284,7 @@ class UnitStarter:
 
 
 def is_stopped(pid: int) -> bool:
-    """Return whether the process is stopped by a signal; False for a process that is gone."""
+    """Return whether a signal has stopped the process, as SIGSTOP does; False for a process that is gone."""
     try:
         stat = (machine.here.proc / f"{pid}/stat").read_text(encoding="ascii", errors="replace")
     except OSError:

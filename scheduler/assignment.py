@@ -1,18 +1,18 @@
 """Chooses which job runs next, drops frames that wait in vain, and hands jobs to units.
 
-Rule: only dirty units are looked at, in the order in which they were marked. `Choice` asks about the present state and
-changes nothing.
+Rule: only dirty units are looked at, in the order in which they were marked. `Choice` changes nothing: it only answers
+questions about the present state.
 
 A frame is dropped only when a step looks at the stage that the frame waits for. The policy says which frames are
 dropped: frames that must be late, or frames that a newer frame has made stale.
 
 A frame must be late if even the earliest end of its last stage is past its deadline. While service times stay as they
-were lately, this bound is never later than the real end. Therefore no frame is given up that could be in time. At every
-stage older frames go first. A frame begins at a stage after the older frames' work there, or after its own work at the
-stages before, whichever ends later. A frame that has not reached the beginning of a bypass is assumed to take it if the
-last frame there took it.
+were lately, this earliest end is never later than the real end. Therefore no frame is given up that could be in time.
+At every stage older frames go first. A frame begins at a stage when two things have ended: the older frames' work at
+this stage, and the frame's own work at the stages before. If the last frame at the beginning of a bypass took the
+bypass, the frames that have yet to come there are assumed to take it.
 
-In a graph whose branches meet, a frame can become stale only until one of its branches has begun it (flow.py).
+In a graph whose branches meet, a frame that one branch has begun can no longer become stale (flow.py).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def earliest_completion_ns(
     `stages`: all stages, with the estimates of service times.
     `frames`: frames in flight, by number.
     `todo`: bits of the stages that the frame has yet to do.
-    `bypass`: bypass that each frame before its beginning is assumed to take; None: no such frame takes a bypass.
+    `bypass`: bypass that is assumed for all frames that have not reached its beginning; None: they take no bypass.
     """
     older = [state.todo for number, state in frames.items() if number < frame]
     skipped, skips = 0, 0
@@ -66,7 +66,7 @@ def earliest_completion_ns(
 
 
 def _done_of_running(now_ns: int, stage: StageState) -> int:
-    """Return how long the stage's running job has run in ns, at most the estimate of its length; 0 if none runs."""
+    """Return how long the stage's job has run in ns, at most the estimated service time; 0 if no job of it runs."""
     queue = stage.unit.queue
     if not queue or queue[0].stage != stage.name:
         return 0
@@ -104,13 +104,13 @@ class Choice:
         return sink.can_claim(lambda frame: self._flow.must_stay(stage, frame))
 
     def slot_to_take(self, stage: StageState) -> int:
-        """Return the slot of the stage's next frame, as `Job.slot_in` counts; -1: the stage has no frame to do."""
+        """Return the slot of the stage's next waiting frame, numbered as in `Job.slot_in`; -1: no frame waits."""
         if stage.bypassed is not None:
             return next_slot(stage, self._frames)
         return stage.waiting[0] if stage.waiting and all(stage.others) else -1
 
     def preferred(self, runnable: Sequence[StageState], now_ns: int) -> StageState:
-        """Return the stage of `runnable` whose job the policy chooses for the unit."""
+        """Return the stage of `runnable` (stages of one unit) whose job the policy chooses."""
         return self._stages[self._policy.choose([self._candidate(stage, now_ns) for stage in runnable]).position]
 
     def is_full(self) -> bool:
@@ -118,10 +118,10 @@ class Choice:
         return 0 < self._in_flight <= len(self._frames) - self._flow.aside
 
     def latch_from_ns(self, now_ns: int) -> int:
-        """Return when the first stage may begin its next frame; only for a run that latches.
+        """Return the time in ns from which the first stage may begin its next frame; only for a run that latches.
 
-        The time is NEVER while the first stage works, or a frame waits for the second stage. Otherwise the first stage
-        is expected to end `latch_ns` before the second stage's unit is free.
+        The time is NEVER while the first stage works, or a frame waits for the second stage. Otherwise it is chosen so
+        that the first stage should end `latch_ns` before the second stage's unit is free.
         """
         first, second = self._stages[0], self._stages[1]
         edge = first.output
@@ -146,7 +146,7 @@ class Choice:
         return end_ns > waiting.deadline_ns
 
     def account_without_job(self, unit: UnitState, now_ns: int) -> int:
-        """Return the account that gets the time of a unit with an empty queue; it says why the unit has no job."""
+        """Return the ledger's account (STARVED, BLOCKED, ...) that says why a unit with an empty queue has no job."""
         if unit.life != READY:
             return ASSIGNED
         account = STARVED
@@ -170,7 +170,7 @@ class Choice:
         return account
 
     def _candidate(self, stage: StageState, now_ns: int) -> Candidate:
-        """Return the frame that the stage would do next."""
+        """Return the stage's next job as a candidate; a frame must be there to take."""
         edge = stage.input
         if edge is None:
             frame, release_ns = self._source.head(now_ns)
@@ -212,7 +212,7 @@ class _LateFrames:
                 self._flow.drop_waiting(stage, slot, DropCause.LATE)
 
     def _drop_stale(self, stage: StageState) -> None:
-        """Drop the frames that the stage could take, except the newest and frames that another branch has begun."""
+        """Drop the frames that the stage could take, but keep the newest, and frames that another branch has begun."""
         line, edge, flow = stage.waiting, stage.input, self._flow
         if flow.is_chain or edge is None:
             while len(line) > 1:
@@ -238,7 +238,10 @@ class _LateFrames:
                 self._source.drop_late_head()
 
     def _expect_less(self) -> None:
-        """Lower all estimates: no other frame is in the way, so only estimates that are too high make a frame late."""
+        """Lower the estimates of all stages, because a frame seems late although no other frame is in flight.
+
+        In this case the estimates must be too high.
+        """
         for stage in self._flow.stages:
             stage.lower_estimate()
 
@@ -253,7 +256,7 @@ class Assignment:
 
         `policy`: policy that says which frames are given up, and how far ahead jobs are handed out.
         `hang_ns`: longest time of a job in ns.
-        `flow`, `source`: frames in flight and frames to come, which this class moves.
+        `flow`, `source`: frames in flight, and frames that have yet to be put in flight; this class changes both.
         `choice`: object that says what could run next.
         `ledger`: ledger that gets the reasons why units have no job.
         """
@@ -269,10 +272,11 @@ class Assignment:
         self._prepares = self._is_fed or self._drops_first
 
     def assign(self, now_ns: int, released_ns: int, actions: list[Action]) -> None:
-        """Hand jobs to the dirty units, as `Dispatch` in `actions`, until each is full or has nothing to run.
+        """Hand jobs to each dirty unit until its queue is full or it has nothing to run.
 
         `released_ns`: time at which the first frame that this step released was due; `now_ns` if it released none. If
         the first stage's unit was starved, the ledger counts its new job as assigned from this time on.
+        `actions`: list that gets a `Dispatch` for each job.
         """
         dirty, is_fed = self._flow.dirty, self._is_fed
         for unit in dirty:  # a dispatch may append to it, even a unit looked at before
@@ -292,14 +296,14 @@ class Assignment:
         dirty.clear()
 
     def _feed(self, now_ns: int) -> None:
-        """Put the released frames in flight, so that they wait in the lines of the stages without inputs."""
+        """Put released frames in flight, up to the limit; they wait in the lines of the stages without inputs."""
         while self._source.queue and not self._choice.is_full():
             if self._newest:
                 self._source.keep_newest()
             self._admit(now_ns)
 
     def _feed_stage(self, stage: StageState, now_ns: int) -> None:
-        """Put frames in flight until one waits for the stage, if the stage has no inputs and could begin a frame."""
+        """If the stage has no inputs and could begin a frame, put frames in flight until one waits for it."""
         if stage.before or not (stage.output is None or self._choice.can_claim(stage, stage.output)):
             return
         while not stage.waiting and not self._source.is_empty and not self._choice.is_full():

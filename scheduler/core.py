@@ -1,7 +1,7 @@
 """The scheduler (which job runs where, and when), and the loop that every driver runs.
 
-Rule: the core is pure. It knows the time only from `step`, and does no I/O. One loop serves all clocks; drivers differ
-only in their `Clock`.
+Rule: the core is pure. It knows the time only from `step`, and does no I/O. A driver runs a core against real or
+simulated units. One loop (`run_loop`) serves all drivers, which differ only in their `Clock`.
 
 Theory of operation. A driver calls `step` with the time and the events since the last step. The core answers with
 actions to do now and with the time at which it wants to be asked again. The same steps give the same answers, so a run
@@ -15,13 +15,13 @@ can be replayed from its events alone. One step does five things, in this order:
 
 Slots. Between two stages lies an edge with a fixed number of slots (transport/slots.py). A job holds its input slot and
 its output slot from dispatch until it is done. Therefore a stage can begin only when a frame waits before it and a slot
-is free behind it. Nothing else holds back the stages before a slow one.
+is free behind it. This alone holds back the stages before a slow stage.
 
-Bypass. A frame may skip the stages between two stages of a chain, if the first of the two says so. The frame keeps its
-slot, waits in it for the second stage, and overtakes no other frame (flow.py).
+Bypass. A frame may skip the stages between two stages of a chain, if the first of these two stages says so. The frame
+keeps its slot, waits in it for the second stage, and overtakes no other frame (flow.py).
 
 Dirty units. A step looks only at units for which something has changed: the unit's own job ended, a frame came to one
-of its stages, a slot became free behind one of its stages, or its life or duty changed. Code that makes such a change
+of its stages, a slot became free behind one of its stages, or its life or duty changed. Code that changes one of these
 calls `mark_dirty`. A dispatch may make a unit dirty that this step has already looked at; the step then looks at it
 again.
 
@@ -29,9 +29,9 @@ The alarm is a time before which no unit's deadline passes and no unit's pause e
 computed from all units only after the old one has gone off or was reset. An event that moves a deadline to a later time
 does not change the alarm, so the alarm may go off too early.
 
-Dispatch ahead and leading. A unit holds its next job while one runs, so that no message delay lies between them. A
-policy with a lead hands the next job over only `lead_ns` before the running job should end. Latching delays the first
-stage: it begins so late that its sample is still new when the second stage can take it.
+Dispatch ahead and lead. A unit holds its next job while another job runs, so that no message delay lies between the
+two. A policy with a lead hands the next job over only `lead_ns` before the running job should end. Late latching delays
+the first stage, so that its sample is still new when the second stage can take it.
 """
 
 from __future__ import annotations
@@ -142,9 +142,10 @@ class Core:
         }
 
     def step(self, now_ns: int, events: tuple[Event, ...] = ()) -> Decision:
-        """Take the events and the time, and return what to do.
+        """Take the events and the time, and return the actions to carry out and the time of the next step.
 
-        `now_ns` must not decrease from step to step. Events after the finish are ignored.
+        `now_ns`: time in ns; must not decrease from step to step.
+        `events`: events since the last step. Those after the finish are ignored.
 
         Raises KeyError for an unknown unit or stage, and UnitLifeError for an event that cannot happen to a unit now.
         Raises ValueError for a frame that skips where no bypass begins.
@@ -174,12 +175,16 @@ class Core:
         return Decision(tuple(self.actions), next_ns)
 
     def report(self, *, clock: str, requested: int | None = None) -> dict[str, Any]:
-        """Return the ledger's report. `requested`: number of frames that were asked for; None: as in the settings."""
+        """Return the ledger's report.
+
+        `clock`: "host" or "virtual".
+        `requested`: number of frames that were asked for; None: the number in the settings.
+        """
         asked = self.settings.frames if requested is None else requested
         return self.ledger.report(clock=clock, requested=asked, not_begun=asked - self.source.left)
 
     def _release(self, now_ns: int) -> int:
-        """Release the frames that are due. Return the time at which the first was due, or `now_ns` if none was."""
+        """Release the frames that are due. Return the time in ns at which the first was due; `now_ns` if none was."""
         due_ns = self.source.due_ns
         if not self.source.advance(now_ns):
             return now_ns
@@ -252,7 +257,7 @@ class Core:
         self.flow.pass_on(stage, job, end_ns)
 
     def ready_ns(self, job: Job) -> int | None:
-        """Return the time at which the inputs of a job were there; None if its frame is gone."""
+        """Return the time in ns from which all inputs of a job were there; None if the job's frame is gone."""
         frame = self.frames.get(job.frame) or self.flow.gone.get(job.frame)
         return None if frame is None else frame.ready_ns[self._stage_named[job.stage].position]
 
@@ -263,7 +268,10 @@ class Core:
         frame.skips = True
 
     def _step_work(self, ladder: WorkLadder, stage: StageState, frame: FrameState, service_ns: int) -> None:
-        """Learn the service time of the frame's work, and reset all estimates when the rung changes."""
+        """Give the ladder a measured service time; if this changes the rung, set the estimates of all stages to it.
+
+        `stage`: stage that took `service_ns` for `frame`.
+        """
         ladder.learn(stage.position, frame.rung, service_ns)
         if stage.position == ladder.last and ladder.consider():
             self.flow.rung = ladder.rung
@@ -271,7 +279,7 @@ class Core:
                 each.estimate_ns = ladder.service_ns(each.position, ladder.rung)
 
     def _begin_next(self, unit: UnitState) -> None:
-        """Note that the unit's last job is over, so that its next job begins now if it holds one."""
+        """Note that the unit's job is over: if the unit holds another job, that job begins now."""
         unit.head_since_ns = self.now_ns
         unit.deadline_ns = self.now_ns + self._hang_ns if unit.queue and unit.life == READY else NEVER
 
@@ -302,7 +310,7 @@ class Core:
             self.source.start(self.now_ns)
 
     def _on_died(self, event: UnitDied) -> None:
-        """Plan the restart and reclaim the slots, or end the run when the unit fails too often."""
+        """Plan the unit's restart and reclaim its slots; if the unit has failed too often, end the run."""
         unit = self.units[event.unit]
         # Only a unit that passed its deadline is stopping.
         loss = Loss(LossKind.HUNG if unit.life == STOPPING else LossKind.DIED, unit.name)
@@ -384,15 +392,15 @@ class Core:
 
 
 class Clock(Protocol):
-    """A driver's side of the loop: it tells the time, returns events and carries out the core's actions."""
+    """A driver's side of `run_loop`: it tells the time, returns events and carries out the core's actions."""
 
     def wait(self, deadline_ns: int) -> tuple[int, tuple[Event, ...]]:
-        """Wait until something happens or the deadline comes; return the time in ns and the events.
+        """Wait until something happens or the deadline comes; return (time in ns, events).
 
-        The returned times must not decrease. The method may return without an event at any time.
+        The returned times must not decrease. The method may return without an event at any time. The first call of a
+        run must return a `UnitReady` for each unit that is up.
 
-        `deadline_ns`: latest time of return; NEVER: wait for an event. The first call of a run gets NEVER, and must
-        return a `UnitReady` for each unit that is up.
+        `deadline_ns`: latest time of return; NEVER: wait for an event, as in the first call of a run.
         """
         ...
 
@@ -410,9 +418,9 @@ class Recorder(Protocol):
 
 
 def run_loop(core: Core, clock: Clock, recording: Recorder | None = None) -> Outcome:
-    """Run `core` until it finishes, and add every step to `recording`.
+    """Run `core` until it finishes, add every step to `recording`, and return how the run ended.
 
-    Raises what `clock` raises, KeyError and UnitLifeError (see Core.step).
+    Raises any error of `clock`, and the errors of `Core.step`.
     """
     wait, perform = clock.wait, clock.perform  # looked up once: they are called for every step
     deadline_ns: int = NEVER

@@ -76,7 +76,7 @@ class DropCause(StrEnum):
     - POOL: a newer frame needed its slot, because no slot of the edge was free.
     - QUEUE_FULL: too many frames waited before the first stage when it was released.
     - TIMEOUT: it waited too long before the first stage.
-    - EVERY: by `StageSpec.every`, no stage without readers takes it.
+    - EVERY: every stage without readers leaves this frame out, by its `StageSpec.every`.
     """
 
     STALE = "stale"
@@ -90,7 +90,7 @@ class DropCause(StrEnum):
 class Drop(NamedTuple):
     """Why and where a frame was dropped.
 
-    `edge`: place of the drop, as `producer->consumer`; for EVERY, names of the stages without readers.
+    `edge`: place of the drop, as `producer->consumer`; for EVERY, names of the stages without readers, with commas.
     """
 
     edge: str
@@ -111,8 +111,10 @@ class Job(NamedTuple):
     """One stage of one frame on one unit, from an input slot to an output slot.
 
     `slot_in`: index of the input slot; for several inputs, the result of `packed`. If a bypass ends at the stage, the
-    slots of the bypassed edge are counted after those of the input edge.
-    `epoch`: epoch of the output edge, or of the input edge without one; it grows when a unit at the edge dies.
+    slots of the edge at which the bypass begins are numbered after those of the input edge.
+    `slot_out`: index of the output slot.
+    `epoch`: epoch of the output edge, or of the input edge if there is no output edge. An edge's epoch grows when a
+    unit at the edge dies.
     `fresh`: whether the stage must not rely on what earlier frames brought to the end of the bypass. Only a job of the
     stage at which the bypass begins can be fresh.
     `rung`: rung of the frame's work (policy.py).
@@ -138,11 +140,13 @@ class UnitReady(NamedTuple):
 class JobDone(NamedTuple):
     """A unit has finished a job.
 
-    `t_sampled_ns`: time at which the frame was sampled, from its header; 0 except from the first stage.
+    `job`: number of the job, `Job.id`.
+    `t_begin_ns`, `t_end_ns`: times of the job's begin and end.
+    `t_sampled_ns`: time at which the frame was sampled, from its header; only from the first stage, else 0.
     `preempted_ns`: time within the job in which the unit had no core.
     `asleep_ns`: time within the job in which the unit slept and no device of its own worked.
     `preempted_before_ns`: time between the unit's last job and this one in which the unit had no core.
-    `skips`: whether the frame takes the bypass; False except from the stage at which the bypass begins.
+    `skips`: whether the frame takes the bypass; only from the stage at which the bypass begins, else False.
     """
 
     unit: str
@@ -157,7 +161,7 @@ class JobDone(NamedTuple):
 
 
 class JobFailed(NamedTuple):
-    """A stage raised an error; the unit's process goes on."""
+    """A stage raised an error; the unit's process goes on. `job`: number of the job, `Job.id`."""
 
     unit: str
     job: int
@@ -188,14 +192,14 @@ class SchedulerStalled(NamedTuple):
 
 
 class SetDuty(NamedTuple):
-    """From now on the unit may work for `permille` thousandths of the time."""
+    """The unit's duty changes: from now on it may work for `permille` thousandths of the time."""
 
     unit: str
     permille: int
 
 
 class StageAlone(NamedTuple):
-    """The stage takes `ns` for a frame on `rung` while other units are quiet; sent for all rungs, before the start."""
+    """The isolated time of a stage for a frame on `rung` is `ns`; sent for all rungs, before the start."""
 
     stage: str
     rung: int
@@ -285,12 +289,12 @@ class Decision(NamedTuple):
 
 @dataclass(frozen=True)
 class Input:
-    """What a stage reads: the stream that another stage writes.
+    """An input of a stage: the stream that another stage writes.
 
-    `stage`: name of the stage that writes it.
-    `latest`: whether the stage takes the newest frame, whatever its number. Otherwise the stage takes the same frame
-    here as from its other inputs.
-    `max_age_ns`: longest age at which the newest frame is taken; an older one counts as absent. 0: any age.
+    `stage`: name of the writing stage.
+    `latest`: whether the reading stage takes the stream's newest frame, whatever its number. If not, it takes the same
+    frame from all its inputs.
+    `max_age_ns`: longest age at which the newest frame is taken; an older frame counts as absent. 0: any age.
     """
 
     stage: str
@@ -302,7 +306,7 @@ class Input:
 class StageSpec:
     """A stage and the unit that it runs on.
 
-    `inputs`: what the stage reads; None for a stage of a chain, which reads what the stage before it writes.
+    `inputs`: inputs of the stage; None for a stage of a chain, which reads the stream of the stage before it.
     `every`: distance between the frames that the stage takes: 3 for the first, the fourth and so on.
     """
 
@@ -319,7 +323,7 @@ NO_SLOT: Final = 255
 def packed(slots: Sequence[int]) -> int:
     """Return the slots of a job's inputs as one number, with the first input in the lowest byte; -1 without inputs.
 
-    `slots`: slot of each input; -1 for an input of the newest frame that has no frame yet.
+    `slots`: slot of each input; -1 for an input with `latest` that has no frame yet.
     """
     if len(slots) == 1:
         return slots[0] if slots[0] >= 0 else NO_SLOT
@@ -330,7 +334,7 @@ def packed(slots: Sequence[int]) -> int:
 
 
 def unpacked(code: int, count: int) -> list[int]:
-    """Return the slots of `count` inputs from `code`, a result of `packed`."""
+    """Return the slot of each of `count` inputs from `code`, a result of `packed`; -1 for an input without a frame."""
     slots = [code >> 8 * place & NO_SLOT for place in range(count)]
     return [slot if slot != NO_SLOT else -1 for slot in slots]
 
@@ -339,12 +343,13 @@ def unpacked(code: int, count: int) -> list[int]:
 class Graph:
     """The stages of a run, and how frames go through them. Each stage comes after the stages that it reads.
 
-    `edges`: rule of each edge. In a chain `edges[i]` lies between stages i and i + 1. Any other graph has one rule for
-    each stage that has a reader, in the order of the stages.
+    `edges`: rule of each edge, such as `fifo:3`. In a chain `edges[i]` lies between stages i and i + 1. Any other graph
+    has one rule for each stage that has a reader, in the order of the stages.
     `latency_to`: stage at whose end the latency ends.
     `bypass`: names of two stages of a chain. A frame skips the stages between them if the first stage says so
     (flow.py).
-    `from_release`: whether the latency begins with the frame's release, not when its first stage samples it.
+    `from_release`: whether the latency begins with the frame's release. If not, it begins when the first stage samples
+    the frame.
     """
 
     stages: tuple[StageSpec, ...]
@@ -368,7 +373,10 @@ class Graph:
             self._check_bypass(names, self.bypass)
 
     def _check_inputs(self) -> None:
-        """Raise UnexpectedValue for inputs that are not earlier stages, repeat or are too many; for `every` below 1."""
+        """Raise UnexpectedValue for a stage with wrong inputs, or with `every` below 1.
+
+        Inputs are wrong if they are missing, repeat, are too many, or are not earlier stages.
+        """
         known: set[str] = set()
         for stage in self.stages:
             if stage.inputs is None:
@@ -391,7 +399,7 @@ class Graph:
 
     @property
     def is_chain(self) -> bool:
-        """Whether each stage reads what the stage before it writes."""
+        """Whether each stage takes every frame from the stage before it, and has no other input."""
         return all(stage.inputs is None and stage.every == 1 for stage in self.stages)
 
     @property
@@ -407,7 +415,7 @@ class Graph:
         return tuple(names[names.index(self.bypass[0]) + 1 : names.index(self.bypass[1])])
 
     def inputs_of(self, index: int) -> tuple[Input, ...]:
-        """Return what stage `index` reads; in a chain, the stage before it."""
+        """Return the inputs of the stage at `index`; in a chain, the only input is the stage before it."""
         given = self.stages[index].inputs
         if given is not None:
             return given
@@ -423,12 +431,12 @@ class Graph:
         return {name: tuple(found) for name, found in readers.items() if found}
 
     def edge_name(self, index: int) -> str:
-        """Return the name `FROM->TO` of the edge with the rule `edges[index]`; commas separate several readers."""
+        """Return the name `WRITER->READER` of the edge with rule `edges[index]`; commas separate several readers."""
         name, readers = list(self.streams.items())[index]
         return f"{name}->{','.join(readers)}"
 
     def written(self) -> dict[str, Any]:
-        """Return the graph as a JSON object, which `recording.graph_of` reads; a chain leaves out default values."""
+        """Return the graph as a JSON object for `recording.graph_of`. A chain leaves out keys with default values."""
         if self.is_chain and not self.from_release:
             stages = [{"name": stage.name, "unit": stage.unit} for stage in self.stages]
             return {"stages": stages, "edges": self.edges, "latency_to": self.latency_to, "bypass": self.bypass}
@@ -436,7 +444,11 @@ class Graph:
 
 
 def chain(stages: Iterable[tuple[str, str]], edge: str, latency_to: str) -> Graph:
-    """Return the graph of `stages`, pairs of a name and its unit, with `edge` as the rule of every edge.
+    """Return the graph of a chain of stages.
+
+    `stages`: pairs (name of the stage, name of its unit).
+    `edge`: rule of every edge.
+    `latency_to`: stage at whose end the latency ends.
 
     Raises ValueError if two stages have the same name, or if `latency_to` is none of them.
     """
@@ -446,21 +458,22 @@ def chain(stages: Iterable[tuple[str, str]], edge: str, latency_to: str) -> Grap
 
 @dataclass(frozen=True)
 class Settings:
-    """What a run asks of the core. Names in `_ns` are durations; a duration or limit of 0 means that there is none.
+    """The settings of a run. Names in `_ns` are durations; a duration or limit of 0 means that there is none.
 
     `frames`: number of frames of the run.
     `policy`: name of the scheduling policy.
     `period_ns`: time between releases of frames; 0: a frame is released as soon as it can be taken.
-    `arrivals_ns`: release times from the start, instead of a period.
+    `arrivals_ns`: release time of each frame, from the start of the run, instead of a period.
     `asked`: whether only `FrameRequest` releases frames.
-    `latch_ns`: margin by which a frame's first stage is expected to end before the second can take it. The first stage
-    begins that late so that its sample is newer and waits less.
+    `latch_ns`: margin of late latching: time from the expected end of a frame's first stage until the second stage can
+    take the frame.
     `deadline_ns`: longest time from a frame's release to its presentation.
-    `works`: work of each rung of the ladder (policy.py) in thousandths, 1000 first, falling; empty: no ladder.
+    `works`: work of each rung of the ladder (policy.py) in thousandths of all the work, from 1000 downwards; empty: no
+    ladder.
     `follow`: names of the stages whose time follows the work.
     `in_flight`: limit of frames between admission and presentation.
-    `in_queue`: limit of released frames that wait; more are turned away.
-    `queue_timeout_ns`: longest wait of a released frame.
+    `in_queue`: limit of released frames that wait before the first stage; further frames are dropped.
+    `queue_timeout_ns`: longest wait of a released frame before the first stage; then it is dropped.
     `hang_ns`: longest time of a job, and longest time for which an idle unit may leave a ping unanswered.
     `start_ns`: longest time of a unit's start.
     `max_failures`: number of failures in a row, with no finished job between them, after which a unit is given up.

@@ -3,17 +3,17 @@
 Each change marks the units that it concerns as dirty (`mark_dirty`).
 
 Several readers. The output of a stage waits in one slot for all its readers; nothing is copied. A line is the queue of
-slots that wait for one reader. A stage with several inputs begins a frame when each of them has it. Frames keep their
-order on every edge, so the oldest frames of all these lines are then the same frame.
+slots that wait for one reader. A stage with several inputs begins a frame when each input has the frame. Frames keep
+their order on every edge, so this frame is then the oldest of each input's line.
 
 Dropped everywhere. A frame that is dropped or lost leaves all lines, because a stage that joins branches would wait for
 it in vain. A job that has begun the frame goes on, but its output is thrown away. A frame that one branch has begun is
 not dropped as stale on another branch. Otherwise two branches would choose different frames, and hardly any pair would
 meet.
 
-Side work. The output of some stages is read only by inputs of the newest frame, so no picture waits for it. If such a
-stage leaves out a frame, the frame is dropped only there, and is not counted. A frame that is dropped after it was
-presented is not counted either.
+Side work. The output of some stages is read only by inputs with `latest`, so no picture waits for it. If a stage of
+side work leaves out a frame, the other stages still do the frame, and it does not count as dropped. A frame that is
+dropped after it was presented does not count either.
 
 A bypass leads frames past some stages of a chain. A frame on the bypass overtakes no other frame. The stage at which
 the bypass begins says for each frame whether it skips (`JobDone.skips`). The slot of a frame that skips waits in the
@@ -39,11 +39,11 @@ SKIPPING = 1  # line of the frames that skip, on the edge at which a bypass begi
 
 
 class Bypass:
-    """The way past the stages between `begin` and `end`.
+    """The bypass of a chain, from the stage `begin` to the stage `end`.
 
     `edge`: output edge of `begin`; it has the slots of the frames on the bypass.
-    `must_be_fresh`: whether the next job of `begin` must be fresh.
-    `was_taken`: whether the last frame of `begin` took the bypass.
+    `must_be_fresh`: whether the next job of `begin` must be fresh (glossary).
+    `was_taken`: whether the last frame that `begin` has done took the bypass.
     """
 
     __slots__ = ("begin", "edge", "end", "must_be_fresh", "was_taken")
@@ -57,7 +57,7 @@ class Bypass:
 
 
 def next_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
-    """Return the slot that a stage with an input takes next, as `Job.slot_in` counts; -1: none.
+    """Return the slot that a stage with one input takes next, numbered as in `Job.slot_in`; -1: none.
 
     `frames`: frames in flight by number, oldest first.
     """
@@ -86,13 +86,13 @@ def _is_older_before(stage: StageState, frame: int, frames: Mapping[int, FrameSt
 
 
 def own_slots(stage: StageState) -> int:
-    """Return the number of slots of the stage's own edge; `Job.slot_in` counts the bypassed edge from there on."""
+    """Return the number of slots of the stage's input edge; `Job.slot_in` numbers the other edge's slots from there."""
     assert isinstance(stage.input, EdgeSlots)
     return len(stage.input.state)
 
 
 def side_of(stage: StageState, slot_in: int) -> tuple[EdgeSlots | SourceLine, int]:
-    """Return the edge and the slot that `slot_in` of a job of `stage` refers to; the stage must have one input."""
+    """Return (edge, slot on this edge) for a number as in `Job.slot_in`; the stage must have one input."""
     own = stage.input
     assert own is not None
     if stage.bypassed is None or slot_in < own_slots(stage):
@@ -101,10 +101,10 @@ def side_of(stage: StageState, slot_in: int) -> tuple[EdgeSlots | SourceLine, in
 
 
 def stale_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
-    """Return the slot of the oldest frame that waits for the stage on the bypass, if it is stale; else -1.
+    """Return the slot of the oldest frame that waits for the stage on the bypass, if this frame is stale; else -1.
 
-    The frame is stale if a newer waiting frame could go as soon. A skipping frame never makes a frame stale that does
-    not skip, because it may rely on that frame. The slot counts as `Job.slot_in` does.
+    The slot is numbered as in `Job.slot_in`. The frame is stale if a newer waiting frame could go as soon. A frame that
+    skips may rely on an earlier frame that does not skip, and therefore never makes that frame stale.
     """
     own, bypassed = stage.input, stage.bypassed
     if own is None or bypassed is None or not bypassed.lines[SKIPPING]:
@@ -118,7 +118,10 @@ def stale_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
 
 
 def _parts(stage: StageState, frame: int, newer: int, frames: Mapping[int, FrameState]) -> bool:
-    """Return whether a frame between `frame` and `newer`, which skip, is still on its way to the stage."""
+    """Return whether a frame with a number between `frame` and `newer` is still on its way to the stage.
+
+    `frame`, `newer`: two frames that skip.
+    """
     return any(frame < number < newer and state.position < stage.position for number, state in frames.items())
 
 
@@ -128,10 +131,10 @@ class Flow:
     `dirty`: units that a step must look at, in the order in which they were marked; a unit may appear twice.
     `bypass`: bypass of the chain, or None.
     `rung`: rung of the work of frames that are admitted from now on.
-    `gone`: frames that were dropped or lost while jobs worked on them, until these jobs end.
-    `aside`: number of frames in flight that are presented, so that only side work is left.
-    `source_lines`: pairs of a stage without inputs and the line of its waiting frames. It is empty if the only such
-    stage takes its frames from the source itself.
+    `gone`: frames that were dropped or lost while jobs worked on them, by number, until these jobs end.
+    `aside`: number of frames in flight that are presented already, so that only side work is left.
+    `source_lines`: pairs (stage without inputs, line of its waiting frames). It is empty if only one stage has no
+    inputs, and takes its frames from the source itself.
     """
 
     def __init__(self, graph: Graph, ledger: Ledger, drops: bool) -> None:
@@ -167,7 +170,7 @@ class Flow:
         self.dirty.append(unit)
 
     def admit(self, frame: int, release_ns: int, deadline_ns: int) -> None:
-        """Put the frame in flight."""
+        """Put the frame in flight. `release_ns`, `deadline_ns`: times in ns; NEVER: no deadline."""
         todo = self.next_todo() if self._every else self._all
         self.frames[frame] = FrameState(release_ns, deadline_ns, self.rung, self._admitted, todo, self._count)
         self._admitted += 1
@@ -185,9 +188,10 @@ class Flow:
         return sum(stage.bit for stage in self.stages if not self._admitted % stage.period)
 
     def begin(self, stage: StageState, frame: int, slot_in: int, now_ns: int) -> Job:
-        """Return the stage's job for `frame`, which was just admitted or waits for the stage.
+        """Take the slots that the stage needs for `frame`, and return the job.
 
-        `slot_in`: slot in which the frame waits, as `Job.slot_in` counts; it matters only in a chain.
+        `frame`: frame that was just admitted, or waits for the stage.
+        `slot_in`: slot in which the frame waits, numbered as in `Job.slot_in`; it matters only in a chain.
         """
         source, sink, state = stage.input, stage.output, self.frames[frame]
         slot_out = -1
@@ -238,15 +242,15 @@ class Flow:
         return packed(slots)
 
     def must_stay(self, behind: StageState, frame: int) -> bool:
-        """Return whether no newer frame may replace a frame behind a stage, because another branch has begun it.
+        """Return whether a frame behind a stage must not be replaced, because another branch has begun it.
 
-        If only side work waits for the frame there, it may be replaced: the side work leaves it out.
+        If only side work waits for the frame there, a newer frame may replace it: the side work leaves it out.
         """
         state = self.frames[frame]
         return self._is_awaited(behind, state) and bool(state.begun & self.main & ~(behind.before | behind.bit))
 
     def _is_awaited(self, behind: StageState, state: FrameState) -> bool:
-        """Return whether a reader of the stage waits for the frame. Readers that are side work do not count."""
+        """Return whether a reader of the stage `behind` has yet to begin a frame. Readers of side work do not count."""
         waiting = state.todo & ~state.begun & self.main
         return any(waiting & reader.bit for reader in behind.readers)
 
@@ -310,7 +314,7 @@ class Flow:
             self.drop(replaced, stage, DropCause.STALE)
 
     def _present(self, frame: int, state: FrameState, end_ns: int) -> None:
-        """Note that a stage without readers has done the frame. The last such stage presents the frame."""
+        """Note that a stage without readers has done the frame. The last of these stages presents the frame."""
         if state.todo & self._ends:
             return
         state.is_presented = True
@@ -324,7 +328,7 @@ class Flow:
         self.mark_roots_dirty()
 
     def _leave(self, frame: int) -> None:
-        """Take a frame out of flight for which nothing is left to do; it counts as dropped if it was not presented."""
+        """Take a frame out of flight that no stage has left to do; if it was not presented, it counts as dropped."""
         state = self.frames.pop(frame)
         if state.is_presented:
             self.aside -= 1
@@ -338,7 +342,7 @@ class Flow:
         self.dirty += self._root_units
 
     def _take_bypass(self, bypass: Bypass, job: Job) -> bool:
-        """Return whether the frame takes the bypass; if so, it waits for the stage at the bypass's end."""
+        """Return whether the job's frame takes the bypass; if so, it now waits for the stage at the bypass's end."""
         frame = self.frames[job.frame]
         bypass.was_taken = frame.skips
         if bypass.was_taken:
@@ -364,7 +368,7 @@ class Flow:
                     side.edge.release(slot)
 
     def _producer(self, stage: StageState, edge: EdgeSlots | SourceLine) -> StageState:
-        """Return the stage that fills `edge`, from which `stage` takes frames; the stage has one input."""
+        """Return the stage that fills `edge`: the input edge of `stage`, which has one input, or its bypassed edge."""
         if edge is not stage.input and self.bypass is not None:
             return self.bypass.begin
         producer = stage.inlets[0].producer
@@ -374,6 +378,7 @@ class Flow:
     def drop(self, frames: list[int], behind: StageState, cause: DropCause, before: StageState | None = None) -> None:
         """Drop frames that waited behind a stage, and count them.
 
+        `behind`: stage that wrote the frames.
         `before`: stage for which the frames waited; None: all readers of the stage `behind`.
         """
         for frame in frames:
@@ -409,7 +414,7 @@ class Flow:
         self._mark_all_dirty()
 
     def mark_lost(self, frame: int, loss: Loss) -> None:
-        """Take a frame out of flight, and count it as lost if it was not presented; its slots are not freed here."""
+        """Take a frame out of flight; if it was not presented, count it as lost. Its slots are not freed here."""
         state = self.frames.pop(frame)
         if state.is_presented:
             self.aside -= 1
@@ -422,7 +427,8 @@ class Flow:
     def reclaim(self, unit: UnitState, loss: Loss) -> None:
         """Give back the slots of a unit whose process is gone, and begin a new epoch of its edges.
 
-        `fates` says which of the unit's frames are lost; the others wait again.
+        `fates` says which of the unit's frames are lost; the other frames wait for their stages again.
+        `loss`: reason that the lost frames get.
         """
         judged = fates(unit.queue, {stage.name for stage in unit.stages if stage.input is None})
         unit.queue.clear()
@@ -454,7 +460,7 @@ class Flow:
         self._end_job(job)
 
     def _end_job(self, job: Job) -> None:
-        """Note that no unit holds the job any more."""
+        """Note that no unit holds the job any more; a frame that is gone is forgotten with its last job."""
         if not self.is_chain:
             state = self.frames.get(job.frame) or self.gone[job.frame]
             state.jobs -= 1

@@ -65,7 +65,8 @@ def idle_causes(*, joins: bool) -> tuple[str, ...]:
 class FrameLeft(NamedTuple):
     """A frame that left the run.
 
-    `cause`: key of the cause in the report; empty for a presented frame.
+    `frame`: its number.
+    `cause`: report key of the cause of its drop or loss; empty for a presented frame.
     `end_ns`, `latency_ns`, `rung`: as in `Ledger.presented`; 0 for a frame that was not presented.
     """
 
@@ -80,10 +81,11 @@ class FrameLeft(NamedTuple):
 class JobRecord(NamedTuple):
     """One finished job; times in ns of the run's clock.
 
-    `ready_ns`: time at which its input was there.
+    `ready_ns`: time from which its inputs were there.
+    `dispatch_ns`: time of its hand-over to the unit.
     `preempted_ns`, `asleep_ns`, `preempted_before_ns`: as in `JobDone`.
-    `cpu_ns`: CPU time of all its unit's threads in the job; 0 in journals older than this field. On the virtual clock,
-    the service time without preemption.
+    `cpu_ns`: CPU time of all threads of the unit in the job; 0 in journals older than this field. On the virtual clock,
+    it is the service time without preemption.
     """
 
     stage: str
@@ -100,7 +102,7 @@ class JobRecord(NamedTuple):
 
 
 class _NewestBook:
-    """Ages of the frames of one stream that inputs with `latest` took."""
+    """Ages of the frames that inputs with `latest` took from one stream."""
 
     def __init__(self, sketch: Callable[[], Sketch] | None) -> None:
         self.age, self.behind = Samples(sketch), Counter[int]()
@@ -125,7 +127,10 @@ class _UnitBook:
         self.restarts = 0
 
     def add_job(self, begin_ns: int, end_ns: int, preempted_ns: int, asleep_ns: int, preempted_before_ns: int) -> None:
-        """Book a job. Time before it counts as preempted if the unit held it, did no other job and had no core."""
+        """Book a job. All times are in ns; the last three are as in `JobDone`.
+
+        Time before the job counts as preempted if the unit held the job, did no other job and had no core.
+        """
         self.jobs += 1
         last_end_ns = self.last_end_ns
         if preempted_before_ns and begin_ns > (held_from_ns := max(last_end_ns, self.since_ns)):
@@ -139,7 +144,10 @@ class _UnitBook:
                 self.busy_ns -= min(preempted_ns + asleep_ns, ran_ns)
 
     def shares(self, joins: bool) -> dict[str, Any]:
-        """Return the unit's row of the report. `joins`: whether one of its stages has several inputs."""
+        """Return the keys `busy`, `idle`, `jobs`, `restarts` of the unit in report.json, with their values.
+
+        `joins`: whether one of its stages has several inputs, so that `idle` has the cause `join`.
+        """
         total = sum(self.totals) or 1
         idle = {name: self.totals[account] for account, name in NAMES.items()}
         idle[PREEMPTED] = self.preempted_ns
@@ -154,7 +162,7 @@ class _UnitBook:
 
 @dataclass(frozen=True)
 class Books:
-    """How a run is accounted for.
+    """Settings of a ledger.
 
     `target_period_ns`: as for `trilane.scheduler.stats.due_ns`.
     `sketch`: function that makes a sketch, as for `trilane.scheduler.stats.Samples`.
@@ -177,10 +185,10 @@ class Ledger:
     `skipped`: number of presented frames that took the bypass.
     `rungs`: number of presented frames on each rung of work.
     `rung_switches`: how often a frame had another rung than the frame before.
-    `left`: list that gets every frame that leaves the run; None: these frames are not kept.
+    `left`: list that gets a record of every frame that leaves the run; None: no records are kept.
     `presented_frames`, `presented_ns`: numbers and times of the presented frames, in order; filled only for a run that
     keeps all values.
-    `lateness_ns`: lateness of the presented frames that have a deadline, in order; filled under the same condition.
+    `lateness_ns`: lateness of the presented frames that have a deadline, in order; also filled only for such a run.
     """
 
     def __init__(self, graph: Graph, books: Books | None = None) -> None:
@@ -231,20 +239,20 @@ class Ledger:
         asleep_ns: int = 0,
         preempted_before_ns: int = 0,
     ) -> None:
-        """Book a job that has ended. `ready_ns`: time at which its input was there; the rest is as in `JobDone`."""
+        """Book a job that has ended. `ready_ns`: time from which its inputs were there. Other times: see `JobDone`."""
         stage = self._stages[job.stage]
         stage.service.add(end_ns - begin_ns)
         stage.wait.add(begin_ns - ready_ns)
         self._units[job.unit].add_job(begin_ns, end_ns, preempted_ns, asleep_ns, preempted_before_ns)
 
     def lose(self, frame: int, release_ns: int, loss: Loss) -> None:
-        """Book a lost frame."""
+        """Book the loss of a frame. `release_ns`: time of its release. `loss`: reason."""
         self.lost[loss] += 1
         if self.left is not None:
             self.left.append(FrameLeft(frame, release_ns, str(loss)))
 
     def drop(self, frame: int, release_ns: int, drop: Drop) -> None:
-        """Book a dropped frame."""
+        """Book the drop of a frame. `release_ns`: time of its release. `drop`: reason."""
         self.dropped[drop] += 1
         if self.left is not None:
             self.left.append(FrameLeft(frame, release_ns, str(drop)))
@@ -253,7 +261,7 @@ class Ledger:
         """Book that a job takes the newest frame of a stream.
 
         `age_ns`: time since that frame was sampled.
-        `behind`: number of frames by which it is older than the job's frame.
+        `behind`: number of frames by which the taken frame is older than the job's frame.
         """
         book = self._newest[stream]
         book.age.add(age_ns)
@@ -270,7 +278,7 @@ class Ledger:
     def hold(self, is_held: bool) -> None:
         """Note whether somebody holds the run from now on.
 
-        A time between two presented frames is no frame time if the run was held in it.
+        If the run was held between two presented frames, the time between them does not count as a frame time.
         """
         self._is_held, self._was_held = is_held, True
 
@@ -320,7 +328,7 @@ class Ledger:
 
     @property
     def shown_ns(self) -> dict[int, int]:
-        """The time of each presented frame by its number; empty for a run that keeps sketches in place of values."""
+        """The time in ns of each presentation, by the frame's number; empty for a run that does not keep all values."""
         return dict(zip(self.presented_frames, self.presented_ns, strict=True))
 
     @property
@@ -340,18 +348,23 @@ class Ledger:
 
     @property
     def latency_ns(self) -> list[int]:
-        """The latency of each presented frame, in order; only for a run that keeps all values."""
+        """The latency in ns of each presented frame, in order; only for a run that keeps all values."""
         return [*self._latency.kept]
 
     @property
     def is_exact(self) -> bool:
-        """Whether all percentiles are exact."""
+        """Whether all percentiles are computed from all values, not from a sketch."""
         books = self._stages.values()
         samples = [*[book.service for book in books], *[book.wait for book in books], self._latency]
         return self._frame_times.samples.is_exact and all([each.is_exact for each in samples])
 
     def report(self, *, clock: str, requested: int, not_begun: int) -> dict[str, Any]:
-        """Return the keys of report.json. `not_begun`: number of requested frames that never left the source."""
+        """Return the ledger's keys of report.json, with their values.
+
+        `clock`: "host" or "virtual".
+        `requested`: number of frames that were asked for.
+        `not_begun`: number of requested frames that never left the source.
+        """
         intervals, span_ns = self._frame_times.samples.count, self._between_ns
         streams = {name: book.row() for name, book in self._newest.items()}
         return {

@@ -1,20 +1,20 @@
 """The least period of a graph, from the times of its stages: the maximum ratio of a cycle (max-plus algebra).
 
-A job waits for other jobs: the jobs whose output it reads, the stage's job before it, and the jobs that free its output
-slot. If the jobs of a cycle of such waits take w ns, and the cycle ends s frames later, no period below w / s is
-possible. The bound is the largest ratio of all cycles. The work of a unit for one frame counts as a cycle, and the
-period of the source as another. With constant times and one stage on each unit the bound is reached. If stages share a
-unit, their order may make the period longer.
+The period is the time between two frames of the source. A job waits for other jobs: the jobs whose output it reads, the
+stage's job before it, and the jobs that free its output slot. These waits form cycles. If the jobs of a cycle take w
+ns, and the cycle ends s frames after its beginning, no period below w / s is possible. The bound is the largest ratio
+w / s of all cycles. The work of a unit for one frame counts as a cycle, and the period of the source as another. With
+constant times and one stage on each unit the bound is reached. If stages share a unit, their order may make the period
+longer.
 
 If frames can take a bypass, the bound ignores the slots. The period of a run may then be longer than the bound.
 
 With `every` a stage takes one frame of several. The pattern of the jobs repeats after a hyperperiod, the least common
-multiple of these distances, and each job of a hyperperiod counts by itself. An input of the newest frame delays no
-writer. An edge whose rule replaces waiting frames (triple, orphan) delays none either.
+multiple of all values of `every`, and each job of a hyperperiod counts by itself. An input with `latest` never delays
+the stage that writes its stream. The same holds for an edge whose rule replaces waiting frames (triple, orphan).
 
-Rule: the arithmetic is exact, in whole ns and fractions. Newton's method finds the ratio. Each step searches a cycle
-with a larger ratio than the present one (Bellman and Ford), and takes over its ratio. The search ends when no such
-cycle is left.
+Rule: the arithmetic is exact, in whole ns and fractions. Newton's method finds the largest ratio. Each step searches a
+cycle whose ratio is above the largest ratio so far (Bellman and Ford). The search ends when there is no such cycle.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from typing import Final, NamedTuple
 from trilane.scheduler.events import Graph
 from trilane.transport.slots import MAX_SLOTS, edge_rule
 
-#: Most jobs of a hyperperiod for which cycles are searched. With more, only the units and the source bound the period.
+#: Most jobs of a hyperperiod for which cycles are searched. With more jobs, only units and source give the bound.
 MOST_JOBS: Final = 4096
 LEAST_SLOTS: Final = 2
 NO_SHARES: Final[Mapping[str, Fraction]] = {}
@@ -39,9 +39,10 @@ class PeriodBound:
     """The least period of a graph.
 
     `period_ns`: least time between two frames of the source.
-    `stages`: stages of the cycle that sets the period, in the order of a frame.
-    `limit`: what sets the period: `unit NAME`, `slots`, `in_flight`, or `rate`; "" where no stage takes time.
-    `streams`: stages whose slots are in the cycle.
+    `stages`: stages of the cycle that sets the period, in the order of the graph.
+    `limit`: cause of the period: `unit NAME`, `slots`, `in_flight` (limit of frames in flight), or `rate` (the
+    source's); "" if no stage takes time.
+    `streams`: stages whose output slots are waited for in the cycle.
     """
 
     period_ns: Fraction
@@ -51,11 +52,12 @@ class PeriodBound:
 
 
 class _Arc(NamedTuple):
-    """A wait of the job `to` for the job `job`, both indices in `_Waits.stages`.
+    """A wait of one job for another.
 
-    `to` means this job in the hyperperiod that is `tokens` later. It begins at least `ns` after the begin of `job`.
-
-    `stream`: stage for whose slot the job waits; "" for another wait.
+    `job`: index, in `_Waits.stages`, of the job that ends the wait.
+    `to`: index of the waiting job, in the hyperperiod that is `tokens` hyperperiods later.
+    `ns`: least time from the begin of `job` to the begin of `to`.
+    `stream`: stage for whose output slot the job waits; "": it waits for something else.
     `in_flight`: whether the job waits because of the limit of frames in flight.
     """
 
@@ -70,7 +72,7 @@ class _Arc(NamedTuple):
 class _Waits:
     """The waits between the jobs of one hyperperiod of a graph.
 
-    Waits for slots are computed for given numbers of slots; the others are computed once.
+    `arcs` computes the waits for slots, for given numbers of slots. All other waits are computed once, here.
     """
 
     def __init__(self, graph: Graph, times_ns: Mapping[str, int], in_flight: int) -> None:
@@ -101,7 +103,7 @@ class _Waits:
         return sorted(found, key=lambda arc: arc.job)
 
     def frame_readers(self, name: str) -> Iterator[str]:
-        """Yield the stages that take the stream of stage `name` frame by frame."""
+        """Yield the names of the stages that read stage `name` by an input without `latest`."""
         for index, stage in enumerate(self.graph.stages):
             if any(each.stage == name and not each.latest for each in self.graph.inputs_of(index)):
                 yield stage.name
@@ -134,7 +136,9 @@ class _Waits:
         If the reader takes every q-th frame, its frames f, f + q, ..., f + (count - 1) q fill all places. Therefore the
         writer's next frame waits until the reader has ended f.
 
-        `step`: distance from the last of these frames to the next frame, in frames.
+        `reader`, `writer`: names of stages.
+        `step`: number of frames from frame f + (count - 1) q to the writer's next frame.
+        `stream`, `in_flight`: as in `_Arc`.
         """
         period, own = self.periods[reader], self.periods[writer]
         for frame in range(0, self.hyperperiod, period):
@@ -167,13 +171,13 @@ def period_bound(
     `times_ns`: time of a job of each stage.
     `in_flight`: limit of frames in flight; 0: none.
     `source_ns`: period of the source in ns; 0: the source is always ready.
-    `shares`: for each stage that some frames skip, the share of frames that do not skip it.
+    `shares`: share (0 to 1) of the frames that do not skip a stage, by the names of the stages that some frames skip.
     """
     return _bound(_Waits(graph, times_ns, in_flight), _slots(graph), source_ns, shares)
 
 
 def _slots(graph: Graph) -> dict[str, int]:
-    """Return the number of slots of each stream whose writer waits for a free one."""
+    """Return the number of slots by stream, for the streams whose writer must wait for a free slot."""
     rules = {name: edge_rule(rule) for name, rule in zip(graph.streams, graph.edges, strict=True)}
     return {name: rule.slots for name, rule in rules.items() if not rule.yields}
 
@@ -195,7 +199,7 @@ def _bound(
 
 
 def _of_units(waits: _Waits, shares: Mapping[str, Fraction]) -> Iterator[PeriodBound]:
-    """Yield for each unit the bound that its work for one frame sets."""
+    """Yield, for each unit, the bound that follows from its work for one frame. `shares`: as in `period_bound`."""
     for unit in waits.graph.units:
         names = tuple(stage.name for stage in waits.graph.stages if stage.unit == unit)
         each = {name: shares.get(name, 1) * Fraction(waits.times_ns[name], waits.periods[name]) for name in names}
@@ -213,7 +217,7 @@ def _of_cycle(waits: _Waits, cycle: Sequence[_Arc], period_ns: Fraction) -> Peri
 
 
 def _positive_cycle(jobs: int, arcs: Sequence[_Arc], ratio: Fraction) -> list[_Arc]:
-    """Return a cycle that takes longer than `ratio` ns for each hyperperiod, or an empty list.
+    """Return the arcs of a cycle that takes longer than `ratio` ns for each hyperperiod; without one, an empty list.
 
     `jobs`: number of jobs.
     `arcs`: waits, sorted by `_Arc.job`, so that one round of the search follows most of them.
@@ -232,9 +236,9 @@ def _positive_cycle(jobs: int, arcs: Sequence[_Arc], ratio: Fraction) -> list[_A
 
 
 def _circle(arcs: Sequence[_Arc], before: Sequence[int]) -> list[_Arc]:
-    """Return a cycle among the arcs in `before`, or an empty list.
+    """Return the arcs of a cycle among the arcs that `before` names; without one, an empty list.
 
-    `before`: index of the arc that delayed each job last, or -1.
+    `before`: for each job, the index of the arc that last made its begin later; -1: no arc did.
     """
     seen = [-1] * len(before)
     for first in range(len(before)):
@@ -254,9 +258,10 @@ def _circle(arcs: Sequence[_Arc], before: Sequence[int]) -> list[_Arc]:
 def fewest_slots(
     graph: Graph, times_ns: Mapping[str, int], given: Collection[str] = (), in_flight: int = 0
 ) -> list[int]:
-    """Return the number of slots of each stream, in the order of `graph.edges`: at least two, and no more than needed.
+    """Return the fewest slots of each stream, at least two, that do not make the period longer.
 
-    The slots do not make the period longer. If any stream with more than two slots had one fewer, it would be longer.
+    The numbers are in the order of `graph.edges`. With one slot fewer in any stream of more than two slots, the period
+    would be longer.
 
     `times_ns`, `in_flight`: as in `period_bound`.
     `given`: names of the streams whose rule stays as it is in `graph`.

@@ -1,10 +1,10 @@
-"""Places for units on cores: every way to place them, the predicted frame time of each, and the choice.
+"""Places units on cores: lists all placements, predicts the frame time of each, and chooses one.
 
 Cores, places and needs of units are plain data. Placements that differ only by an exchange of equal cores count as one
 placement.
 
-Rule: measured times decide, by one formula; nothing is tried here. The formula is not exact. If real frames can be run,
-their measured times decide between the few placements that the formula cannot tell apart.
+Rule: one formula predicts frame times from the units' measured times; nothing is tried here. The formula is not exact.
+If real frames can be run, a trial decides between the few placements that the formula cannot tell apart.
 
 A placement gives each unit cores and threads. Its frame time is predicted from each unit's `UnitWork`: the time that
 the unit needs for a frame, and the time that it takes on each core. Let T be the frame time. In a pipelined run these
@@ -13,14 +13,14 @@ conditions hold:
 - *A unit does one job at a time.* Its jobs of a frame take at most T.
 - *A core does one thing at a time.* The time that all units need on a core is at most T. A unit with one thread and
   several cores *floats*: the kernel runs it on any core that is free. For every set of cores, the work that cannot go
-  to other cores is at most what the set can do in T, less the share that the kernel fails to use. By Hall's condition
-  the work can be divided exactly if this holds for all sets.
+  to other cores is at most the work that the set can do in T. The kernel fails to use a share of this time, which is
+  taken off. By Hall's condition the work can be divided among the cores exactly if this holds for all sets.
 - *Each of a job's parallel regions waits for its slowest thread.* Let other units have core c for the share o(c) of the
-  time. A job of several threads goes on only while all its cores are free. If the other units come independently, this
-  share of the time is the product of 1 - o(c) over its cores. The job's time divided by this share is at most T.
+  time. A job of several threads goes on only while all its cores are free. If the other units come independently, the
+  cores are all free for the share p, the product of 1 - o(c) over the cores. The job's time divided by p is at most T.
 - *Siblings* are cores of one physical core. Together they do `SIBLINGS` times the work that one of them does alone.
 
-The prediction is the least T that meets these conditions. In a sequential run one stage works at any time. Its T is the
+The prediction is the least T that meets these conditions. In a sequential run one stage works at any time, and T is the
 sum of all jobs' times.
 
 A floating unit that has one core to itself *stays* there, because the kernel moves a thread only when it has to wait.
@@ -43,7 +43,7 @@ FULL: Final = 1000
 class CpuCore(NamedTuple):
     """A core of this machine, as the kernel counts cores.
 
-    `number`: number of the core.
+    `number`: the kernel's number of the core.
     `physical`: number of its physical core, the same for siblings.
     `permille`: speed in thousandths, 1000 for the fastest core.
     """
@@ -56,9 +56,9 @@ class CpuCore(NamedTuple):
 class UnitWork(NamedTuple):
     """The work of a unit for a frame, on cores of full speed that the unit has to itself.
 
-    `serial_ns`: time of the unit's jobs.
+    `serial_ns`: sum of the service times of the unit's jobs.
     `core_ns`: time that the jobs take on each of the unit's cores; less than `serial_ns` if a device works for them.
-    `jobs`: number of jobs.
+    `jobs`: number of jobs for a frame.
     """
 
     serial_ns: int
@@ -111,9 +111,10 @@ def busiest_core_ns(placement: Placement, core_ns: Mapping[str, float]) -> float
 
 
 def share_ns(cores: tuple[int, ...], core_ns: float, floats: bool, these: frozenset[int]) -> float:
-    """Return the part of a load that must be done on `these` cores, in ns.
+    """Return the part of a unit's work that must be done on `these` cores, in ns.
 
-    The load takes `core_ns` on each of `cores`. If it floats, it takes `core_ns` on all of them together.
+    `cores`: cores of the unit.
+    `core_ns`: time in ns that the work takes on each of `cores`; if it `floats`, on all of them together.
     """
     if floats:
         return core_ns if these.issuperset(cores) else 0.0
@@ -125,9 +126,9 @@ MOST_FLOATING: Final = 4
 
 
 def placements(cores: Sequence[CpuCore], times: Times, fixed: Placement) -> Iterator[Placement]:
-    """Yield each placement of the units of `times`; those that differ only by an exchange of equal cores count as one.
+    """Yield each placement of the units of `times`; placements that an exchange of equal cores makes alike count once.
 
-    Cores are equal if they have the same speed, the same users and equal siblings. The core with the lowest number
+    Cores are equal if they have the same speed, the same units and equal siblings. The core with the lowest number
     stands for all equal cores. A unit with one thread has one core, or floats between two cores of the same speed.
 
     `fixed`: places of units that stay where they are.
@@ -150,7 +151,11 @@ def placements(cores: Sequence[CpuCore], times: Times, fixed: Placement) -> Iter
 
 
 def _forms(works: Mapping[int, UnitWork], most: int) -> Iterator[tuple[int, int]]:
-    """Yield the numbers (threads, cores) that a unit may have. `most`: number of cores of the run."""
+    """Yield the pairs (number of threads, number of cores) that a unit may have.
+
+    `works`: work of the unit by its number of threads.
+    `most`: number of cores of the run.
+    """
     for threads in works:
         if threads <= most:
             yield threads, threads
@@ -164,7 +169,7 @@ def _equally_fast(cores: Sequence[CpuCore], chosen: Sequence[int]) -> bool:
 
 #: The units that have each core, by the core's number.
 _Users = Mapping[int, frozenset[str]]
-#: A core's speed and users.
+#: A core's speed in thousandths, and the names of its units.
 _CoreSignature = tuple[int, tuple[str, ...]]
 #: The signatures of all cores, grouped by physical core.
 _Signature = tuple[tuple[_CoreSignature, ...], ...]
@@ -173,9 +178,11 @@ _Signature = tuple[tuple[_CoreSignature, ...], ...]
 def _choices(
     cores: Sequence[CpuCore], users: _Users, unit: str, count: int
 ) -> Iterator[tuple[dict[int, frozenset[str]], tuple[int, ...]]]:
-    """Yield each choice of `count` cores for `unit` as (users of each core after the choice, chosen cores).
+    """Yield each choice of `count` cores for `unit`, as (`users` after the choice, numbers of the chosen cores).
 
     Choices that differ only by an exchange of equal cores count as one.
+
+    `users`: units that each core has before the choice, by the core's number.
     """
     states = [dict(users)]
     for _ in range(count):
@@ -208,7 +215,7 @@ def _siblings(cores: Sequence[CpuCore], core: CpuCore, users: _Users) -> tuple[_
 
 
 def _signature(cores: Sequence[CpuCore], users: _Users) -> _Signature:
-    """Return a value that an exchange of equal cores does not change: the sorted signatures of physical cores."""
+    """Return a value that stays the same if equal cores are exchanged: the sorted signatures of all physical cores."""
     groups: dict[int, list[_CoreSignature]] = {}
     for core in cores:
         groups.setdefault(core.physical, []).append(_own_signature(core, users))
@@ -243,7 +250,10 @@ class Rules(NamedTuple):
 
 
 def frame_ns(placement: Placement, cores: Sequence[CpuCore], times: Times, rules: Rules) -> int:
-    """Return the predicted frame time in ns."""
+    """Return the predicted frame time of `placement` in ns.
+
+    `cores`: cores of the run. `times`: work of each unit. `rules`: properties of the run.
+    """
     model = _Model(placement, cores, times, rules)
     return model.sum_ns() if rules.sequential else model.pipelined_ns()
 
@@ -251,9 +261,9 @@ def frame_ns(placement: Placement, cores: Sequence[CpuCore], times: Times, rules
 class _Load(NamedTuple):
     """The work of a unit, or of the scheduler, for a frame on its cores.
 
-    `serial_ns`: time that the unit needs for its jobs.
-    `core_ns`: time that it takes on each of its cores; if it `floats`, on all of them together.
-    `work_ns`: `core_ns` without the slowing of siblings by each other.
+    `serial_ns`: time that the unit needs for its jobs; 0 for the scheduler.
+    `core_ns`: time that the work takes on each of `cores`; if it `floats`, on all of them together.
+    `work_ns`: like `core_ns`, but as if siblings did not slow each other.
     """
 
     cores: tuple[int, ...]
@@ -270,7 +280,7 @@ class _Load(NamedTuple):
 
 
 def _settled(placement: Placement) -> Placement:
-    """Return `placement`, but each floating unit that has one core to itself has only that core."""
+    """Return `placement`, with one change: a floating unit that has one core to itself has only this core."""
     shared = shared_cores(placement)
     settled = dict(placement)
     for unit, place in placement.items():
@@ -282,7 +292,7 @@ def _settled(placement: Placement) -> Placement:
 
 
 class _Model:
-    """The model of one placement."""
+    """Predicts the frame time of one placement, by the conditions in the module's docstring."""
 
     def __init__(self, placement: Placement, cores: Sequence[CpuCore], times: Times, rules: Rules) -> None:
         self._speed = {core.number: core.permille / FULL for core in cores}
@@ -303,7 +313,7 @@ class _Model:
     def _load(self, place: Place, work: UnitWork, cost_ns: int) -> _Load:
         """Return the load of a unit. The slowest of its cores sets the speed, and two used siblings slow each other.
 
-        `cost_ns`: time in ns for changes of threads and moves.
+        `cost_ns`: time in ns of a frame that changes of threads, and moves to other cores, take.
         """
         floats = place.threads < len(place.cores)
         speed = min(self._speed[core] for core in place.cores)
@@ -349,13 +359,13 @@ class _Model:
 
     @staticmethod
     def _within(load: _Load, these: frozenset[int]) -> float:
-        """Return the part of a load that must be done on `these` cores."""
+        """Return the part of a load that must be done on `these` cores, in ns."""
         return share_ns(load.cores, load.core_ns if len(these) == 1 else load.work_ns, load.floats, these)
 
     def _capacity(self, these: frozenset[int]) -> float:
-        """Return the work that a set of cores does in a time, as a multiple of the work of one core.
+        """Return how many cores the set `these` is worth: siblings together count SIBLINGS, every other core 1.
 
-        The loads are already scaled to the cores' speeds, so each core counts 1.
+        The cores' speeds do not matter here, because the loads are already scaled to them.
         """
         counts = [sum(self._physical[core] == one for core in these) for one in self._physical_cores]
         return sum(SIBLINGS if count > 1 else count for count in counts)
@@ -374,7 +384,7 @@ class _Gang(NamedTuple):
     """A unit of several threads, each on a core of its own.
 
     `serial_ns`, `core_ns`: times of its jobs, as in `_Load`.
-    `others_ns`: for each of its cores, the time of other loads on this core, and on the core's siblings.
+    `others_ns`: for each of its cores, the time in ns of other loads on (this core, the core's siblings).
     """
 
     serial_ns: float
@@ -391,7 +401,7 @@ class _Gang(NamedTuple):
         return self.serial_ns - self.core_ns + self.core_ns / max(free, LEAST_FREE) <= frame
 
 
-#: Relative difference from the shortest prediction that counts as none; the model's own error is not smaller.
+#: Predictions whose relative difference from the shortest is at most this count as equal; the model is not more exact.
 WORTH: Final = 0.03
 #: Relative difference from the shortest prediction up to which a placement may still be the best.
 UNCERTAIN: Final = 0.25
@@ -409,13 +419,14 @@ class Ranked(NamedTuple):
 
 
 def ranked(cores: Sequence[CpuCore], times: Times, rules: Rules, fixed: Placement | None = None) -> list[Ranked]:
-    """Return all placements, the shortest frame time first.
+    """Return all placements with their predicted frame times, the shortest first.
 
-    Ties go to fewer shared cores, then less floating work, less time in all stages (latency), lower core numbers.
+    Of equal frame times, the placement with fewer shared cores comes first. Further ties go to less floating work, less
+    time of all stages together (latency), lower core numbers.
 
     `fixed`: places of units that stay where they are.
 
-    Raises ValueError for no cores, or for a unit that has no number of threads that fits the cores.
+    Raises ValueError if there are no cores, or if every listed number of threads of a unit exceeds the cores.
     """
     found = [Ranked(each, frame_ns(each, cores, times, rules)) for each in placements(cores, times, fixed or {})]
     if not found:
@@ -430,7 +441,7 @@ def chosen(found: Sequence[Ranked], rule: Ranked) -> Ranked:
     shared cores is used, among the placements within WORTH of the shortest.
 
     `found`: placements in the order of `ranked`.
-    `rule`: placement that suits any run.
+    `rule`: default placement, which suits any run.
     """
     near = [each for each in found if each.frame_ns * (1 - WORTH) <= found[0].frame_ns]
     if rule.frame_ns * (1 - WORTH) <= found[0].frame_ns:
@@ -439,9 +450,10 @@ def chosen(found: Sequence[Ranked], rule: Ranked) -> Ranked:
 
 
 def worth_trying(found: Sequence[Ranked], rule: Ranked) -> list[Ranked]:
-    """Return at most MOST_TRIED placements of `found` that may be the best, in the order of `found`.
+    """Return at most MOST_TRIED placements that may be the best.
 
-    The placement that `chosen` returns comes first, and `rule` second if it is another one.
+    The placement that `chosen` returns comes first, and then `rule`, if it differs. The others follow in the order of
+    `found`.
 
     `found`, `rule`: as for `chosen`.
     """
@@ -452,12 +464,12 @@ def worth_trying(found: Sequence[Ranked], rule: Ranked) -> list[Ranked]:
 
 
 def typical(rounds: Sequence[Sequence[float]]) -> list[float]:
-    """Return a frame time for each placement, in the unit of `rounds`, that slow rounds do not distort.
+    """Return a frame time for each placement, in the unit of measure of `rounds`. Slow rounds do not distort it.
 
     Each time is divided by the median of its round, because a slow second of the machine slows all placements alike.
     The result is the median of these ratios over the rounds, times the median of the rounds' medians.
 
-    `rounds`: frame times of all placements, for each round.
+    `rounds`: for each round, the frame times of all placements, in the same order.
     """
     medians = [median(times) for times in rounds]
     relative = [[frame / middle for frame in times] for times, middle in zip(rounds, medians, strict=True)]
@@ -477,6 +489,6 @@ def _tie(placement: Placement, times: Times) -> tuple[tuple[int, ...], tuple[tup
 
 
 def _sharing(placement: Placement) -> int:
-    """Return the number of pairs of a shared core and a unit that has it."""
+    """Return for how many pairs (unit, core) the unit shares the core with another unit."""
     shared = shared_cores(placement)
     return sum(len(shared.intersection(place.cores)) for place in placement.values())

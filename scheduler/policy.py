@@ -1,26 +1,27 @@
 """Decisions about a frame before its first job: the run's policy, the frame's release, and how much work it gets.
 
-Rule: a policy is a row of the table; policies differ only in their rows. Runs on this machine and runs in virtual time
-take their settings from here, so that a policy means the same on both clocks. The source queues frames within limits:
-each frame is taken once, or counted as dropped.
+Rule: a policy is a row of the table `POLICIES`; policies differ only in their rows. Runs on this machine and runs in
+virtual time take their settings from here, so that a policy means the same on both clocks. The source queues frames
+within limits: each frame is taken once, or counted as dropped.
 
-A frame that would be late gets less work. Rule: measured times decide; less work is chosen at once, more work only
-later. A ladder has rungs: rung 0 is all the work, and each further rung is less work at the price of a worse picture.
-Some stages take less time for less work (the network); the other stages are assumed to need the same time.
+A frame that would be late gets less work. A ladder has rungs: rung 0 is all the work, and each further rung is less
+work at the price of a worse picture. Rule: measured times decide; less work is chosen at once, more work only later.
+Some stages take less time for less work (the network); the other stages are assumed to need the same time on all rungs.
 
-The time of a stage on a rung is its isolated time there, times its load. The isolated time is measured (`set_alone`),
-or else proportional to the work. The load is the ratio of a job's time to the stage's isolated time. The median over
-the stage's last three jobs counts, so that one slow job decides nothing.
+The time of a stage on a rung is its isolated time on this rung, times its load. The isolated time is measured
+(`set_alone`), or else proportional to the work. The load is the ratio of a job's time to the stage's isolated time. The
+median over the stage's last three jobs counts, so that one slow job decides nothing.
 
-The use of a rung is the larger of two shares:
-- the busiest unit's time for a frame, as a share of the period;
-- the time of all stages, as a share of the deadline.
+The use of a rung is the larger of two ratios:
+- the busiest unit's time for a frame, divided by the period;
+- the time of all stages for a frame, divided by the time from release to deadline.
 
 The wanted rung is the first whose use is at most `FULL`. Without such a rung, it is the first rung whose use exceeds
 the least use by at most a twentieth, because less work would save nothing.
 
-The ladder steps down at once. It takes one step up after `patience` frames in which the use of the rung above was at
-most `ROOM`. If the ladder steps down again sooner than that, the patience doubles, up to `MOST_PATIENCE`.
+The ladder changes at once to a rung of less work. It returns to more work by one rung, after `patience` successive
+frames in which that rung's use was at most `ROOM`. If it must leave that rung within `patience` frames, the patience
+doubles, up to `MOST_PATIENCE`.
 """
 
 from __future__ import annotations
@@ -36,9 +37,10 @@ from trilane.unexpected_value import UnexpectedValue
 
 
 class Candidate(NamedTuple):
-    """A job that could start now.
+    """A job that could begin now.
 
-    `position`: position of its stage in the chain.
+    `frame`: number of its frame.
+    `position`: index of its stage in the graph.
     `deadline_ns`: deadline of its frame, or NEVER.
     """
 
@@ -48,30 +50,30 @@ class Candidate(NamedTuple):
 
 
 def oldest_frame(candidates: Sequence[Candidate]) -> Candidate:
-    """Choose the oldest frame; along a chain this keeps the edges empty and the latency low."""
+    """Choose the job of the oldest frame; along a chain this keeps the edges empty and the latency low."""
     return min(candidates)
 
 
 def furthest_stage(candidates: Sequence[Candidate]) -> Candidate:
-    """Choose the last of the stages; the newest frame first would starve the later stages of a shared unit."""
+    """Choose the job of the last stage; to choose the newest frame would starve the later stages of a shared unit."""
     return max(candidates, key=lambda c: c.position)
 
 
 def earliest_deadline(candidates: Sequence[Candidate]) -> Candidate:
-    """Choose the earliest deadline; ties go to the older frame."""
+    """Choose the job whose frame has the earliest deadline; ties go to the older frame."""
     return min(candidates, key=lambda c: (c.deadline_ns, c.frame))
 
 
 @dataclass(frozen=True)
 class Policy:
-    """One row of the table.
+    """One row of `POLICIES`.
 
-    `choose`: function that says which of several runnable jobs a unit takes.
+    `choose`: function that returns the job that a unit takes, from the jobs that could begin.
     `in_flight`: limit of frames between admission and presentation; 0: the policy sets no limit.
-    `newest`: whether a stage takes the newest waiting frame; the other waiting frames are stale.
-    `drop_late`: whether a frame that cannot make its deadline is dropped before its next stage.
-    `lead_ns`: time before the expected end of a unit's job at which the unit gets its next job; 0: as soon as there is
-    one.
+    `newest`: whether a stage takes the newest waiting frame; all older waiting frames are stale and dropped.
+    `drop_late`: whether a frame that cannot meet its deadline is dropped before its next stage.
+    `lead_ns`: time before the expected end of a unit's job at which the unit gets its next job; 0: the unit gets the
+    next job as soon as there is one.
     `paced`: whether the policy needs a rate: a period, arrivals or frame requests.
     """
 
@@ -107,7 +109,7 @@ def run_settings(policy: str, frames: int, scene_period_ns: int, forced_period_n
 
     `scene_period_ns`: period of the scene's rate in ns. Under `latest` and `deadline`, which need a rate, it is the
     period of releases. Under other policies a frame is released as soon as it can be taken.
-    `forced_period_ns`: period of releases under every policy; 0: as above.
+    `forced_period_ns`: period of releases in ns under every policy; 0: `scene_period_ns` decides.
     `others`: further fields of Settings.
 
     Raises UnexpectedValue for an unknown policy.
@@ -166,7 +168,7 @@ class Source:
 
     @property
     def left(self) -> int:
-        """The number of frames that were taken or dropped here."""
+        """The number of frames that were taken from the source, or dropped by it."""
         return self._next - self._forgotten - len(self.queue)
 
     @property
@@ -198,20 +200,20 @@ class Source:
         self._set_due()
 
     def hold(self, frames: int, now_ns: int) -> None:
-        """Release `frames` frames and no more until the next call; -1 ends the hold."""
+        """Release `frames` frames now, and no others until the next call; -1 ends the hold."""
         if frames >= 0:
             self._held = True
             self.request(frames, now_ns)
         elif self._held:
             self._held = False
             if self._paced and not self._settings.asked and self._next < self._end:
-                # The schedule is moved on, so that the frames that came due in the hold are not all released at its
-                # end.
+                # All release times move to later times. Else every frame that came due in the hold would be released
+                # when it ends.
                 self._start_ns += now_ns - self._release_ns(self._next)
             self._set_due()
 
     def head(self, now_ns: int) -> tuple[int, int]:
-        """Return the next frame's number and its release time in ns; only valid if `is_empty` is False."""
+        """Return (number, release time in ns) of the next frame; only valid if `is_empty` is False."""
         return self.queue[0] if self.queue else (self._next, now_ns)
 
     def keep_newest(self) -> None:
@@ -226,7 +228,7 @@ class Source:
         self._set_due()
 
     def take(self, now_ns: int) -> tuple[int, int]:
-        """Remove the next frame, and return its number and its release time in ns."""
+        """Remove the next frame, and return its (number, release time in ns)."""
         head = self.head(now_ns)
         if self.queue:
             self.queue.popleft()
@@ -271,7 +273,8 @@ class WorkLadder:
     """The ladder of a run.
 
     `rung`: rung of the frames that begin from now on.
-    `patience`: number of frames in a row with room that the next step up needs.
+    `patience`: number of frames with room in a row, after which the ladder returns to more work.
+    `last`: position of the last stage whose time follows the work; -1: none.
     """
 
     def __init__(
@@ -285,8 +288,8 @@ class WorkLadder:
         """Begin at rung 0.
 
         `stages`: stages of the chain.
-        `works`: work of each rung in thousandths, in falling order from ALL.
-        `follow`: names of the stages whose time follows the work.
+        `works`: work of each rung in thousandths of all the work, from ALL downwards.
+        `follow`: names of the stages that take less time for less work.
         `period_ns`: period of frames, more than 0.
         `deadline_ns`: longest time from a frame's release to its presentation; 0: none.
         """
@@ -302,7 +305,10 @@ class WorkLadder:
         self._since_up = MOST_PATIENCE
 
     def set_alone(self, position: int, rung: int, service_ns: int) -> None:
-        """Set the isolated time of the stage at `position` on `rung`; to be called for all rungs or for none."""
+        """Set a stage's isolated time on `rung`, in ns. Call this for all rungs of a stage, or for none.
+
+        `position`: position of the stage.
+        """
         self._alone[position][rung] = max(service_ns, 1)
 
     def learn(self, position: int, rung: int, service_ns: int) -> None:
@@ -310,7 +316,7 @@ class WorkLadder:
         self._loads[position].append(service_ns * LOAD_ONE // self._alone[position][rung])
 
     def service_ns(self, position: int, rung: int) -> int:
-        """Return the time that the stage at `position` would take now on `rung`; 0 before its first job."""
+        """Return the time in ns that the stage at `position` would take now on `rung`; 0 before its first job."""
         loads = sorted(self._loads[position])
         return self._alone[position][rung] * loads[len(loads) // 2] // LOAD_ONE if loads else 0
 
@@ -326,7 +332,7 @@ class WorkLadder:
         return max(busiest, sum(of_units.values()) * ALL // self._deadline_ns)
 
     def consider(self) -> bool:
-        """Choose the rung, once for each frame that was measured, and return whether it changed."""
+        """Choose the rung, and return whether it changed. Call this once for each frame, after its jobs are learnt."""
         uses = [self.use(rung) for rung in range(self._rungs)]
         wanted = _first_that_does(uses)
         self._since_up += 1

@@ -1,6 +1,6 @@
 """Records the steps of a run: its events and the core's actions.
 
-Rule: a replay gives the same actions, or says which step gives others.
+Rule: a replay gives the same actions, or says at which steps the actions differ.
 """
 
 from __future__ import annotations
@@ -32,12 +32,15 @@ from trilane.scheduler.state import UnitLifeError
 from trilane.unexpected_value import UnexpectedValue
 
 SCHEMA = 7
-#: Actions that carry one tuple, whose fields are written in place of the action's own.
+#: Actions with one field, a tuple: the fields of this tuple are written as if they were the action's.
 CARRIED: dict[Any, Any] = {Dispatch: Job, Finish: Outcome}
 
 
 def _forms(kinds: tuple[Any, ...]) -> dict[str, tuple[Any, dict[str, Any]]]:
-    """Return (class, types of its fields by name, in the order of a row) of each event or action, by class name."""
+    """Return, for each class of event or action by its name, (class, types of its fields by name).
+
+    The fields are in the order of a row (`row_of`).
+    """
     return {kind.__name__: (kind, get_type_hints(CARRIED.get(kind, kind))) for kind in kinds}
 
 
@@ -48,8 +51,8 @@ _EVENTS, _ACTIONS = _forms(EVENTS), _forms(ACTIONS)
 class Recording:
     """The steps of one run, as tuples (now_ns, events, actions).
 
-    `accounts`: (now_ns, unit, account) for each step that left a unit with another account (ledger.py) than the step
-    before. They are not written, because a replay gives them again.
+    `accounts`: (time in ns, unit, account) for each change of a unit's account (ledger.py): from this time on, the unit
+    has this account. `accounts` is not written, because a replay gives it again.
     """
 
     graph: Graph
@@ -59,7 +62,7 @@ class Recording:
     _account_of: dict[str, int] = field(default_factory=dict, compare=False, repr=False)
 
     def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
-        """Note a step of `core` that has just been taken."""
+        """Add a step that `core` has just taken."""
         self.steps.append((now_ns, events, actions))
         for unit in core.units.values():
             if self._account_of.get(unit.name) != unit.account:
@@ -80,9 +83,9 @@ def header_line(graph: Graph, settings: Settings) -> str:
 
 
 def step_line(now_ns: int, events: Iterable[Event], actions: Iterable[Action]) -> str:
-    """Return the line of a step, an object of `t`, `events` and `actions`.
+    """Return the line of a step: a JSON object with the keys `t` (ns), `events` and `actions`.
 
-    Each event or action is an object of its name and its fields.
+    Each event or action is an object with its fields, and its name under `event` or `action`.
     """
     told = [{"event": type(event).__name__, **_fields_of(event)} for event in events]
     answered = [{"action": type(action).__name__, **_fields_of(action)} for action in actions]
@@ -95,7 +98,7 @@ def _fields_of(item: Any) -> dict[str, Any]:
 
 
 def read(path: Path) -> Recording:
-    """Return the recording at `path`. Raises BadInputError naming the line that is not part of a recording."""
+    """Return the recording at `path`. Raises BadInputError, which names the first wrong line."""
     number = 0
     try:
         with path.open(encoding="utf-8") as file:
@@ -157,7 +160,11 @@ def actions_of(rows: Iterable[Sequence[Any]]) -> tuple[Action, ...]:
 
 
 def _listed(row: Mapping[str, Any], key: str, forms: dict[str, tuple[Any, dict[str, Any]]]) -> list[Any]:
-    """Return an event or action from its JSON object as a row (`row_of`).
+    """Return the row (`row_of`) of an event or action.
+
+    `row`: its JSON object.
+    `key`: key of its name, "event" or "action".
+    `forms`: result of `_forms`.
 
     Raises UnexpectedValue for an unknown name, and for missing or further fields.
     """
@@ -169,16 +176,16 @@ def _listed(row: Mapping[str, Any], key: str, forms: dict[str, tuple[Any, dict[s
 
 
 def _form(name: Any, forms: dict[str, tuple[Any, dict[str, Any]]]) -> tuple[Any, dict[str, Any]]:
-    """Return the row of `forms` for `name`. Raises UnexpectedValue for an unknown name."""
+    """Return the entry of `forms` for `name`. Raises UnexpectedValue for an unknown name."""
     if not isinstance(name, str) or name not in forms:
         raise UnexpectedValue(repr(str(name)[:80]), f"one of {', '.join(forms)}")
     return forms[name]
 
 
 def _parse(row: Sequence[Any], forms: dict[str, tuple[Any, dict[str, Any]]]) -> Any:
-    """Return the event or action of a row.
+    """Return the event or action that was written as `row` (`row_of`).
 
-    Raises UnexpectedValue for a wrong name, type of a field or kind of outcome.
+    Raises UnexpectedValue for an unknown name, a field of a wrong type, or an unknown kind of outcome.
     """
     name, *fields = row
     kind, hints = _form(name, forms)
@@ -191,7 +198,7 @@ def _parse(row: Sequence[Any], forms: dict[str, tuple[Any, dict[str, Any]]]) -> 
 
 
 def graph_of(data: Mapping[str, Any]) -> Graph:
-    """Return the graph that was written as `data`. Raises KeyError or TypeError for other data."""
+    """Return the graph that `Graph.written` gave as `data`. Raises KeyError or TypeError for other data."""
     bypass = data["bypass"]
     ends = None if bypass is None else (bypass[0], bypass[1])
     stages = tuple(_stage_of(stage) for stage in data["stages"])
@@ -205,6 +212,6 @@ def _stage_of(data: Mapping[str, Any]) -> StageSpec:
 
 
 def settings_of(data: Mapping[str, Any]) -> Settings:
-    """Return the settings that were written as `data`. Raises TypeError for other data."""
+    """Return the settings from `data`, their fields by name. Raises TypeError for other data."""
     fields: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in data.items()}
     return Settings(**fields)

@@ -1,20 +1,20 @@
 """Runs several pipelines in virtual time on the same hardware, each with a scheduler (`Core`) of its own.
 
-Rule: nothing here decides which job a pipeline does next; its `Core` decides that. This module decides whose job a unit
+Rule: the `Core` of a pipeline decides which of the pipeline's jobs comes next. This module decides whose job a seat
 takes when several pipelines have handed it one. It also decides the speed of jobs that run at the same time.
 
-Theory of operation. Each pipeline has its own `Core` with its own policy, ledger and recording, like two applications
-on one phone, and none knows of the others. Each unit of a pipeline has a *seat*: the hardware that does its jobs. On a
-seat with turns one job runs at a time; the others wait, and their units are preempted. On a *divided* seat all jobs run
-at once, each with an equal share. An example is a core of this machine: the kernel switches between the processes on
-it. A unit does its own jobs in the order in which they were handed to it.
+Theory of operation. Each pipeline has its own `Core` with its own policy, ledger and recording. Like applications on
+one phone, the pipelines do not know of each other. Each unit of a pipeline has a *seat*: the hardware that does its
+jobs. On a seat with turns one job runs at a time. The other jobs wait, and their units are preempted. On a *divided*
+seat all jobs run at once, each with an equal share. An example is a core of this machine: the kernel switches between
+the processes on the core. A unit does its own jobs in the order in which they were handed to it.
 
-Turns. The first waiting job of each pipeline is a candidate, and a row of `TURNS` chooses one. A running job is never
-taken off its unit. Source of `deadline`: Liu and Layland, Journal of the ACM 20 (1973).
+Turns. The first waiting job of each pipeline is a candidate, and a rule of `TURNS` chooses one. A running job is never
+taken off its seat. Source of the rule `deadline`: Liu and Layland, Journal of the ACM 20 (1973).
 
-At one instant, all events and all deadlines of the schedulers come first; each is a step of one `Core`. Only then do
-jobs begin, so that no ready job is passed over because it was named later. Running jobs change their speed when others
-begin or end. The work that is left of a job is kept as a whole number, in units of ns / `ONE`.
+At one instant, all events and all deadlines of the schedulers come first; each of them is a step of one `Core`. Only
+then do jobs begin, so that the choice sees every job that is ready at this instant. Running jobs change their speed
+when other jobs begin or end. The work that is left of a job is kept as a whole number, in units of ns / `ONE`.
 
 Accounts. If a job waits while another pipeline has its seat, this time counts as preempted before the job
 (`JobDone.preempted_before_ns`). On a divided seat, the share of the other jobs counts as preempted within the job
@@ -41,12 +41,12 @@ ROUND_ROBIN: Final = "round-robin"
 
 
 class Waiting(NamedTuple):
-    """The first job of a pipeline that waits for the unit.
+    """The first job of a pipeline that waits for a seat.
 
-    `behind`: number of pipelines before this one, counted in turn from the one that had the unit last. 0 is the next in
-    turn; the pipeline that had the unit last comes last.
+    `behind`: number of pipelines whose turn comes before this one's; 0 for the pipeline after the one that had the seat
+    last, whose own number is the largest.
     `deadline_ns`: deadline of the job's frame, or NEVER.
-    `order`: number that grows with each job handed out.
+    `order`: number that grows with each hand-over of a job to a unit.
     """
 
     behind: int
@@ -55,14 +55,14 @@ class Waiting(NamedTuple):
 
 
 def _in_turn(waiting: Sequence[Waiting]) -> Waiting:
-    """Choose the job of the next pipeline in turn, so that each waiting pipeline gets one job after the other."""
+    """Choose the job of the next pipeline in turn, so that waiting pipelines get one job each, one after another."""
     return min(waiting, key=lambda job: (job.behind, job.order))
 
 
 def _earliest_deadline(waiting: Sequence[Waiting]) -> Waiting:
-    """Choose the job whose frame must be presented first; of equal deadlines, the next in turn.
+    """Choose the job whose frame has the earliest deadline; of equal deadlines, the next in turn.
 
-    Jobs without a deadline come last. If the pipelines need more than the unit can do, such jobs may never run.
+    Jobs without a deadline come last. If the other pipelines keep the seat busy, these jobs never run.
     """
     return min(waiting, key=lambda job: (job.deadline_ns, job.behind, job.order))
 
@@ -74,7 +74,7 @@ TURNS: Final[dict[str, Callable[[Sequence[Waiting]], Waiting]]] = {
 
 
 def _turns_named(name: str) -> Callable[[Sequence[Waiting]], Waiting]:
-    """Return the row of `TURNS`. Raises UnexpectedValue for an unknown name."""
+    """Return the rule of `TURNS` with this name. Raises UnexpectedValue for an unknown name."""
     if name not in TURNS:
         raise UnexpectedValue(f"turns {name!r}", f"one of {', '.join(TURNS)}")
     return TURNS[name]
@@ -89,9 +89,8 @@ class Member:
     """One of the pipelines.
 
     `graph`, `settings`: graph and settings of its core.
-    `service`: function that returns the service time of each job in ns on hardware that no other pipeline uses
-    meanwhile.
-    `seats`: seat of each unit, by unit; a unit that is missing has the seat of its own name.
+    `service`: function that returns the service time of a job in ns, while no other pipeline uses the hardware.
+    `seats`: name of each unit's seat, by the unit's name; a missing unit has the seat of its own name.
     `skips`: function that says which frames take the graph's bypass.
     `inputs`: events from outside, such as `Stop`, as pairs (t_ns, event).
     """
@@ -106,7 +105,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Runs:
-    """A job that runs. `member`: index of its pipeline."""
+    """A job that runs. `member`: index of its pipeline in the list of members."""
 
     member: int
     stage: str
@@ -115,13 +114,13 @@ class Runs:
     frame: int
 
 
-#: (a job that runs, the other jobs that run) -> the job's speed beside them, above 0, in units of 1 / ONE. Shares of
-#: seats are not part of this speed.
+#: Function of (a running job, all other running jobs) that returns the first job's speed beside the others, above 0, in
+#: units of 1 / ONE. The job's share of its seat is not part of this speed.
 Speed = Callable[[Runs, Sequence[Runs]], int]
 
 
 class _Waits(NamedTuple):
-    """A job that was handed to its unit. `order`: number that grows with each hand-over."""
+    """A job that was handed to its unit at `dispatch_ns`. `order`: number that grows with each hand-over."""
 
     job: Job
     order: int
@@ -134,9 +133,9 @@ class _Running:
     `left`: work that is left, in units of ns / ONE.
     `speed`: its present speed, in units of 1 / ONE.
     `held`: its present share of its seat, in units of 1 / ONE.
-    `had`: sum of its shares of the seat over the time so far, in units of ns / ONE.
-    `preempted_before_ns`: time for which its unit waited for the seat, from the hand-over or the end of the unit's last
-    job.
+    `had`: its share of the seat, summed over the time so far, in units of ns / ONE.
+    `preempted_before_ns`: time for which its unit waited for the seat. The wait begins with the hand-over or with the
+    end of the unit's last job, whichever is later.
     """
 
     __slots__ = ("begin_ns", "had", "held", "left", "preempted_before_ns", "runs", "speed", "waited")
@@ -148,12 +147,12 @@ class _Running:
         self.had = 0
 
     def end_ns(self, now_ns: int) -> int:
-        """Return when the job ends if its speed stays; a job with nothing left ends now."""
+        """Return the time in ns at which the job ends if its speed stays; if no work is left, `now_ns`."""
         return now_ns - (-self.left // self.speed) if self.left > 0 else now_ns
 
 
 class _Unit:
-    """A unit of one pipeline. `queue`: its waiting jobs."""
+    """A unit of one pipeline. `queue`: its waiting jobs, the first handed over first."""
 
     __slots__ = ("is_running", "last_end_ns", "name", "queue", "seat")
 
@@ -191,9 +190,10 @@ class BesideDriver:
     ) -> None:
         """Prepare a run of the pipelines `members`.
 
-        `turns`: name of a rule of `TURNS`, for every seat that is not among the `divided` ones.
+        `turns`: name of a rule of `TURNS`, for every seat that is not divided.
         `divided`: names of the divided seats.
-        `speed`: function that returns a job's speed beside other jobs; None: only its share of its seat slows a job.
+        `speed`: function that returns a job's speed beside other jobs; None: a job is slowed only by its share of its
+        seat.
         `keep`: whether to record the steps of each `Core`, and the jobs that end.
 
         Raises ValueError for an unknown policy, edge or rule of turns.
@@ -212,7 +212,10 @@ class BesideDriver:
                 self._push(at_ns, line.number, event)
 
     def run(self) -> list[Outcome]:
-        """Run until every `Core` finishes. Raises RuntimeError if nothing can ever happen again."""
+        """Run until every `Core` finishes, and return how each ended, in the order of the members.
+
+        Raises RuntimeError if nothing can ever happen again.
+        """
         while not all(line.core.finished for line in self.lines):
             self._advance(self._next_ns())
             while self._step_one():
@@ -223,7 +226,7 @@ class BesideDriver:
         return [line.core.outcome for line in self.lines if line.core.outcome is not None]
 
     def _next_ns(self) -> int:
-        """Return the time at which something happens next."""
+        """Return the time in ns at which something happens next."""
         at_ns = min((line.deadline_ns for line in self.lines), default=NEVER)
         if self._heap:
             at_ns = min(at_ns, self._heap[0][0])
@@ -241,9 +244,9 @@ class BesideDriver:
                 running.had += passed_ns * running.held
 
     def _step_one(self) -> bool:
-        """Give one `Core` one thing that happens now: an event, a job's end, or the core's deadline.
+        """Let one `Core` take one step for an event, a job's end or a deadline that is due now.
 
-        Return False if nothing more happens now.
+        Return False if nothing is due any more.
         """
         now_ns = self._now_ns
         if self._heap and self._heap[0][0] <= now_ns:
@@ -276,9 +279,9 @@ class BesideDriver:
 
     @staticmethod
     def _check(line: _Line, action: Action) -> None:
-        """Raise RuntimeError if a core that has not finished returns anything but a dispatch.
+        """Raise RuntimeError if a core returns an action other than a dispatch before it has finished.
 
-        It does so only for a unit that seems to hang. In virtual time every job ends, so `hang_ns` is too short then.
+        A core does so only for a unit that seems to hang. In virtual time every job ends, so `hang_ns` is too short.
         """
         if not line.core.finished:
             raise RuntimeError(f"{action} of pipeline {line.number}: its hang_ns is shorter than a job takes")
@@ -338,7 +341,7 @@ class BesideDriver:
         self._running.append(_Running(waited, runs, now_ns, service_ns, before_ns))
 
     def _set_speeds(self) -> None:
-        """Set the speeds of all jobs that run, now that others began or ended."""
+        """Set the speeds of all running jobs, after a job has begun or ended."""
         self._is_changed = False
         if not self._divided and self._speed is None:
             return
@@ -361,8 +364,8 @@ class BesideDriver:
 def simulate_beside(members: Sequence[Member], *, keep: bool = False, **driver: Any) -> list[Simulation]:
     """Run all `members` to their ends, and return a Simulation for each, in their order.
 
-    Frames that still waited before the first stage at a `Stop` do not count as requested. The reports have one more
-    key, `response_ms`: times from a frame's release to its presentation, for frames with a deadline.
+    Frames that still waited before the first stage at a `Stop` do not count as requested. In each report the key
+    `response_ms` is added: summary of the times from release to presentation, of the frames with a deadline.
 
     `keep`, `driver`: arguments of BesideDriver, which also lists the errors.
     """

@@ -1,17 +1,17 @@
 """The state of units, stages and frames. Rule: this file holds the state and computes from it; core.py decides.
 
-A time that is not set is NEVER. Only a table changes a unit's life. An event that the table refuses is a defect of the
+A time that is not set is NEVER. Only `TABLE` changes a unit's life. An event that the table refuses is a defect of the
 driver.
 
     down --back-off over--> starting --UnitReady--> ready --too slow--> stopping --UnitDied--> down
 
-A unit has one deadline, and its state says what happens when the deadline passes:
+A unit has one deadline, and its life says what happens when the deadline passes:
 - `down`: the process is started again.
 - `starting`: the start took too long, and the process is killed.
 - `ready`: the running job or the answer to a ping took too long, and the process is killed.
 - `stopping`: there is no deadline, because the process is about to end.
 
-`verdict` says what to do with a unit now, and `next_alarm_ns` says when the next verdict is due.
+`verdict` says what to do with a unit now, and `next_alarm_ns` says when something is to be done next.
 """
 
 from __future__ import annotations
@@ -42,12 +42,13 @@ class DeadlinePassed:
 
 
 class UnitLifeError(Exception):
-    """An event that the table refuses in the unit's state: a defect of the driver, never of the user's input."""
+    """An event that `TABLE` refuses in the unit's life: a defect of the driver, not of the user's input."""
 
 
 # fmt: off
-#: The state that follows each event. The job events move no unit, so core.py need not look them up. A job counts when
-#: it is the first of its unit's queue, also while the unit is stopping; a unit that is down or starting has no jobs.
+#: The life that follows each event. JobDone and JobFailed change no life, so core.py need not look them up. Their job
+#: counts if it is the first in its unit's queue, even while the unit is stopping. A unit that is down or starting has
+#: no jobs.
 TABLE: dict[type, tuple[int, int, int, int]] = {
     #                from DOWN  STARTING  READY     STOPPING
     UnitReady:      (REFUSED,   READY,    REFUSED,  IGNORED),
@@ -62,7 +63,12 @@ TABLE: dict[type, tuple[int, int, int, int]] = {
 
 
 def state_after(unit: str, state: int, event: type) -> int:
-    """Return the state that follows `state`, or IGNORED. Raises UnitLifeError if the table refuses the event."""
+    """Return the life that follows the life `state` after an event, or IGNORED.
+
+    `unit`: name of the unit, for the error message. `event`: class of the event.
+
+    Raises UnitLifeError if the table refuses the event.
+    """
     after = TABLE[event][state]
     if after == REFUSED:
         raise UnitLifeError(f"unit {unit} is {STATES[state]}: {event.__name__} cannot happen")
@@ -76,16 +82,16 @@ FULL_DUTY: Final = 1000
 class UnitState:
     """The state of one unit.
 
-    `life`: state in the table `TABLE`.
-    `deadline_ns`: time from which on the event that this state waits for is late.
-    `queue`: the running job, then the one dispatched ahead.
-    `queue_capacity`: number of jobs that it may hold now (`update_queue_capacity`).
+    `life`: DOWN, STARTING, READY or STOPPING, by the table `TABLE`.
+    `deadline_ns`: time by which the event must come that this life waits for.
+    `queue`: the running job, then the job dispatched ahead.
+    `queue_capacity`: number of jobs that the unit may hold now (`update_queue_capacity`).
     `head_since_ns`: time since which the running job could run.
-    `hold_until_ns`: end of the pause that its duty asks for; NEVER: no pause.
-    `duty`: share of the time for which it may work, in thousandths.
-    `failures`: number of its deaths since it last ended a job.
-    `account`: account of the ledger that gets its time now.
-    `account_ns`: time since which that account gets it.
+    `hold_until_ns`: end of the pause that the unit's duty asks for; NEVER: no pause.
+    `duty`: share of the time for which the unit may work, in thousandths.
+    `failures`: number of the unit's deaths since it last ended a job.
+    `account`: account of the ledger that gets the unit's time now.
+    `account_ns`: time since which this account gets it.
     """
 
     __slots__ = (
@@ -119,16 +125,21 @@ class UnitState:
 
     @property
     def is_ready(self) -> bool:
-        """Whether its process is up and not being stopped."""
+        """Whether the unit's process is up, and does not stop."""
         return self.life == READY
 
     @property
     def awaits_nothing(self) -> bool:
-        """Whether it is ready, has no job and was not pinged, so that only a ping can tell whether it lives."""
+        """Whether the unit is ready, has no job and was not pinged, so that only a ping can tell whether it lives."""
         return self.life == READY and not self.queue and self.deadline_ns == NEVER
 
     def move(self, event: type, deadline_ns: int) -> bool:
-        """Take the table's row for `event` and set `deadline_ns`; return False if the event is ignored.
+        """Change the unit's life by the table's row for `event`, and set its deadline.
+
+        Return False, and change nothing, if the table ignores the event.
+
+        `event`: class of the event.
+        `deadline_ns`: deadline after the event in ns, or NEVER.
 
         Raises UnitLifeError for an event that cannot happen now.
         """
@@ -147,7 +158,7 @@ class UnitState:
             self.queue_capacity = HELD_JOBS if self.duty == FULL_DUTY else 1
 
     def expected_end_ns(self) -> int:
-        """Return when the running job should end by its stage's estimate. Raises IndexError if no job runs."""
+        """Return when, by its stage's estimate, the running job should end, in ns. Raises IndexError if no job runs."""
         name = self.queue[0].stage
         for stage in self.stages:
             if stage.name == name:
@@ -156,10 +167,10 @@ class UnitState:
 
 
 class SourceLine:
-    """The frames that wait for a stage without inputs, with the methods of `EdgeSlots`.
+    """The frames that wait for a stage without inputs; has the methods of `EdgeSlots`.
 
-    A run has such lines if several stages have no inputs, or the only one has `every`. A frame's number serves as its
-    slot.
+    A run has source lines if several stages have no inputs, or if `every` of the only such stage is above 1. The number
+    of a frame serves as its slot.
     """
 
     def __init__(self) -> None:
@@ -173,7 +184,7 @@ class SourceLine:
         self.ready.remove(slot)
 
     def release(self, slot: int) -> None:
-        """Do nothing, because the frame had no memory."""
+        """Do nothing, because a frame has no memory here."""
 
     def pass_by(self, frame: int, _line: int) -> None:
         """Note that the stage no longer waits for `frame`."""
@@ -181,7 +192,7 @@ class SourceLine:
             self.ready.remove(frame)
 
     def give_back(self, slot: int, _line: int = 0, _keeps: Keeps | None = None) -> list[int]:
-        """Let a taken frame wait again in its old place."""
+        """Let the taken frame `slot` wait again in its old place. Return the dropped frames: none."""
         place = sum(frame < slot for frame in self.ready)
         self.ready.insert(place, slot)
         return []
@@ -189,7 +200,7 @@ class SourceLine:
 
 @dataclass(frozen=True)
 class Inlet:
-    """An input through which a stage takes one frame after the other.
+    """An input without `latest`: the stage takes one frame after the other.
 
     `edge`: slots that it reads.
     `line`: index, in `edge.lines`, of the slots that wait for the stage.
@@ -207,11 +218,12 @@ class Inlet:
 
 @dataclass(frozen=True)
 class NewestInlet:
-    """An input through which a stage takes the newest frame.
+    """An input with `latest`: the stage takes the newest frame.
 
     `edge`: slots that it reads.
-    `reader`: index, in `edge.newest`, of the slot that it holds.
-    `max_age_ns`: longest age at which the frame is taken; 0: any age.
+    `reader`: index of this input in `edge.newest`.
+    `producer`: stage that fills the slots.
+    `max_age_ns`: longest age in ns at which the frame is taken; 0: any age.
     """
 
     edge: EdgeSlots
@@ -224,19 +236,22 @@ class StageState:
     """The state of one stage.
 
     `estimate_ns`: running mean of its service time in ns (weight 1/8); 0 before the first job.
-    `inlets`: inputs that take frame by frame; `input` is the first one's edge, and `waiting` its line.
-    `others`: waiting lines of the other inputs.
+    `position`: index of the stage in the graph.
+    `input`, `output`: edge of the first of `inlets`, and edge that the stage fills; None if there is none.
+    `inlets`: inputs without `latest`.
+    `waiting`: line of frames that wait at the first of `inlets`.
+    `others`: lines of frames that wait at the further `inlets`.
     `slots_of`: inputs whose slots a job names, in the order of `Job.slot_in`.
     `feeder`: unit that fills the input, if every job of the stage reads one slot of the same edge; else None.
-    `joins`: whether `Job.slot_in` is more than the slot of one input, and must be unpacked.
-    `bypassed`: for the stage at which a bypass ends, the edge whose frames may skip to it.
-    `readers`: stages that read its output frame by frame, in the order of the output's lines.
-    `period`: distance between the frames that it does.
-    `bit`: 1 shifted by its position.
-    `after`: positions of the stages that it reads frame by frame.
+    `joins`: whether `Job.slot_in` stands for the slots of several inputs, and must be unpacked.
+    `bypassed`: for the stage at which a bypass ends, the output edge of the stage at which the bypass begins.
+    `readers`: stages that read the output by an input without `latest`, in the order of the output's lines.
+    `period`: distance between the frames that the stage does, in frames.
+    `bit`: 1 shifted left by `position`.
+    `after`: positions of the stages that the stage reads by an input without `latest`.
     `before`: bits of the stages that must have done a frame before this stage can take it.
     `is_main`: whether the stage has no readers, or a stage without readers needs its work. Other stages do side work,
-    which only inputs of the newest frame take.
+    which is read only by inputs with `latest`.
     """
 
     __slots__ = (
@@ -278,21 +293,21 @@ class StageState:
         self.period, self.bit, self.before = 1, 1 << position, 0
 
     def learn(self, service_ns: int) -> None:
-        """Take one more measured service time into the estimate."""
+        """Add a measured service time in ns to the running mean."""
         self.estimate_ns += (service_ns - self.estimate_ns) >> 3 if self.estimate_ns else service_ns
 
     def lower_estimate(self) -> None:
         """Lower the estimate by a sixteenth.
 
-        The estimate may come from one slow job. While every frame is given up, no other job corrects it.
+        The estimate may come from one slow job. While every frame is dropped as late, no other job corrects it.
         """
         self.estimate_ns -= self.estimate_ns >> 4
 
     def set_inlets(self, inlets: Sequence[Inlet], slots_of: Sequence[Inlet | NewestInlet]) -> None:
         """Set the inputs.
 
-        `inlets`: inputs that take frame by frame.
-        `slots_of`: inputs with slots, including inputs of the newest frame, in the order of the graph.
+        `inlets`: inputs without `latest`.
+        `slots_of`: all inputs that read another stage, with and without `latest`, in the order of the graph.
         """
         self.inlets, self.slots_of = tuple(inlets), tuple(slots_of)
         if inlets:
@@ -307,17 +322,18 @@ class StageState:
 class FrameState:
     """The state of one frame in flight.
 
-    `position`: position of its next stage in a chain.
-    `release_ns`: time of its release.
-    `ready_ns`: time at which the inputs of each stage were there, by the stage's position.
-    `latency_ns`: time from its sampling to the end of the stage at which the latency ends, once known; else -1.
+    `position`: in a chain, the position of its next stage.
+    `release_ns`, `deadline_ns`: times of its release and of its deadline (or NEVER).
+    `ready_ns`: times from which the inputs of each stage were there, by the stage's position.
+    `sampled_ns`: time of its sampling; -1 until it is known.
+    `latency_ns`: time from its sampling to the end of the stage at which the latency ends; -1 until it is known.
     `skips`: whether it takes the bypass.
     `rung`: rung of its work.
     `number`: how many frames were put in flight before it.
-    `todo`: bits of the stages that have not ended the frame yet.
-    `begun`: bits of the stages that have begun the frame; not kept in a chain.
-    `jobs`: number of its jobs that units hold.
-    `is_presented`: whether all stages without readers have done it; what is left is side work.
+    `todo`: bits of the stages that have yet to end the frame.
+    `begun`: bits of the stages that have begun the frame; always 0 in a chain.
+    `jobs`: number of its jobs that units hold; always 0 in a chain.
+    `is_presented`: whether all stages without readers have done the frame, so that only side work is left.
     """
 
     __slots__ = (
@@ -359,9 +375,9 @@ class FrameState:
 
 
 def build(graph: Graph) -> tuple[list[StageState], dict[str, UnitState], list[EdgeSlots]]:
-    """Return the connected states of a graph: stages in its order, units by name, edges in the order of `graph.edges`.
+    """Return the connected states of a graph: (stages in the graph's order, units by name, edges as in `graph.edges`).
 
-    Raises ValueError for an unknown edge.
+    Raises ValueError for an unknown rule of an edge.
     """
     units = {name: UnitState(name) for name in graph.units}
     stages = [StageState(spec.name, units[spec.unit], position) for position, spec in enumerate(graph.stages)]
@@ -405,25 +421,25 @@ def build(graph: Graph) -> tuple[list[StageState], dict[str, UnitState], list[Ed
 
 
 def _input(inputs: Sequence[Input], stage: str) -> Input:
-    """Return the one of `inputs` that reads `stage`."""
+    """Return the input that reads `stage`."""
     return next(each for each in inputs if each.stage == stage)
 
 
-#: Verdicts: leave the unit alone, kill its process, start it again, let it work after a hold, see if it takes a job.
+#: Verdicts on a unit: leave it alone, kill its process, start its process, end its pause, see if it takes a job.
 NOTHING: Final = 0
 KILL: Final = 1
 START: Final = 2
 RESUME: Final = 3
 LOOK: Final = 4
 
-#: Waits before a restart, by the number of failures in a row without a finished job; the last repeats.
+#: Waits before a restart in ns: the first after one failure, the next after two in a row, and so on; the last repeats.
 BACK_OFF_NS = (0, 100_000_000, 400_000_000, 1_600_000_000)
 
 
 def verdict(unit: UnitState, now_ns: int, lead_ns: int) -> int:
-    """Return the verdict on the unit now.
+    """Return the verdict on the unit now: NOTHING, KILL, START, RESUME or LOOK.
 
-    `lead_ns`: lead of the policy; with a lead, the unit's next job may be due.
+    `lead_ns`: lead of the policy in ns; LOOK comes only with a lead.
     """
     if unit.deadline_ns <= now_ns:
         return START if unit.life == DOWN else KILL
@@ -433,9 +449,11 @@ def verdict(unit: UnitState, now_ns: int, lead_ns: int) -> int:
 
 
 def next_alarm_ns(units: Iterable[UnitState], now_ns: int, lead_ns: int) -> int:
-    """Return when the first verdict other than NOTHING is due, or NEVER.
+    """Return the time in ns at which the first verdict other than NOTHING is due, or NEVER.
 
-    No verdict becomes due earlier until a deadline or a pause is set: a job's end and a Pong only put deadlines off.
+    Only a newly set deadline or pause can make a verdict due earlier: a job's end and a Pong move deadlines to later.
+
+    `lead_ns`: lead of the policy in ns.
     """
     alarm_ns = NEVER
     for unit in units:
@@ -448,10 +466,10 @@ def next_alarm_ns(units: Iterable[UnitState], now_ns: int, lead_ns: int) -> int:
 
 
 def fates(jobs: Iterable[Job], sources: Container[str]) -> list[tuple[Job, bool]]:
-    """Return pairs of a job of a dead unit and whether the job's frame is lost, in the order of `jobs`.
+    """Return pairs (job of a dead unit, whether the job's frame is lost), in the order of `jobs`.
 
-    The frame of the running job is lost. A frame before a stage without an input slot is lost too, because nothing
-    keeps its input. All other frames wait for their stage again.
+    The frame of the running job is lost. A frame at a stage without an input slot is lost too, because no slot keeps
+    its input. All other frames wait for their stage again.
 
     `jobs`: jobs of the unit, the running one first.
     `sources`: names of the stages without an input slot.
@@ -465,7 +483,7 @@ def back_off_ns(failures: int) -> int:
 
 
 def extended_deadline_ns(unit: UnitState, ns: int) -> int:
-    """Return the unit's deadline, later by the `ns` for which the scheduler did nothing; a restart is not delayed."""
+    """Return the unit's deadline, moved by the `ns` for which the scheduler did nothing; restarts are not delayed."""
     if unit.deadline_ns == NEVER or unit.life not in (STARTING, READY):
         return unit.deadline_ns
     return unit.deadline_ns + ns

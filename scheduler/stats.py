@@ -1,15 +1,15 @@
 """Summaries of the times of a run: percentiles, means with their uncertainty, and scores.
 
-Rule: while the values are few, percentiles are exact (linear between ranks, without bins). After that they come from a
-sketch; `is_exact` says which. A sketch is a structure of bounded size that gives percentiles within a stated error.
-This folder contains no sketch: the caller of `Samples` provides one for a run that may last for days. Without a sketch,
-all values are kept.
+Rule: while there are few values, percentiles are exact (linear between ranks, without bins). Percentiles of many values
+come from a sketch; `is_exact` says which holds. A sketch is a structure of bounded size that gives percentiles within a
+stated error. This folder contains no sketch: the caller of `Samples` provides one for a run that may last for days.
+Without a sketch, all values are kept.
 
-The interval of a mean frame time follows from the run's own frames. Successive frames are not independent, so the
-method is nonoverlapping batch means. The times are cut into batches of equal length. A batch has more frames than one
-slow frame can delay. The means of the batches count as independent, and Student's t over them gives the interval. Once
-a sketch has the times, the interval is computed from the means of blocks. Each block has the same number of times,
-about a thousandth of the run.
+The confidence interval of the mean frame time follows from the run's own frames. Successive frames are not independent,
+so the method is nonoverlapping batch means. The times are cut into batches of equal length. A batch has more frames
+than one slow frame can delay. The means of the batches count as independent, and Student's t over them gives the
+interval. Once a sketch holds the times, the interval is computed from the means of blocks. Each block has the same
+number of times, about a thousandth of the run.
 
 Sources: Schmeiser, "Batch Size Effects in the Analysis of Simulation Output", Operations Research 30 (1982), who finds
 little use in more than 10 to 30 batches; Law, Simulation Modeling and Analysis, chapter 9.
@@ -33,7 +33,7 @@ LARGEST_EXPONENT = 700.0  # e to this power is still a number
 
 
 def percentile(ordered: Sequence[int], share: float) -> float:
-    """Return the percentile at `share` (0 to 1) of the sorted `ordered`, linear between ranks; 0 if it is empty."""
+    """Return the percentile at `share` (0 to 1) of sorted values, linear between ranks; 0 without values."""
     if not ordered:
         return 0.0
     place = share * (len(ordered) - 1)
@@ -43,7 +43,7 @@ def percentile(ordered: Sequence[int], share: float) -> float:
 
 
 def summary_ms(values_ns: Iterable[int]) -> dict[str, float]:
-    """Return mean, p50, p90, p95, p99 and max in ms, all 0 without values, and the number of values as `samples`."""
+    """Return `mean`, `p50`, `p90`, `p95`, `p99` and `max` in ms (0 without values), and the number `samples`."""
     ordered = sorted(values_ns)
     return _summary_row(
         len(ordered), sum(ordered), ordered[-1] if ordered else 0, lambda share: percentile(ordered, share)
@@ -64,20 +64,20 @@ def _summary_row(count: int, total: int, largest: int, percentile_of: Callable[[
 
 
 def samples_needed(share: float) -> int:
-    """Return how many samples a percentile needs, so that the largest of them exceeds it with 95 % confidence.
+    """Return the number of samples whose largest exceeds the percentile at `share` (0 to 1) with 95 % confidence.
 
-    This is the least n with 1 - share^n >= 0.95: 29 for p90, 59 for p95, 299 for p99. With fewer, the samples
-    themselves do not show that they reach up to it. Wilks, Annals of Mathematical Statistics 12 (1941), 91-96.
+    This is the least n with 1 - share^n >= 0.95: 29 for p90, 59 for p95, 299 for p99. Fewer samples do not show that
+    they reach up to the percentile. Wilks, Annals of Mathematical Statistics 12 (1941), 91-96.
     """
     return ceil(log(1 - CONFIDENCE) / log(share))
 
 
 def median_interval(values: Sequence[float], confidence: float = 0.95) -> tuple[float, float]:
-    """Return the two values between which the median of their distribution lies with at least `confidence`.
+    """Return two of `values` (low, high): their distribution's median lies between them with at least `confidence`.
 
-    By the sign test they are the k-th least and the k-th largest value. k is the largest number with P(B(n, 1/2) < k)
-    <= (1 - confidence) / 2. If there are too few values for that (below six for 0.95), they are the least and the
-    largest value. Raises ValueError for no values.
+    By the sign test they are the k-th least and the k-th largest of the n values. k is the largest number with
+    P(B(n, 1/2) < k) <= (1 - confidence) / 2, where B is binomial. If no k >= 1 meets this (below six values for 0.95),
+    the least and the largest value are returned. Raises ValueError for no values.
     """
     if not values:
         raise ValueError("no values")
@@ -91,23 +91,23 @@ def median_interval(values: Sequence[float], confidence: float = 0.95) -> tuple[
 def energy_score(frame_mj: float) -> float:
     """Return the energy score of a frame of `frame_mj` millijoules: 1 for 0 mJ, 0 for `LARGEST_ENERGY_MJ` and more.
 
-    Kwon et al., XRBench, MLSys 2023, section 3, with their largest energy.
+    Source: Kwon et al., XRBench, MLSys 2023, section 3; the largest energy is theirs.
     """
     return max(0.0, 1 - frame_mj / LARGEST_ENERGY_MJ)
 
 
 MOST_BATCHES = 10
 LEAST_BATCHES = 5
-#: Least number of frames in a batch: as many as can be in flight in five stages with two slots between each.
+#: Least number of frames in a batch: as many as can be in flight in five stages, with two slots between neighbours.
 LEAST_FRAMES = 10
 #: The 0.975 quantile of Student's t, by degrees of freedom.
 T_975 = {4: 2.776445, 5: 2.570582, 6: 2.446912, 7: 2.364624, 8: 2.306004, 9: 2.262157}
 
 
 def mean_interval(values: Sequence[float], mean: float | None = None) -> tuple[float, float] | None:
-    """Return the 95 % interval (low, high) of the mean of an endless run like this one, in the unit of `values`.
+    """Return the 95 % interval (low, high) of the mean of an endless run like this one, in the values' unit of measure.
 
-    Return None for too few values: fewer than `LEAST_BATCHES` batches of `LEAST_FRAMES`, or an interval that reaches 0.
+    Return None if the values are fewer than `LEAST_BATCHES` batches of `LEAST_FRAMES`, or if the interval reaches 0.
 
     `values`: values above 0 in the order of measurement. The first values, which do not fill a batch, count only for
     the mean.
@@ -122,9 +122,11 @@ def mean_interval(values: Sequence[float], mean: float | None = None) -> tuple[f
 
 
 def batch_interval(values: Sequence[float]) -> float | None:
-    """Return half the width of the 95 % interval of a mean, from `values` over equal batches of at least LEAST_FRAMES.
+    """Return half the width of the 95 % interval of a mean; None for fewer than LEAST_BATCHES batches.
 
-    Return None for fewer than LEAST_BATCHES batches. If there are more than MOST_BATCHES, neighbours are merged.
+    If there are more than MOST_BATCHES batches, neighbours are merged.
+
+    `values`: one value for each batch, over equal batches of at least LEAST_FRAMES frames.
     """
     batches = min(len(values), MOST_BATCHES)
     return _half_width(values, batches) if batches >= LEAST_BATCHES else None
@@ -142,7 +144,10 @@ def _half_width(values: Sequence[float], batches: int) -> float:
 
 
 def frame_interval_ms(interval_ns: tuple[float, float] | None) -> dict[str, float | None]:
-    """Return `mean_low` and `mean_high` of the frame time in ms; both are None without an interval."""
+    """Return `mean_low` and `mean_high` of the frame time in ms; both are None without an interval.
+
+    `interval_ns`: interval (low, high) of the mean frame time in ns.
+    """
     low, high = interval_ns or (None, None)
     return {"mean_low": low and low / NS_PER_MS, "mean_high": high and high / NS_PER_MS}
 
@@ -150,13 +155,14 @@ def frame_interval_ms(interval_ns: tuple[float, float] | None) -> dict[str, floa
 def fps_interval(interval_ns: tuple[float, float] | None) -> dict[str, float | None]:
     """Return `fps_low` and `fps_high`, in frames a second; both are None without an interval.
 
-    `interval_ns`: interval of the mean frame time in ns.
+    `interval_ns`: interval (low, high) of the mean frame time in ns.
     """
     low, high = interval_ns or (None, None)
     return {"fps_low": high and NS_PER_S / high, "fps_high": low and NS_PER_S / low}
 
 
-# At 8 bytes a value, runs of some minutes stay exact, and runs of days stay small (docs/decisions/journal.md).
+#: Most values that are kept for exact percentiles: runs of some minutes stay exact, and runs of days stay small
+#: (docs/decisions/journal.md).
 MOST_EXACT: Final = 20_000
 #: Number of kept values that move to the sketch with each further value, so that no step of the scheduler takes long.
 MOVED_AT_ONCE: Final = 4
@@ -170,15 +176,15 @@ class Sketch(Protocol):
         ...
 
     def percentile(self, share: float) -> float:
-        """Return the value that `share` of the values do not exceed, within the error of the sketch."""
+        """Return the percentile at `share` (0 to 1), within the error of the sketch."""
         ...
 
 
 class Samples:
     """Values in ns. `count`, `total` and `largest` are exact.
 
-    `is_exact`: whether all values are in `kept`, in the order in which they came. Otherwise the values move from `kept`
-    to the sketch, a few at a time.
+    `is_exact`: whether all values are in `kept`, in the order in which they came. If not, they move from `kept` to the
+    sketch, a few with each further value.
     """
 
     def __init__(self, sketch: Callable[[], Sketch] | None = None) -> None:
@@ -215,7 +221,7 @@ class Samples:
             self._sketch = self._make_sketch()
 
     def summary_ms(self) -> dict[str, float]:
-        """Return `summary_ms` of all values."""
+        """Return the summary of all values, with the keys of the function `summary_ms`."""
         sketch = self._sketch
         if sketch is None:
             ordered = sorted(self.kept)
@@ -262,10 +268,12 @@ class FrameTimeSamples:
         self._add_to_block(interval_ns)
 
     def row(self) -> dict[str, float | None]:
-        """Return `frame_time_ms` of a report: summary, exponential average, jitter, interval of the mean.
+        """Return the object `frame_time_ms` of a report, in ms.
 
-        The exponential average (weight 2 / (SPAN + 1)) counts from frame SPAN on; in a shorter run, only its last value
-        counts. Jitter is the mean absolute difference of successive times, None for fewer than two.
+        Its keys are those of the function `summary_ms`, least and largest exponential average (`ema20_min`,
+        `ema20_max`), `jitter`, and interval of the mean (`mean_low`, `mean_high`). The exponential average (weight
+        2 / (SPAN + 1)) counts from frame SPAN on; in a shorter run, only its last value counts. Jitter is the mean
+        absolute difference of successive times; None for fewer than two times.
         """
         count = self.samples.count
         return {
@@ -277,7 +285,7 @@ class FrameTimeSamples:
         }
 
     def fps_interval(self) -> dict[str, float | None]:
-        """Return `fps_low` and `fps_high` of a report."""
+        """Return `fps_low` and `fps_high` of a report, in frames a second; both are None without an interval."""
         return fps_interval(self._interval())
 
     def _interval(self) -> tuple[float, float] | None:
@@ -313,8 +321,8 @@ def due_ns(deadline_ns: int, before_ns: int | None, target_period_ns: int) -> in
 class Lateness:
     """How late frames were, by `due_ns`.
 
-    `count`: number of frames that had a deadline.
-    `missed`: number of frames that came after it.
+    `count`: number of these frames.
+    `missed`: number of frames that came after their deadline.
     """
 
     def __init__(self) -> None:
@@ -322,7 +330,7 @@ class Lateness:
         self._score = 0.0
 
     def add(self, late_ns: int) -> None:
-        """Add a frame that came `late_ns` after its deadline, or before it if that is negative."""
+        """Add a frame that came `late_ns` after its deadline; below 0: before its deadline."""
         self.count += 1
         self.missed += late_ns > 0
         self._score += 1 / (1 + exp(min(SCORE_PER_MS * late_ns / NS_PER_MS, LARGEST_EXPONENT)))

@@ -1,17 +1,17 @@
-"""Drivers of simulated time: each unit on cores of its own, or on cores that units share as the kernel divides them.
+"""Drivers of simulated time: units have cores of their own, or share cores as the kernel divides them.
 
 Rule: the scheduler is the real `Core`; only the units and the cores are simulated. Equal inputs give equal runs.
 
 With cores of their own (`VirtualDriver`), the units are queues of jobs whose service times come from a function. A heap
 with the key (t_ns, priority, seq) orders the events.
 
-On shared cores (`SharedCores`), every job's needs are given: CPU time of its unit's threads, and time in which they
-need no core (a device works, or the unit sleeps). A unit with one thread is on one core at a time. It wakes on its last
-core. If another unit is there, it wakes on the core with the fewest units among its own. A core that becomes idle pulls
-a unit that shares another core. If a unit begins to share a core while another core is already idle, the idle core
-pulls it at the next tick (BALANCE_NS). The units on a core have equal shares of it. A unit of several threads is on all
-of its cores at once. It is as fast as on the fullest of them, because each parallel region waits for its slowest
-thread.
+On shared cores (`SharedCores`), every job's needs are given: CPU time of its unit's threads, and time in which the
+threads need no core (a device works, or the unit sleeps). A unit with one thread is on one core at a time. It wakes on
+the core where it was last. If another unit is there, it wakes on the one of its cores that has the fewest units. A core
+that becomes idle pulls a unit that shares another core. If a unit begins to share a core while another core is already
+idle, the idle core pulls this unit at the next tick (BALANCE_NS). The units on a core have equal shares of it. A unit
+of several threads is on all of its cores at once. The core with the most units sets its speed, because each parallel
+region waits for its slowest thread.
 
 Equal shares stand for the kernel's time slices. Moves and changes of threads cost nothing here, because the given CPU
 times of jobs include them.
@@ -48,12 +48,12 @@ from trilane.scheduler.ledger import Books, JobRecord
 from trilane.scheduler.placement import Placement
 from trilane.scheduler.recording import Recording
 
-#: (stage, unit, frame, begin_ns) -> service time in ns.
+#: Function of (stage, unit, number of the frame, begin in ns) that returns the service time in ns.
 Service = Callable[[str, str, int, int], int]
-#: (frame, `Job.fresh`) -> whether the frame takes the bypass.
+#: Function of (number of the frame, `Job.fresh`) that returns whether the frame takes the bypass.
 Skips = Callable[[int, bool], bool]
 
-#: Priorities at equal times; the core's deadline comes after both.
+#: Priorities of events at equal times; the core's deadline comes after both.
 FAULT: Final = 0
 EVENT: Final = 1
 
@@ -68,7 +68,7 @@ class Simulation:
     """The result of a simulated run.
 
     `report`: keys of report.json.
-    `recording`, `jobs`: recording and finished jobs; None and empty if they are not kept.
+    `recording`, `jobs`: recording and finished jobs, if they are kept; else None and empty.
     `shown_ns`: time in ns at which each frame was presented, by the frame's number.
     """
 
@@ -83,7 +83,7 @@ class Simulation:
 class _VirtualUnit:
     """A simulated unit.
 
-    `up`: whether its process exists, starting or ready.
+    `up`: whether its process exists, and is starting or ready.
     `free_ns`: time from which it can begin another job.
     `epoch`: number of its deaths; events of an older epoch are void.
     """
@@ -94,7 +94,7 @@ class _VirtualUnit:
 
 
 class VirtualDriver:
-    """The clock of simulated time (`core.Clock`), and the core that it runs."""
+    """A `trilane.scheduler.core.Clock` of simulated time, together with the core that it drives."""
 
     def __init__(
         self,
@@ -110,17 +110,17 @@ class VirtualDriver:
         keep: bool = False,
         books: Books | None = None,
     ) -> None:
-        """Prepare a simulated run; all times are `int`, also those of `service` (no NumPy integers).
+        """Prepare a simulated run. All times must be `int`, not NumPy integers, also those from `service`.
 
         `graph`, `settings`: graph and settings of the core.
         `service`: function that returns the service time of each job in ns.
         `message_delay_ns`: delay of a message, each way.
-        `restart_ns`: start-up time of a unit.
+        `restart_ns`: time that a unit takes to start again.
         `faults`: deaths of units, as pairs (t_ns, unit).
         `inputs`: events from outside, such as SetDuty or Stop, as pairs (t_ns, event).
         `skips`: function that says which frames take the bypass of `graph`, if it has one.
-        `keep`: whether to record steps and the jobs that end.
-        `books`: how the core accounts for the run.
+        `keep`: whether to record the core's steps, and the jobs that end.
+        `books`: settings of the ledger; None: the default settings.
 
         Raises ValueError for an unknown policy or edge.
         """
@@ -152,7 +152,7 @@ class VirtualDriver:
                 gc.enable()
 
     def wait(self, deadline_ns: int) -> tuple[int, tuple[Event, ...]]:
-        """Return the next valid event, or none at the core's deadline if that comes first."""
+        """Return (time in ns, the next valid event); if the core's deadline comes first, it comes without an event."""
         heap = self._heap
         while heap and heap[0][0] <= deadline_ns:
             at_ns, _, _, event, epoch = heappop(heap)
@@ -224,7 +224,7 @@ def simulate(
     keep: bool = False,
     **driver: Any,
 ) -> Simulation:
-    """Simulate a run to its end.
+    """Simulate a run to its end, and return the result.
 
     `graph`, `settings`, `service`, `keep`, `driver`: arguments of VirtualDriver.
     `target_period_ns`: as in `trilane.scheduler.ledger.Books`.
@@ -245,8 +245,8 @@ DONE_NS: Final = 1e-3  # what is left of a job that has ended, by the rounding o
 class Need(NamedTuple):
     """The needs of a job.
 
-    `cpu_ns`: CPU time of each of its unit's threads.
-    `other_ns`: time in which it needs no core.
+    `cpu_ns`: CPU time of each thread of its unit.
+    `other_ns`: time in which the job needs no core.
     `skips`: whether the frame takes the bypass that begins at the job's stage.
     """
 
@@ -255,16 +255,19 @@ class Need(NamedTuple):
     skips: bool = False
 
 
-#: (stage, frame) -> the job's needs.
+#: Function of (stage, number of the frame) that returns the job's needs.
 Needs = Callable[[str, int], Need]
 
 
 class _Unit:
     """A unit, or the scheduler.
 
+    `gangs`: whether it has several threads, each on a core of its own.
     `queue`: jobs handed to the unit, or groups of events that the scheduler hears of. The first element is in work.
-    `on`: cores where its threads are while they compute.
-    `left`: rest of its computation, or of its time without a core, in ns at full speed.
+    `need`: needs of the first element; None if the queue is empty.
+    `on`: cores where its threads are while they compute; else empty.
+    `last`: core where its only thread was last.
+    `left`: time in ns at full speed until its computation, or its time without a core, ends.
     `rate`: its present speed, 1 for full speed.
     """
 
@@ -283,7 +286,7 @@ class _Unit:
 class SharedCores:
     """The `trilane.scheduler.core.Core` of one run on simulated cores. Equal inputs give equal runs.
 
-    A job that the scheduler hands over begins at once if its unit is free.
+    If its unit is free, a job begins as soon as the scheduler hands it over.
 
     `places`: cores and threads of every unit.
     `needs`: function that returns the needs of a job.
@@ -312,7 +315,7 @@ class SharedCores:
         self.presented: list[tuple[int, int]] = []
 
     def run(self) -> list[tuple[int, int]]:
-        """Run to the end; return pairs of number and time in ns, one for each presented frame.
+        """Run to the end; return a pair (number, time in ns) for each presented frame, in order.
 
         Raises RuntimeError if nothing can ever happen again, or if the run ends before its last frame.
         """
@@ -352,7 +355,7 @@ class SharedCores:
             self._set_rates()
 
     def _step(self, now_ns: int, events: tuple[Event, ...]) -> None:
-        """Take a step of the core, and begin the jobs that it hands over."""
+        """Take a step of the core at `now_ns` with `events`, and begin the jobs that it hands over."""
         actions, self._deadline_ns = self._core.step(now_ns, events)
         is_changed = False
         for action in actions:
@@ -378,9 +381,9 @@ class SharedCores:
         self._active.append(unit)
 
     def _woken_on(self, unit: _Unit) -> int:
-        """Return the core on which a unit of one thread wakes, and keep it as its last."""
+        """Return the core on which a unit of one thread wakes, and store it in `last`."""
         if self._queues[unit.last]:
-            # The core with the fewest units; of several, the one where the unit was.
+            # The core with the fewest units; of several such cores, the one where the unit was last.
             unit.last = min(unit.cores, key=lambda core: (len(self._queues[core]), core != unit.last))
         return unit.last
 

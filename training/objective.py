@@ -1,7 +1,7 @@
 """The objective that training minimises: the loss terms, including those that need networks (VGG-16, discriminators).
 
-Rule: a term that needs a network or blurs is computed only if it has a weight. The same step on the same pictures gives
-the same numbers.
+Rule: a term that needs a network, or blurred pictures, is computed only if it has a weight. The same step on the same
+pictures gives the same numbers.
 """
 
 from __future__ import annotations
@@ -33,8 +33,9 @@ JUDGES = "discriminators"
 class Objective:
     """The objective of a training.
 
-    `weights`: weights of the terms, by name. `vgg`: network of the perceptual loss; if None, the perceptual loss is one
-    minus MS-SSIM. `adversary`: discriminators, or None.
+    `weights`: weight of each term, by name.
+    `vgg`: network of the perceptual loss; None: the perceptual loss is one minus MS-SSIM.
+    `adversary`: discriminators; None: there are none.
     """
 
     weights: Mapping[str, float] = field(default_factory=lambda: WEIGHTS)
@@ -42,7 +43,7 @@ class Objective:
     adversary: Adversary | None = None
 
     def terms(self, output: Tensor, target: Tensor) -> dict[str, Tensor]:
-        """Return the loss terms by name, before weighting, with random backgrounds behind both pictures.
+        """Return the loss terms by name, not weighted, with the same random backgrounds behind both pictures.
 
         `output`, `target`: (N, 4, H, W) in 0..1, colour and mask, straight alpha.
         """
@@ -55,11 +56,13 @@ class Objective:
         return terms if self.adversary is None else terms | self.adversary.terms(output, target, behind)
 
     def total(self, terms: Mapping[str, Tensor]) -> Tensor:
-        """Return the sum of `terms`, weighted by the objective's weights."""
+        """Return the sum of `terms` (from the method `terms`), weighted by the objective's weights."""
         return total_loss(terms, self.weights)
 
     def learn(self, output: Tensor, target: Tensor) -> dict[str, float]:
-        """Train the discriminators, if any, by one step. Return their error in bits under the key `JUDGES`.
+        """Train the discriminators by one step, and return their error in bits under the key `JUDGES`.
+
+        Without discriminators, return an empty dict.
 
         `output`, `target`: as in `terms`.
         """
@@ -81,10 +84,10 @@ LEAST = 1e-6
 
 
 def ms_ssim(one: Tensor, other: Tensor) -> Tensor:
-    """Return the MS-SSIM (N,) of pictures `one` and `other`: formula 7 of the paper above.
+    """Return the MS-SSIM (N,) of the pictures `one` and `other`: formula 7 of the paper named at `SCALES`.
 
-    It is the product over the scales of the mean contrast-structure similarity, to the power of the scale's weight. At
-    the last scale, the luminance is included.
+    It is a product over the scales. The factor of a scale is the mean similarity of contrast and structure, to the
+    power of the scale's weight. At the last scale, the similarity includes luminance.
 
     `one`, `other`: (N, C, H, W) in 0..1, H and W at least 11.
     """
@@ -100,7 +103,7 @@ def ms_ssim(one: Tensor, other: Tensor) -> Tensor:
 
 
 def _similarity(one: Tensor, other: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the mean SSIM (N,), and the mean (N,) of its factor for contrast and structure."""
+    """Return (mean SSIM (N,), mean (N,) of its factor for contrast and structure). Parameters: as in `ms_ssim`."""
     mean_one, mean_other = _blurred(one), _blurred(other)
     variances = _blurred(one**2) - mean_one**2 + _blurred(other**2) - mean_other**2
     covariance = _blurred(one * other) - mean_one * mean_other
@@ -121,13 +124,13 @@ def _blurred(picture: Tensor) -> Tensor:
 # The loss terms of training: errors of the picture, of its PSNR, colours, edges, structure and mask.
 #
 # Rule: every term is a mean over the pixels that it concerns, so that a weight means the same for every view. Each
-# picture of a batch has a random background: in front of a fixed colour, a person who lets that colour through has no
-# error.
+# picture of a batch has a random background: in front of a fixed colour, a person who lets this colour through would
+# have no error.
 #
-# The colour of pixels without a person is invisible. It is trained to be black: otherwise it would be noise that
-# differs from runtime to runtime.
+# The colour of pixels without a person is invisible. It is trained to be black; without this training it would be noise
+# that differs from runtime to runtime.
 
-#: Width in pixels of the border around the person that the terms count too.
+#: Width in pixels of the border around the person that the terms also count.
 MARGIN_PX = 5
 #: Weights of the default avatar's loss.
 WEIGHTS: Mapping[str, float] = {name: weight for name, weight in LossWeights().by_name().items() if weight}
@@ -139,13 +142,13 @@ LEAST_SQUARE = 1e-5
 def loss_terms(
     output: Tensor, target: Tensor, behind: Tensor, weights: Mapping[str, float] = WEIGHTS
 ) -> dict[str, Tensor]:
-    """Return the loss terms by name, before weighting.
+    """Return the loss terms by name, not weighted.
 
-    `overlap` is the Dice loss with 1 added to numerator and denominator, so that it is 0 without a person.
+    The term `overlap` is the Dice loss, with 1 added to numerator and denominator so that it is 0 without a person.
 
     `output`, `target`: (N, 4, H, W) in 0..1, colour and mask, straight alpha.
     `behind`: background (N, 3, H, W) of both, as `drawn_behind` returns it.
-    `weights`: weights by name. Only the weight of `STRUCTURE` matters: without it, that term is not computed.
+    `weights`: weights by name. Only the weight of `STRUCTURE` matters here: without it, this term is not computed.
     """
     mask, true_mask = output[:, 3:], target[:, 3:]
     near = _grown(true_mask)
@@ -173,9 +176,10 @@ def loss_terms(
 
 
 def missing_db(difference: Tensor, near: Tensor) -> Tensor:
-    """Return how far (N,), in dB, the PSNR of each picture is below 50 dB, over the pixels where `near` is 1.
+    """Return, for each picture (N,), the difference in dB from its PSNR to 50 dB, over the pixels where `near` is 1.
 
-    50 dB is the PSNR of the mean square `LEAST_SQUARE`, which is added to the pictures' mean square.
+    50 dB is the PSNR of the mean square error `LEAST_SQUARE`. `LEAST_SQUARE` is added to each picture's mean square
+    error, so that the difference is never negative.
 
     `difference`: (N, 3, H, W), picture minus target. `near`: (N, 1, H, W), 1 for pixels that count, else 0.
     """
@@ -185,7 +189,7 @@ def missing_db(difference: Tensor, near: Tensor) -> Tensor:
 
 
 def _grown(mask: Tensor) -> Tensor:
-    """Return (N, 1, H, W): 1 on the person in `mask` (N, 1, H, W) and up to `MARGIN_PX` around the person, else 0."""
+    """Return (N, 1, H, W): 1 on the person and up to `MARGIN_PX` pixels around, else 0. `mask`: (N, 1, H, W)."""
     grown = mask.detach().contiguous()
     for along in ((1, 0), (0, 1)):
         kernel, padding = tuple(2 * MARGIN_PX * side + 1 for side in along), tuple(MARGIN_PX * side for side in along)
@@ -199,13 +203,16 @@ def total_loss(terms: Mapping[str, Tensor], weights: Mapping[str, float] = WEIGH
 
 
 def composite(image: Tensor, behind: Tensor) -> Tensor:
-    """Return `image` (N, 4, H, W), straight alpha, composited over `behind` (N, 3, H, W), as (N, 3, H, W)."""
+    """Return the colours (N, 3, H, W) of `image` (N, 4, H, W), straight alpha, in front of `behind` (N, 3, H, W)."""
     mask = image[:, 3:]
     return image[:, :3] * mask + behind * (1 - mask)
 
 
 def drawn_behind(target: Tensor) -> Tensor:
-    """Return a random background for each picture of `target` (N, 4, H, W), as (N, 3, H, W), from PyTorch's seed."""
+    """Return random backgrounds (N, 3, H, W) in 0..1, one for each picture of `target` (N, 4, H, W).
+
+    They depend on the state of PyTorch's random generator.
+    """
     rng = np.random.default_rng(int(torch.randint(2**62, ())))
     drawn = backgrounds(len(target), (target.shape[2], target.shape[3]), rng)
     return torch.from_numpy(drawn).permute(0, 3, 1, 2).to(target.device)
@@ -215,7 +222,7 @@ def drawn_behind(target: Tensor) -> Tensor:
 #
 # Rule: only tensors are read from the file, no code. Each tensor must have the shape that VGG-16 requires.
 
-#: Number of convolutions and number of channels of each of the five blocks; the picture is halved between blocks.
+#: (Number of convolutions, number of channels) of each of the five blocks; the picture is halved between blocks.
 #: Source: Simonyan and Zisserman, Very deep convolutional networks for large-scale image recognition, 2014, table 1,
 #: column D.
 BLOCKS = ((2, 64), (2, 128), (3, 256), (3, 512), (3, 512))
@@ -243,7 +250,10 @@ class Vgg16(nn.Module):
         self.requires_grad_(False)
 
     def forward(self, picture: Tensor) -> list[Tensor]:
-        """Return the last features (N, C, h, w) of each block for `picture` (N, 3, H, W) in 0..1, sides at least 16."""
+        """Return the last features (N, C, h, w) of each block.
+
+        `picture`: (N, 3, H, W) in 0..1, with H and W at least 16.
+        """
         x, found = (picture - self.mean) / self.deviation, list[Tensor]()
         for layer, after in pairwise([*self.features, nn.MaxPool2d(2)]):
             x = layer(x)
@@ -271,7 +281,8 @@ class Vgg16(nn.Module):
 def read_vgg16(path: Path) -> Vgg16:
     """Return the network with the weights of a state dict in the file `path` (.pth, .pt or .safetensors).
 
-    Raises BadInputError; MissingPartError for a .safetensors file if the package safetensors is not installed.
+    Raises BadInputError for another file. Raises MissingPartError for a .safetensors file if the package safetensors is
+    not installed.
     """
     found, network = _tensors(path), Vgg16()
     for name, wanted in network.state_dict().items():
@@ -313,29 +324,29 @@ def _safe_tensors(path: Path) -> dict[str, object]:
         raise ValueError(str(error)) from error
 
 
-# Three discriminators, which learn to distinguish the avatar's pictures from ground truth, and the terms that they add
-# to the avatar's loss.
+# Three discriminators learn to distinguish the avatar's pictures from ground truth, and add terms to the avatar's loss.
 #
 # Rule: the avatar's loss does not change the discriminators, and the discriminators' loss does not change the avatar.
 # Discriminators have no normalisation, so that a picture's score does not depend on other pictures of its batch.
 #
-# The thesis has three networks of falling resolution and rising channels, each with one probability for a picture, and
-# does not state their inputs. Here, each network reads the composited colours and the mask, at full, half or quarter
-# size (Wang et al., High-resolution image synthesis with conditional GANs, 2018, section 3.2).
+# The thesis has three networks whose levels have falling resolution and rising numbers of channels; each gives one
+# probability for a picture. It does not state their inputs. Here, each network reads the composited colours and the
+# mask, at full, half or quarter size (Wang et al., High-resolution image synthesis with conditional GANs, 2018, section
+# 3.2).
 
 #: Factor by which the picture is shrunk, for each discriminator.
 SHRUNK = (1, 2, 4)
 SEEN_CHANNELS = 4
-#: Channels of a discriminator's levels, as multiples of its width; each level halves the picture.
+#: Numbers of channels of a discriminator's levels, as multiples of its width; each level halves the picture.
 LEVELS = (1, 2, 4, 8)
 SLOPE = 0.2
 BETAS = (0.9, 0.999)
 
 
 class Judgement(NamedTuple):
-    """The output of a discriminator.
+    """The output of a discriminator for N pictures.
 
-    `features`: features (N, C, H, W) of each level. `score`: log odds (N,) that the picture is ground truth.
+    `features`: features (N, C, H, W) of each level. `score`: log odds (N,) that a picture is ground truth.
     """
 
     features: list[Tensor]
@@ -343,7 +354,10 @@ class Judgement(NamedTuple):
 
 
 class Discriminator(nn.Module):
-    """Strided 3x3 convolutions, then a 1x1 convolution whose output is averaged over the picture."""
+    """Strided 3x3 convolutions, followed by a 1x1 convolution whose output is averaged over the picture.
+
+    `width`: number of channels of the first level.
+    """
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -378,8 +392,8 @@ class Adversary:
     def terms(self, output: Tensor, target: Tensor, behind: Tensor) -> dict[str, Tensor]:
         """Return the loss terms `adversarial` and `features`, which the avatar minimises.
 
-        `adversarial` falls when the discriminators take `output` for ground truth. `features` is the mean difference
-        between the features of `output` and of `target` (feature matching).
+        The more the discriminators take `output` for ground truth, the smaller is `adversarial`. `features` is the mean
+        difference between the features of `output` and of `target` (feature matching).
 
         `output`, `target`: (N, 4, H, W) in 0..1, colour and mask, straight alpha.
         `behind`: background (N, 3, H, W) of both.
@@ -398,7 +412,7 @@ class Adversary:
     def learn(self, output: Tensor, target: Tensor, behind: Tensor) -> float:
         """Train the discriminators by one step, and return their mean error before the step, in bits.
 
-        The error of guessing is 1 bit. The parameters are those of `terms`.
+        A discriminator that guesses has an error of 1 bit. The parameters are those of `terms`.
         """
         wrong = [
             (bits(mine.score, true=False) + bits(theirs.score, true=True)) / 2
@@ -421,6 +435,6 @@ class Adversary:
 def bits(score: Tensor, true: bool) -> Tensor:
     """Return the mean binary cross entropy of the log odds `score` (N,), in bits (thesis, formula 3.1).
 
-    `true`: whether all pictures are ground truth; otherwise all are the avatar's.
+    `true`: whether all N pictures are ground truth; if not, all are the avatar's.
     """
     return functional.softplus(-score if true else score).mean() / math.log(2)

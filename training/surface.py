@@ -18,8 +18,9 @@ from trilane.body.body import ShapedBody
 class BodyArrays:
     """Arrays of a body at rest.
 
-    `vertices`: (V,3), metres. `faces`: (F,3) indices of vertices. `uv`: texture coordinates (T,2). `uv_faces`: (F,3)
-    indices of `uv`. `weights`: skin weights (V,55). `joints`: (55,3), metres.
+    `vertices`: (V,3), in metres. `faces`: (F,3) indices of vertices.
+    `uv`: texture coordinates (T,2). `uv_faces`: (F,3) indices of `uv`.
+    `weights`: skin weights (V,55). `joints`: (55,3), in metres.
     """
 
     vertices: F64
@@ -43,15 +44,17 @@ def body_arrays(shaped: ShapedBody) -> BodyArrays:
     )
 
 
-# Geometry of triangle surfaces: normals, areas, smoothing, shells that stand off, obscurance.
+# Geometry of triangle surfaces: normals, areas, smoothing, shells that stand off, and ambient light behind occluders.
 #
 # Rule: functions take and return arrays; they know nothing of bodies and garments.
 
 
 def vertex_normals(vertices: F64, faces: Ints) -> F64:
-    """Return unit normals (V,3) of the vertices: mean face normals, weighted by area; +Y for a vertex without a face.
+    """Return the unit normal (V,3) of each vertex: the mean of its faces' normals, weighted by area.
 
-    `vertices`: (V,3). `faces`: (F,3).
+    A vertex without a face gets +Y.
+
+    `vertices`: (V,3). `faces`: (F,3) indices of vertices.
     """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     face_normal = np.cross(b - a, c - a)
@@ -61,7 +64,10 @@ def vertex_normals(vertices: F64, faces: Ints) -> F64:
 
 
 def vertex_areas(vertices: F64, faces: Ints) -> F64:
-    """Return the area (V,) of each vertex: a third of the total area of its faces, square metres."""
+    """Return the area (V,) of each vertex, in square metres: a third of the total area of the vertex's faces.
+
+    `vertices`: (V,3), in metres. `faces`: (F,3) indices of vertices.
+    """
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6.0
     return _scatter(faces, np.repeat(area, 3), len(vertices))
@@ -81,14 +87,14 @@ class Smoother:
         self._count = count
 
     def mean(self, values: F64) -> F64:
-        """Return the mean of the neighbours' values at each vertex; `values` and result are (V,) or (V,C)."""
+        """Return, for each vertex, the mean of its neighbours' values. `values` and the result: (V,) or (V,C)."""
         columns = values.reshape(self._count, -1)
         sums = [np.bincount(self._to, weights=column[self._from], minlength=self._count) for column in columns.T]
         around = np.stack(sums, axis=1) / np.maximum(self._degree, 1)[:, None]
         return np.where(self._degree[:, None] > 0, around, columns).reshape(values.shape)
 
     def smooth(self, values: F64, rounds: int) -> F64:
-        """Return `values` (V,) or (V,C), moved half way to the mean of the neighbours, `rounds` times."""
+        """Return `values` (V,) or (V,C) after `rounds` rounds; each moves them half way to the neighbours' means."""
         for _ in range(rounds):
             values = 0.5 * (values + self.mean(values))
         return values
@@ -97,12 +103,12 @@ class Smoother:
 def shell(vertices: F64, faces: Ints, offset: F64, least: F64, rounds: int) -> F64:
     """Return the vertices (V,3) of a smooth surface over a mesh, which bridges hollows as cloth does.
 
-    The mesh is raised along smoothed normals. Each round then smooths the surface, and lifts vertices that sank too low
-    back along the normals.
+    First the mesh is raised along smoothed normals. Then each round smooths the surface, and raises vertices that have
+    sunk below their least height again, along the normals.
 
-    `vertices`, `faces`: mesh, (V,3) and (F,3).
-    `offset`: height by which the mesh is raised, (V,), metres.
-    `least`: least height over the mesh, (V,), metres.
+    `vertices` (V,3), `faces` (F,3): the mesh.
+    `offset`: height (V,), in metres, to which the mesh is raised first.
+    `least`: least height (V,) over the mesh, in metres.
     `rounds`: number of rounds of smoothing.
     """
     smoother = Smoother(faces, len(vertices))
@@ -117,13 +123,13 @@ def shell(vertices: F64, faces: Ints, offset: F64, least: F64, rounds: int) -> F
 
 
 def obscurance(points: F64, normals: F64, emitters: F64, emitter_normals: F64, areas: F64, reach: float) -> F64:
-    """Return the share (N,) of ambient light, in 0..1, that reaches points past discs that occlude it.
+    """Return the share (N,) of ambient light, in 0..1, that reaches points although discs occlude it.
 
-    The share follows from disc-to-point form factors: M. Bunnell, Dynamic Ambient Occlusion and Indirect Lighting, GPU
-    Gems 2, 2005.
+    The share is computed from disc-to-point form factors: M. Bunnell, Dynamic Ambient Occlusion and Indirect Lighting,
+    GPU Gems 2, 2005.
 
     `points`, `normals`: points (N,3) at which the light is computed, and normals (N,3) there.
-    `emitters`, `emitter_normals`: centres and normals (M,3) of the discs.
+    `emitters`, `emitter_normals`: centres (M,3) and normals (M,3) of the discs.
     `areas`: areas (M,) of the discs, square metres.
     `reach`: distance in metres at which a disc's effect has faded out.
     """
@@ -144,7 +150,7 @@ def obscurance(points: F64, normals: F64, emitters: F64, emitter_normals: F64, a
 
 
 def smoothstep(low: float, high: float, values: F64) -> F64:
-    """Return GLSL's smoothstep of `values`: 0 at `low`, 1 at `high`, a cubic between. `low` may exceed `high`."""
+    """Return GLSL's smoothstep of `values`: 0 at `low`, 1 at `high`, a cubic between. `low` may be above `high`."""
     t = np.clip((values - low) / (high - low), 0.0, 1.0)
     return t * t * (3.0 - 2.0 * t)
 

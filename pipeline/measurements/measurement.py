@@ -4,8 +4,8 @@
     found.sample("line 16: RPC (execute) time", "RPC (execute) time", "run", 7784, "us")
     found.measurements, found.refused
 
-Rule: a reader hands each number to `Found`, which converts it to ms and refuses a number that no tool can have
-measured. A refusal names the row and a reason; other rows stay. Nothing is guessed and nothing is repaired.
+Rule: a reader of a format hands each number to `Found`, which converts it to ms and refuses a number that no tool can
+have measured. A refusal names the row and a reason; other rows stay. Nothing is guessed and nothing is repaired.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ import numpy as np
 
 from trilane.errors import BadInputError
 
-#: run: one job of a whole network. layer: a part of such a job. wall: a time from outside, with all waiting.
+#: run: one job of a whole network. layer: a part of such a job. wall: a time measured from outside, with all waits.
 Kind = Literal["run", "layer", "wall"]
-#: Number of each unit of time in a millisecond. A division rounds only once, so 99091 us are 99.091 ms.
+#: How many of each unit of time a millisecond has. A division by this number rounds once, so 99091 us are 99.091 ms.
 PER_MS: Final = {"s": 1e-3, "ms": 1.0, "us": 1e3, "ns": 1e6}
 CYCLES: Final = "cycles"
 MOST_SAMPLES: Final = 1_000_000  # in one file
@@ -38,7 +38,7 @@ QUEUEING: Final = "a wall time that contains queueing is no service time"
 
 
 class Refused(NamedTuple):
-    """A row that was refused. `row`: its place in the file and its name."""
+    """A row that was refused. `row`: its place in the file and its name. `reason`: reason as part of a sentence."""
 
     row: str
     reason: str
@@ -46,19 +46,20 @@ class Refused(NamedTuple):
 
 @dataclass(frozen=True)
 class Measurement:
-    """One measured time.
+    """The times of one thing that a tool measured, such as a run or a layer.
 
-    `name`: name that the tool gives it.
-    `unit`: unit of time in the source: s, ms, us, ns or cycles.
+    `name`: name that the tool gives to this thing.
+    `kind`: run, layer or wall, see `Kind`.
+    `unit`: unit of time in the file: s, ms, us, ns or cycles.
     `what`: contents of the time, in words.
     `samples_ms`: single times; empty if the tool states only figures such as a mean.
     `count`: number of measured times; None if the tool does not state it.
     `mean_ms`, ..., `max_ms`: figures of the times; None if the tool does not state them.
-    `share`: share of the layer in all layers, if it is known.
+    `share`: share (0 to 1) of the layer in the sum of all layers; None if it is not known.
     `hardware`: hardware that did the work, as the tool names it.
     `service`: whether the time can be the service time of a stage.
     `hint`: warning about the measurement, or empty.
-    `more`: other figures of the source, by name.
+    `more`: other figures in the file, by name.
     """
 
     name: str
@@ -80,25 +81,25 @@ class Measurement:
     more: dict[str, float] = field(default_factory=dict)
 
     def document(self) -> dict[str, Any]:
-        """Return the measurement as plain data."""
+        """Return the measurement as JSON values, by the names of the fields."""
         names = ("name", "kind", "unit", "what", "count", "mean_ms", "sd_ms", "min_ms", "p50_ms", "p95_ms", "max_ms")
         rest = ("share", "hardware", "service", "hint", "more")
         return {name: getattr(self, name) for name in (*names, *rest)} | {"samples_ms": list(self.samples_ms)}
 
 
 def is_finite(value: object) -> TypeGuard[int | float]:
-    """Return whether a value of a JSON document is a finite number; true and false are no numbers."""
+    """Return whether a value of a JSON document is a finite number; true and false do not count as numbers."""
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 class Found:
     """Collects the measurements that a reader finds in one file.
 
-    `tool`: name of the format.
-    `says`: description of its times, part of a sentence.
+    `tool`: name of the file's format.
+    `says`: description of the times in this format, as part of a sentence.
     `refused`: refused rows, at most MOST_REFUSED.
     `refused_count`: number of all refused rows.
-    `skipped`: number of rows that are no times of a run, by reason.
+    `skipped`: number of rows that do not contain a time of a run, by reason.
     """
 
     def __init__(self, tool: str, says: str) -> None:
@@ -112,17 +113,17 @@ class Found:
         self._left = MOST_SAMPLES
 
     def refuse(self, row: str, reason: str) -> None:
-        """Note a row whose number is not plausible. `row`: its place and name."""
+        """Note a row whose number is not plausible. `row`: place and name of the row, for messages."""
         self.refused_count += 1
         if len(self.refused) < MOST_REFUSED:
             self.refused.append(Refused(row[:LONGEST_NAME], reason))
 
     def skip(self, reason: str) -> None:
-        """Count a row that is no time of a run."""
+        """Count a row that does not contain a time of a run."""
         self.skipped[reason] += 1
 
     def number(self, row: str, value: object, what: str = "the time") -> float | None:
-        """Return `value` if it is a finite number that is not negative; otherwise refuse the row and return None.
+        """Return `value` if it is a finite number of at least 0; otherwise refuse the row and return None.
 
         `row`: place and name of the row, for messages.
         `what`: name of the number in messages.
@@ -147,6 +148,7 @@ class Found:
 
         `row`, `what`: as for `number`.
         `unit`: unit of `value`, a key of PER_MS.
+        `kind`: kind of the measurement.
         """
         number = self.number(row, value, what)
         if number is None:
@@ -163,10 +165,12 @@ class Found:
     def sample(
         self, row: str, name: str, kind: Kind, value: object, unit: str, what: str = "", **facts: Any
     ) -> float | None:
-        """Take one time of the measurement `name`; return it in ms, or None if it is refused.
+        """Add a time to the samples of the measurement `name`. Return the time in ms; None if it is refused.
 
-        `row`, `unit`: as for `ms`.
-        `what`, `facts`: fields of the measurement; those of its first sample count.
+        `row`, `kind`, `value`, `unit`: as for `ms`.
+        `what`, `facts`: further fields of the measurement; those of its first sample count.
+
+        Raises BadInputError for too many times or names.
         """
         time = self.ms(row, value, unit, kind)
         if time is None:
@@ -185,19 +189,19 @@ class Found:
         return time
 
     def add(self, measurement: Measurement) -> None:
-        """Take a measurement of a tool that states figures, but no single times."""
+        """Add a measurement of a tool that states figures, but no single times. Raises BadInputError for too many."""
         if len(self._made) >= MOST_NAMES:
             raise BadInputError("the file", f"over {MOST_NAMES} names", "fewer")
         self._made.append(replace(measurement, name=measurement.name[:LONGEST_NAME] or UNNAMED))
 
     def take_back(self, names: set[str], row: str, reason: str) -> None:
-        """Remove the measurements `names`, which `add` has taken, and refuse `row` for `reason`."""
+        """Remove the measurements `names`, which `add` has added, and refuse `row` for `reason`."""
         self._made = [each for each in self._made if each.name not in names]
         self.refuse(row, reason)
 
     @property
     def measurements(self) -> list[Measurement]:
-        """All measurements, those with samples first, in the order of the file."""
+        """All measurements in the order of the file, but those with samples come first."""
         sampled = [
             _of_samples(name, kind, values, self._facts[name, kind]) for (name, kind), values in self._samples.items()
         ]
@@ -227,7 +231,7 @@ def _of_samples(name: str, kind: Kind, samples: list[float], facts: dict[str, An
 
 
 def _told_apart(made: list[Measurement]) -> list[Measurement]:
-    """Return the measurements with different names: `net.tflite`, `net.tflite #2`."""
+    """Return the measurements, with numbers after names that repeat: `net.tflite`, `net.tflite #2`."""
     seen: Counter[str] = Counter()
     result = []
     for each in made:
@@ -238,7 +242,12 @@ def _told_apart(made: list[Measurement]) -> list[Measurement]:
 
 
 class Figures(NamedTuple):
-    """Figures of a distribution in ms, as a tool states them; None for a figure that it does not state."""
+    """Figures of measured times in ms, as a tool states them; None for a figure that the tool does not state.
+
+    `sd`: standard deviation.
+    `low`, `high`: least and largest time.
+    `p50`, `p95`: percentiles.
+    """
 
     mean: float | None = None
     sd: float | None = None
@@ -253,9 +262,9 @@ ROUNDING: Final = 2e-5
 
 
 def contradiction(figures: Figures) -> str:
-    """Return a sentence about two figures that contradict each other; "" if none do.
+    """Return a sentence about two figures that contradict each other; "" if no two figures do.
 
-    Mean and percentiles lie between the least and the largest time, and percentiles rise.
+    Mean and percentiles must lie between the least and the largest time, and a higher percentile must not be smaller.
     """
     named = [
         ("the least", figures.low),
@@ -278,10 +287,12 @@ def contradiction(figures: Figures) -> str:
 
 
 def falling(values: Sequence[float], slack: float = 0.0) -> list[int]:
-    """Return the indices of the longest series in `values` that never rises by more than the share `slack`.
+    """Return the indices of the longest series of `values`, in their order, that never rises by more than `slack`.
 
-    Values outside the series do not fit most other values. Of several longest series, the one with the larger sum is
-    returned: a wrong time lacks a part more often than it has one too many.
+    Values outside the series do not fit most other values. Of several longest series, the one with the largest sum is
+    returned, because a wrong time is more often too short than too long.
+
+    `slack`: largest rise, as a share of the value before.
     """
 
     def weight(series: list[int]) -> tuple[int, float]:

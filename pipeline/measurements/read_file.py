@@ -35,11 +35,12 @@ OWN_COLUMNS: Final = ("name", "kind", "unit", "sample", "ms")
 class Measurements:
     """The measurements of a file.
 
-    `tool`: name of its format.
-    `says`: description of its times, part of a sentence.
+    `path`: path of the file.
+    `tool`: name of the file's format.
+    `says`: description of the times in this format, as part of a sentence.
     `refused`: refused rows, at most MOST_REFUSED.
     `refused_count`: number of all refused rows.
-    `skipped`: number of rows that are no times of a run, by reason.
+    `skipped`: number of rows that do not contain a time of a run, by reason.
     """
 
     path: Path
@@ -80,7 +81,7 @@ def _found(path: Path) -> Found:
 
 
 def _about(path: Path, error: BadInputError) -> BadInputError:
-    """Return the error with the file's name, because a reader knows only the text."""
+    """Return the error with the path of the file, which the reader of a format does not know."""
     if str(path) in error.where:
         return error
     return BadInputError(path, f"{error.found} in {error.where}", error.expected, error.remedy)
@@ -110,9 +111,9 @@ def _of_text(path: Path, text: str) -> Found:
 
 
 def _of_json(path: Path, text: str) -> Found | None:
-    """Return the measurements of a JSON document; None for a log of benchmark_model that begins like JSON.
+    """Return the measurements of a JSON document; None if `text` is a log of benchmark_model that begins like JSON.
 
-    Raises BadInputError for other text that is no JSON, and for JSON of no known tool.
+    Raises BadInputError for any other text that is not JSON, and for JSON of no known tool.
     """
     try:
         document = json.loads(text, parse_int=whole_number)
@@ -170,7 +171,7 @@ def _of_list(document: object) -> Found | None:
 
 
 def _of_events(events: Sequence[Any]) -> Found:
-    """Return the measurements of trace events; events of ONNX Runtime have the category Session or Node."""
+    """Return the measurements in trace events of ONNX Runtime (categories Session and Node) or of another tool."""
     categories = {
         each.get("cat") for each in events[:1000] if isinstance(each, dict) and isinstance(each.get("cat"), str)
     }
@@ -180,7 +181,7 @@ def _of_events(events: Sequence[Any]) -> Found:
 
 
 def _events_by_line(text: str) -> tuple[list[Any], list[str]]:
-    """Return (events, places of the lines that are no event) of a cut-off list that has one event on each line."""
+    """Return (events, places of the lines that are no event) from a cut-off JSON list with one event on each line."""
     events, broken = [], []
     for number, line in enumerate(text.splitlines(), 1):
         bare = line.strip().removeprefix('{"traceEvents":').removeprefix("[").removesuffix("]").rstrip(", ")
@@ -198,7 +199,7 @@ def _events_by_line(text: str) -> tuple[list[Any], list[str]]:
 
 
 def _read_own(text: str) -> Found:
-    """Return the measurements of a CSV that `trilane times --csv` wrote."""
+    """Return the measurements in the text of a CSV that `trilane times --csv` wrote."""
     found = Found("CSV of trilane times", "samples, as another tool measured them")
     lines = text.splitlines()
     reader, last = csv.DictReader(lines), len(lines)
@@ -225,11 +226,13 @@ def _read_own(text: str) -> Found:
 
 
 def chosen(read: Measurements, name: str, where: str) -> Measurement:
-    """Return the measurement `name` as the time of a stage; an empty `name` stands for the only run.
+    """Return the measurement that gives the time of a stage.
 
-    `where`: place to name in errors.
+    `name`: name of the measurement; empty: the file must have exactly one run, which is returned.
+    `where`: place that errors name.
 
-    Raises BadInputError for an unknown name, for several runs or none without a name, and for no service time.
+    Raises BadInputError for an unknown name, and for a measurement that cannot be a service time. Without a name, it
+    is also raised if the file does not have exactly one run.
     """
     if name:
         found = [each for each in read.measurements if each.name == name]
@@ -253,7 +256,11 @@ def chosen(read: Measurements, name: str, where: str) -> Measurement:
 
 
 def _not_one(read: Measurements, runs: Sequence[Measurement], where: str) -> BadInputError:
-    """Return the error for a file without a single run; it lists the measurements that a name can choose."""
+    """Return the error for a file that has no run, or several; it lists the measurements that a name can choose.
+
+    `runs`: runs of the file.
+    `where`: place that the error names.
+    """
     usable = runs or [each for each in read.measurements if each.service and each.unit != CYCLES]
     listed = [f"{each.name!r}" if runs else f"{each.name!r} ({each.what})" for each in usable or read.measurements]
     shown = ", ".join(listed[:8]) + (" …" if len(listed) > 8 else "")

@@ -1,11 +1,11 @@
 """Readers of files that network runtimes write.
 
 The tools write these formats:
-- ONNX Runtime's profile (`profiler.cc`): a JSON array with an event a line; it is cut off if the session was not
-  closed.
-- The log of `benchmark_model` of TFLite and LiteRT: microseconds, but ms for operators.
-- TensorRT's layers from `trtexec --exportProfile`: ms.
-- The app benchmarks of react-native-executorch: ms.
+- ONNX Runtime's profile (`profiler.cc`): a JSON array with one event on each line, times in us. If the session was not
+  closed, the array is cut off.
+- The log of `benchmark_model` of TFLite and LiteRT: times in us, but of operators in ms.
+- TensorRT's layers from `trtexec --exportProfile`: times in ms.
+- The app benchmarks of react-native-executorch: times in ms.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ NODE_ENDING: Final = "_kernel_time"
 
 
 def read_ort(events: Sequence[Any]) -> Found:
-    """Read the events of ONNX Runtime's profile."""
+    """Return the measurements in the events of ONNX Runtime's profile."""
     found = Found("ONNX Runtime profile", "times of each call of the session, and of each node")
     for index, event in enumerate(events):
         row = f"event {index}"
@@ -74,19 +74,19 @@ OPERATORS: Final = "Run Order"
 
 
 def is_benchmark(text: str) -> bool:
-    """Return whether a text has lines of `benchmark_model`."""
+    """Return whether a text has lines that `benchmark_model` writes."""
     return re.search(r"\bcount=\d+ (first|curr)=|Inference timings in us:|Inference \(avg\):", text) is not None
 
 
 def read_benchmark(text: str) -> Found:
-    """Read the log of `benchmark_model`, which may contain several benchmarks."""
+    """Return the measurements in a log of `benchmark_model`, which may contain several benchmarks."""
     return _Benchmark(text).found
 
 
 class _Benchmark:
     """Reads the log of `benchmark_model` line by line.
 
-    The last line of figures before a summary belongs to the runs; a line of figures before it belongs to the warm-up.
+    The last line of figures before a summary is about the measured runs; an earlier one is about the warm-up.
     """
 
     def __init__(self, text: str) -> None:
@@ -146,10 +146,10 @@ class _Benchmark:
         self._figures = (place, pairs)
 
     def _flush(self, place: str, summary: str = "") -> None:
-        """Take the last line of figures, and check it against the summary, which repeats the mean.
+        """Add the last line of figures, after a check against the summary, which repeats the mean.
 
-        `place`: place of the summary.
-        `summary`: text of the summary; empty without one.
+        `place`: place of the summary in the file.
+        `summary`: text of the summary; empty without a summary.
         """
         figures, self._figures, self._is_warm = self._figures, None, False
         stated = re.search(r"Inference \(avg\): ([^\s,]+)", summary)
@@ -173,7 +173,12 @@ class _Benchmark:
         self._take(row, pairs, self._graph)
 
     def _take(self, place: str, pairs: Mapping[str, str], name: str) -> None:
-        """Take a line of figures in us. A line of a single run has its time in place of a mean."""
+        """Add the measurement in a line of figures in us. A line about a single run has a time in place of a mean.
+
+        `place`: place of the line in the file.
+        `pairs`: figures as texts, by the tool's key, such as `avg`.
+        `name`: name of the measurement.
+        """
         times = {key: _number(value) for key, value in pairs.items() if key != "count"}
         times.setdefault("avg", times.get("curr", ""))
         self._add(place, name, _number(pairs["count"]), times, "us")
@@ -186,7 +191,7 @@ class _Benchmark:
             self.found.add(Measurement(self._graph, "run", "us", what, mean_ms=time, hardware=hardware))
 
     def _flush_litert(self) -> None:
-        """Take the block of lines that newer versions print, with one figure and its unit in each line."""
+        """Add the measurement in a block of lines of newer versions, with one figure and its unit in each line."""
         if "avg" not in self._litert:
             self._litert = {}
             return
@@ -202,11 +207,12 @@ class _Benchmark:
         self._add(place, self._graph, float(count) if count else None, times, unit or "us")
 
     def _of_block(self, place: str, average: object, unit: str) -> None:
-        """Take the line of figures before a block, which repeats them with two digits.
+        """Add the line of figures before a block of lines, which repeats these figures with two digits.
 
-        If the block's mean contradicts the line, the line is refused.
+        If the block's mean contradicts the line, refuse the line.
 
-        `average`: mean of the block, in `unit`.
+        `place`: place of the block in the file.
+        `average`: mean that the block states, in `unit`.
         """
         assert self._figures is not None
         row, pairs = self._figures
@@ -219,9 +225,11 @@ class _Benchmark:
         self._flush("")
 
     def _add(self, place: str, name: str, count: object, times: Mapping[str, object], unit: str) -> None:
-        """Add the figures of the runs; refuse them if they contradict each other.
+        """Add a measurement; refuse it if its figures contradict each other, or one is no number.
 
-        `times`: figures in `unit`, by the tool's key, such as `avg`; a value that is no number is refused.
+        `place`: place of the figures in the file.
+        `count`: number of runs; None if the tool does not state it.
+        `times`: figures in `unit`, by the tool's key, such as `avg`.
         """
         row = f"{place}: {name}"
         if count is not None and (not isinstance(count, float) or count < 1 or count != count // 1):
@@ -254,7 +262,7 @@ class _Benchmark:
         )  # fmt: skip
 
     def _operator(self, place: str, line: str) -> None:
-        """Take a row of the table of operators in run order; the table's first row names the columns."""
+        """Add a row of the table of operators in run order. The first row of the table names the columns."""
         cells = [cell.strip() for cell in line.strip("\r\n").split("\t")][1:]
         if any(cell.lower() == "[node type]" for cell in cells):
             self._columns = [cell.strip("[]").lower() for cell in cells]
@@ -271,9 +279,10 @@ class _Benchmark:
 
 
 def _ran_by(lines: Sequence[str]) -> str:
-    """Return the delegate that ran the whole graph, from the lines of a log; "" if that is not clear.
+    """Return the delegate that ran the whole graph, from the lines of a log; "" if the log does not show it.
 
-    XNNPACK runs the operators that other delegates leave. If the log names no other delegate, all ran on the CPU.
+    XNNPACK runs, on the CPU, the operators that other delegates leave. Therefore it ran the whole graph only if the log
+    names no other delegate.
     """
     named = [line for line in lines if "delegate" in line.lower() and "\t" not in line]  # tables have tabs
     applied = [said[1] for line in named if (said := APPLIED.search(line))]
@@ -290,18 +299,18 @@ def _number(text: str) -> object:
 
 
 def _in_unit(value: object, of: str, unit: str) -> object:
-    """Return a number of the unit `of`, converted to `unit`; another value is returned unchanged."""
+    """Convert a number from the unit of time `of` to `unit`; return a value that is no number unchanged."""
     return value / PER_MS[of] * PER_MS[unit] if isinstance(value, float) and of != unit else value
 
 
 def is_tensorrt(document: Sequence[Any]) -> bool:
-    """Return whether `trtexec --exportProfile` wrote a list."""
+    """Return whether a JSON list is one that `trtexec --exportProfile` writes."""
     tables = [each for each in document[:3] if isinstance(each, dict)]
     return any("averageMs" in each or "timeMs" in each for each in tables)
 
 
 def read_tensorrt(document: Sequence[Any]) -> Found:
-    """Read the mean time of each layer that TensorRT exports, and their sum."""
+    """Return the mean time of each layer that TensorRT exports, and the sum of these times as a run."""
     found = Found("TensorRT profile", "the mean of each layer; their sum is the run without what lies between them")
     count, whole = None, 0.0
     for index, layer in enumerate(document):
@@ -325,7 +334,12 @@ def read_tensorrt(document: Sequence[Any]) -> Found:
 
 
 def _of_tensorrt(found: Found, row: str, layer: Mapping[str, Any], count: int | None) -> float | None:
-    """Add one layer; return its mean in ms, or None if it is refused. `count`: number of runs, if known."""
+    """Add one layer to `found`, and return its mean in ms; None if it is refused.
+
+    `row`: place and name of the layer, for messages.
+    `layer`: the layer's table.
+    `count`: number of runs; None if it is not known.
+    """
     mean = found.ms(row, layer.get("averageMs"), "ms", "layer", "averageMs")
     if mean is None:
         return None
@@ -346,7 +360,7 @@ def _of_tensorrt(found: Found, row: str, layer: Mapping[str, Any], count: int | 
 
 
 def read_layer_means(document: Sequence[Any]) -> Found:
-    """Read a list of layers with `average_time_ms`, as scripts make from TensorRT's profiles."""
+    """Return the measurements in a list of layers with `average_time_ms`, as scripts make from TensorRT's profiles."""
     found = Found("table of layers' means", "the mean of each layer")
     for index, layer in enumerate(document):
         name = str(layer.get("name", index)) if isinstance(layer, dict) else str(index)
@@ -361,9 +375,10 @@ CUT: Final = re.compile(r"^(.*)_at_(-?\d+)$")
 
 
 def read_cut_means(document: Mapping[str, Any]) -> Found:
-    """Read a table of mean times of networks that are cut after layer N (`NAME_at_N`).
+    """Return the measurements in a table of mean times of networks that are cut after layer N (`NAME_at_N`).
 
-    The rest of a network behind a later cut cannot take longer than the rest behind an earlier cut.
+    The part of a network behind a later cut cannot take longer than the part behind an earlier cut. A time that
+    contradicts this is refused.
     """
     found = Found("table of times by cut", "the mean for each place at which a network is cut")
     rests: dict[str, list[tuple[int, float]]] = defaultdict(list)
@@ -394,11 +409,11 @@ def read_cut_means(document: Mapping[str, Any]) -> Found:
 
 
 def rising_rests(points: Sequence[tuple[int, float]]) -> Iterator[tuple[int, str]]:
-    """Yield (cut to remove, reason), so that the times that are left never rise from cut to cut.
+    """Yield (cut to remove, reason) for each time that must be removed so that times never rise from cut to cut.
 
     The longest series of times that never rises stays.
 
-    `points`: pairs of a cut and the time of the network behind it in ms.
+    `points`: pairs (number of the layer of the cut, time in ms of the part of the network behind the cut).
     """
     ordered = sorted(points)
     kept = falling([time for _, time in ordered])
@@ -411,7 +426,7 @@ def rising_rests(points: Sequence[tuple[int, float]]) -> Iterator[tuple[int, str
 
 
 def read_executorch(document: Mapping[str, Any]) -> Found:
-    """Read the app benchmarks of react-native-executorch: the network's own calls, and the app around them."""
+    """Return the measurements of react-native-executorch: calls of a network, and wall times of the app around them."""
     says = "runs of each network as its runtime sees them, and wall times of the app around them"
     found = Found("react-native-executorch benchmarks", says)
     for index, case in enumerate(document["cases"]):

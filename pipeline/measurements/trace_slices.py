@@ -1,8 +1,9 @@
-"""Reads the named slices of a trace as samples: Perfetto's packets and Chrome's JSON, without a trace processor.
+"""Reads the named slices of a trace as samples: Perfetto's packets and Chrome's JSON, without Perfetto's processor.
 
 Slices come from track events, and from marks of Android's atrace in ftrace packets. Track events may have interned
-names, delta clocks, compressed packets, or the form of older Chrome. A slice is a wall time: it contains all waits of
-its thread.
+names, delta clocks, compressed packets, or the form of older versions of Chrome. The length of a slice is a wall time:
+it contains all waits of the slice's thread.
+
 Sources: the comments of Perfetto's protos (track_event.proto, clock_snapshot.proto); Chrome's Trace Event Format.
 """
 
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
 WHAT: Final = "slice, with what its thread waited for"
 WHAT_ASYNC: Final = "asynchronous slice, with all waiting"
 BEGINS, ENDS, ASYNC = "BbS", "EeF", "beSF"  # phases of Chrome's events; b, e, S and F belong to asynchronous slices
-#: Meaning of the events of all other phases.
+#: Meaning of the events of all other phases, by phase.
 NO_SLICES: Final = {
     "M": "a name or another fact of a process or thread, no slice",
     "C": "a counter, no slice",
@@ -42,14 +43,17 @@ STATE_CLEARED, NEEDS_STATE = 1, 2  # flags of a packet
 LOST_STATE: Final = "an event whose names or clock were in packets that are lost"
 NO_CLOCK: Final = "an event on a clock that the trace does not explain"
 ATRACE: Final = re.compile(r"([BE])(?:\|(\d+)(?:\|(.*))?)?\s*", re.DOTALL)
-#: Traces as text, which are recognised but not read: ftrace's lines, and Perfetto's.
+#: Traces as text are recognised, but not read: lines of ftrace, and Perfetto's text.
 FTRACE_TEXT: Final = re.compile(r"^# tracer: |\[\d{3}\] .{0,40}\d+\.\d+: \w+: ", re.MULTILINE)
 PERFETTO_TEXT: Final = re.compile(r"\s*packet\s*:?\s*\{")
 PACKET: Final = 0x0A  # field 1 of a Trace, with a length
 
 
 def is_perfetto(head: bytes) -> bool:
-    """Return whether a file begins like a trace of Perfetto, with a packet and its length, and not with text."""
+    """Return whether a file begins like a trace of Perfetto: with a packet and its length, and not with text.
+
+    `head`: first bytes of the file.
+    """
     if head[:1] != bytes([PACKET]):
         return False
     try:
@@ -60,7 +64,7 @@ def is_perfetto(head: bytes) -> bool:
 
 
 def read_perfetto(data: bytes) -> Found:
-    """Read the slices of a Perfetto trace. Raises BadInputError for other bytes."""
+    """Return the slices of a Perfetto trace, whose bytes are `data`. Raises BadInputError for other bytes."""
     found = Found("Perfetto trace", "wall times of named slices")
     _Slices(found).read(data)
     return found
@@ -111,7 +115,12 @@ def _uncompressed(data: bytes) -> Iterator[TracePacket]:
 
 
 class _Sequence:
-    """The state of one writer of packets: names by number, its clocks, its default track and clock."""
+    """The state of one writer of packets (a sequence in Perfetto's words).
+
+    `names`: names of events by their numbers.
+    `clocks`: for each clock of the writer, its last time in ns, ns of a tick, and whether times are differences.
+    `default_clock`, `default_track`: clock and track of packets that state none.
+    """
 
     def __init__(self) -> None:
         self.names: dict[int, str] = {}
@@ -124,7 +133,7 @@ class _Sequence:
 class _Slices:
     """Reads the slices of a Perfetto trace.
 
-    Begins and ends are first collected by track, because packets of several writers come in any order.
+    Packets of several writers come in any order. Therefore all begins and ends are collected by track, and then paired.
     """
 
     def __init__(self, found: Found) -> None:
@@ -149,7 +158,10 @@ class _Slices:
             self._pair(sorted(marks, key=lambda mark: mark[0]))  # marks of one time stay in their order
 
     def _pair(self, marks: Sequence[tuple[int, str | None]]) -> None:
-        """Take the slices of one track. Each end belongs to the last begin that is still open."""
+        """Add the slices of one track. Each end belongs to the last begin that is still open.
+
+        `marks`: pairs (time in ns, name of the slice that begins; None for an end), in the order of time.
+        """
         begun: list[tuple[str, int]] = []
         for at, name in marks:
             if name is not None:
@@ -175,7 +187,7 @@ class _Slices:
                 self._mark(event.pid, event.timestamp, event.print.buf)
 
     def _learned(self, packet: TracePacket) -> _Sequence:
-        """Return the sequence of a packet, after adding the packet's names, defaults and clocks to it."""
+        """Add a packet's names, defaults and clocks to the state of its writer, and return this state."""
         sequence = self._sequences[packet.trusted_packet_sequence_id]
         if packet.previous_packet_dropped:
             sequence.is_known = False
@@ -195,7 +207,7 @@ class _Slices:
         return sequence
 
     def _time(self, packet: TracePacket, sequence: _Sequence) -> int | None:
-        """Return the time of a packet in ns; None for a program's own clock that no snapshot explains."""
+        """Return the time of a packet in ns; None if its clock belongs to a program and no snapshot explains it."""
         known = packet.timestamp_clock_id or sequence.default_clock
         clock = sequence.clocks.get(known) or self._clocks.get(known)
         if clock is None:
@@ -217,7 +229,11 @@ class _Slices:
             self._take(name, at, at + 1000 * event.legacy_event.duration_us)
 
     def _mark(self, thread: int, at: int, text: str) -> None:
-        """Take a mark of atrace: `B|process|name` begins a slice of the thread, `E` ends the thread's last slice."""
+        """Collect a mark of atrace: `B|process|name` begins a slice of the thread, `E` ends the thread's last slice.
+
+        `thread`: id of the thread.
+        `at`: time in ns.
+        """
         mark = ATRACE.fullmatch(text)
         if mark is not None:
             self._marks["thread", thread].append((at, (mark[3] or "").strip() if mark[1] == "B" else None))
@@ -232,7 +248,10 @@ class _Slices:
 
 
 def _varint(data: bytes, at: int) -> tuple[int, int]:
-    """Return (number, index behind it) of the protobuf varint at index `at`; the number is -1 if it does not end."""
+    """Return (number, index of the byte behind it) of the protobuf varint at index `at`.
+
+    If the varint does not end, return (-1, `at`).
+    """
     value = 0
     for index in range(10):
         if at + index >= len(data):
@@ -245,10 +264,10 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
 
 
 def read_chrome(events: Sequence[Any]) -> Found:
-    """Read the slices of a trace in Chrome's format: complete events, and pairs of begin and end. Times are us.
+    """Return the slices of a trace in Chrome's format: complete events, and pairs of begin and end. Times are in us.
 
-    If an asynchronous slice has the name of an ordinary slice, it is called `name (async)`, so that their times do not
-    mix.
+    If an asynchronous slice has the name of an ordinary slice, it is called `name (async)`, so that the times of the
+    two do not mix.
     """
     found = Found("Chrome trace (JSON)", "wall times of named slices")
     slices = _ChromeSlices(found)
@@ -314,9 +333,9 @@ def _thread(event: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _asynchronous_track(event: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return a key that begin and end of an asynchronous slice share; () if a part of the key is missing.
+    """Return the key that begin and end of an asynchronous slice have in common; () if a part of the key is missing.
 
-    If its id is not local, the slice may end in another process.
+    Only a slice with a local id must end in the process where it began.
     """
     name, id_, scoped = event.get("name"), event.get("id"), event.get("id2")
     process = ""

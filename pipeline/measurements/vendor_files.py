@@ -1,23 +1,24 @@
 """Readers of files that vendors' tools write: Qualcomm's profiles, and MLPerf's results.
 
 Qualcomm's tools write these formats:
-- The QNN execution provider of ONNX Runtime (`qnn_backend_manager.cc`) writes seven columns. It appends the rows of
-  each run, and does not quote identifiers.
-- `qnn-profile-viewer` writes the same table after some lines of text. The header has blanks, each row has `EXECUTE`,
-  and `qnn-net-run` itself has a row.
-- QHAS of QAIRT writes `htp_overall_summary`.
-- `download_profile()` of qai-hub returns times in microseconds.
+- The QNN execution provider of ONNX Runtime (`qnn_backend_manager.cc`) writes a CSV with seven columns. It appends the
+  rows of each run, and does not quote identifiers.
+- `qnn-profile-viewer` writes the same table after some lines of text. Its header has blanks, each of its rows has
+  `EXECUTE`, and there is a row for `qnn-net-run` itself.
+- QHAS of QAIRT writes JSON with the table `htp_overall_summary`.
+- `download_profile()` of qai-hub returns JSON with times in us.
 
-Cycles become shares of a run, never times, because the clock is not in the file.
+Cycles become shares of a run, never times, because the files do not state the clock.
 
 MLPerf's files are the summary of LoadGen, and the result file of the mobile app.
 
-In SingleStream the next query begins when the last one has ended, so a latency is a service time. In the other
-scenarios queries wait for each other, or come many at once: their latencies are wall times with queueing.
+In LoadGen's scenario SingleStream, a query begins when the query before has ended, so a latency is a service time. In
+all other scenarios queries wait for each other or come many at once, so a latency is a wall time with queueing.
 
 Versions: LoadGen before 1.0 writes `Single Stream` and `Performance`. The app before 4.0 states no latencies, but the
-duration of all queries (`loadgen_info.duration`, or `duration_ms`). Before 3.0 its file is a list of results. In
-SingleStream the app's throughput is the reciprocal of the 90th percentile.
+duration of all queries (`loadgen_info.duration`, or `duration_ms`). The file of an app before 3.0 is a list of results.
+In SingleStream the app's throughput is the reciprocal of the 90th percentile.
+
 Source: the results that mlcommons publishes (mobile_results_v2.1 to v5.0).
 """
 
@@ -44,7 +45,7 @@ from trilane.pipeline.measurements.measurement import (
 
 QNN_COLUMNS: Final = ("Msg Timestamp", "Message", "Time", "Unit of Measurement", "Timing Source", "Event Level")
 IDENTIFIER: Final = "Event Identifier"
-#: Units of the CSV. Counts, bytes and objects are no times.
+#: Unit of time for each unit in the CSV. Counts, bytes and objects (NO_TIMES) are no times.
 QNN_UNITS: Final = {"US": "us", "MICROSEC": "us", "MS": "ms", "NS": "ns", "S": "s", "CYCLES": CYCLES}
 NO_TIMES: Final = ("COUNT", "BYTES", "OBJECT", "NONE", "INF/SEC", "UNKNOWN", "")
 #: Times of one execution, the outermost first: each contains the next.
@@ -59,12 +60,12 @@ NESTED: Final = (
     ("Accelerator (execute excluding wait) time", "accelerator, without waiting"),
 )
 WHAT: Final = dict(NESTED)
-NESTED_SLACK: Final = 0.01  # share by which a time may be longer than one around it
-RATE_SLACK: Final = 0.02  # relative, between a time and the rate that the same file states
+NESTED_SLACK: Final = 0.01  # share by which a time may be longer than a time that contains it
+RATE_SLACK: Final = 0.02  # largest relative difference between a rate and the reciprocal of its time
 
 
 def is_qnn(lines: Sequence[str]) -> bool:
-    """Return whether one of the first lines is the header of the QNN CSV."""
+    """Return whether one of the first 20 lines of a file is the header of the QNN CSV."""
     return any(_names(line.lstrip("\ufeff").split(","))[:3] == list(QNN_COLUMNS[:3]) for line in lines[:20])
 
 
@@ -73,7 +74,7 @@ def _names(cells: Sequence[str]) -> list[str]:
 
 
 def read_qnn(text: str) -> Found:
-    """Read the CSV of the QNN execution provider, one run or many."""
+    """Return the measurements in a CSV of the QNN execution provider, which has one run or many."""
     found = Found("QNN profile (CSV)", "times of each run; of its nodes only cycles, which are shares")
     cycles: dict[str, list[float]] = defaultdict(list)
     run = _Run(found)
@@ -100,9 +101,10 @@ def read_qnn(text: str) -> Found:
 
 
 def _qnn_rows(text: str, found: Found) -> Iterator[tuple[str, dict[str, str], str, str]]:
-    """Yield (place, cells by column, identifier, graph) of each row; the graph is "" for a row that names none.
+    """Yield (place, cells by column, name of the event, graph) of each row; refuse damaged rows.
 
-    In joined files a header may come again. Each line is parsed by itself, so that an open quote damages only one row.
+    The graph is "" for a row that names none. In files that were joined a header may come again. Each line is parsed by
+    itself, so that an open quote damages only one row.
     """
     header: list[str] = []
     for number, line in enumerate(text.splitlines(), 1):
@@ -132,9 +134,12 @@ def _qnn_rows(text: str, found: Found) -> Iterator[tuple[str, dict[str, str], st
 
 
 def _event(named: dict[str, str], identifier: str) -> str:
-    """Return the name of an event. A row of `qnn-net-run` has the graph's name as identifier, an unnamed event NULL.
+    """Return the name of a row's event.
 
-    The texts of the other columns in `named` are cleaned in place.
+    This is the identifier, with two exceptions: a row of `qnn-net-run` has the graph's name as identifier, and an event
+    without a name has NULL.
+
+    `named`: cells by column; the texts of other columns are cleaned in place.
     """
     for column in ("Event Level", "Message", "Timing Source"):
         named[column] = named.get(column, "").strip().upper()
@@ -147,7 +152,11 @@ def _event(named: dict[str, str], identifier: str) -> str:
 
 
 def _fits_name(unit: str, identifier: str, level: str) -> bool:
-    """Return whether a unit agrees with the event's name. The name of a node need not contain `(cycles)`."""
+    """Return whether a row's unit agrees with its event's name. The name of a node need not contain `(cycles)`.
+
+    `unit`: key of QNN_UNITS.
+    `level`: event level; SUB-EVENT: a node.
+    """
     if QNN_UNITS[unit] == CYCLES and level == "SUB-EVENT":
         return identifier not in WHAT
     return ("(cycles)" in identifier.lower()) == (QNN_UNITS[unit] == CYCLES)
@@ -161,10 +170,10 @@ def _number_of(text: str) -> object:
 
 
 class _Run:
-    """Collects the times of one execution, in any order.
+    """Collects the times of one execution after the other, each in any order.
 
-    A name that comes again begins the next execution; the whole time after its parts ends the present one. A row of
-    `qnn-net-run` names the graph of an execution.
+    A name that comes again begins the next execution. The time of the whole execution, if it comes after its parts,
+    ends the execution. A row of `qnn-net-run` names the graph of an execution.
     """
 
     def __init__(self, found: Found) -> None:
@@ -186,7 +195,7 @@ class _Run:
             self.end()
 
     def end(self) -> None:
-        """End the execution: take the times that fit into each other, and refuse times that do not fit most others."""
+        """End the execution: keep the times that fit into each other, and refuse those that do not fit most others."""
         names = [name for name, _ in NESTED if name in self._rows]
         ms = [self._rows[name][1] / PER_MS[self._rows[name][2]] for name in names]
         kept = falling(ms, NESTED_SLACK)
@@ -203,7 +212,7 @@ class _Run:
         self._rows, self._graph = {}, ""
 
     def finish(self) -> None:
-        """Take the times of all executions; if the file has several graphs, the names contain the graph."""
+        """Add the times of all executions to the measurements; if there are several graphs, names contain the graph."""
         self.end()
         several = len({graph for graph, *_ in self._ended if graph}) > 1
         for graph, row, name, value, unit in self._ended:
@@ -218,7 +227,10 @@ def _take_cycles(found: Found, row: str, level: str, name: str, value: object, c
 
 
 def _add_cycles(found: Found, cycles: Mapping[str, Sequence[float]]) -> None:
-    """Add each node with its share of all nodes' cycles. `cycles`: counts of each node by name; "" for whole runs."""
+    """Add each node to `found`, with its share of all nodes' cycles.
+
+    `cycles`: counts of cycles by the node's name; under "" the counts of whole runs.
+    """
     nodes = {name: sum(values) / len(values) for name, values in cycles.items() if name}
     _add_shares(found, nodes, {name: len(cycles[name]) for name in nodes})
     if of_runs := cycles.get(""):
@@ -239,7 +251,7 @@ def _add_shares(found: Found, nodes: Mapping[str, float], counts: Mapping[str, i
 
 
 def read_qhas(document: Mapping[str, Any]) -> Found:
-    """Read the summary of a QHAS analysis."""
+    """Return the measurements in the summary of a QHAS analysis."""
     found = Found("QHAS summary", "the mean time of a run with its traffic; of operators only cycles, which are shares")
     data = document.get("data", document)
     rows = _rows(data.get("htp_overall_summary"))
@@ -287,7 +299,7 @@ def _rows(table: object) -> list[dict[str, Any]]:
 
 
 def read_ai_hub(document: Mapping[str, Any]) -> Found:
-    """Read the result of `download_profile()` of AI Hub. All its times are microseconds."""
+    """Return the measurements in the result of AI Hub's `download_profile()`, whose times are in us."""
     found = Found("AI Hub profile", "times of each run on the device, and the mean of each layer")
     summary = document.get("execution_summary")
     summary = summary if isinstance(summary, dict) else {}
@@ -339,13 +351,13 @@ LATENCY: Final = re.compile(r"(Min|Max|Mean|[\d.]+ percentile) latency \(ns\)")
 PROCESSED: Final = re.compile(r"Processed at least \d+ queries \((\d+)\)")
 APP_RATE_SLACK: Final = 0.25  # relative difference between a rate and the reciprocal of its time
 RATE_ROUNDING: Final = 0.005  # of the rates that LoadGen prints
-UNIT_SLACK: Final = 10.0  # factor between mean and 90th percentile; a wrong unit differs by more
+UNIT_SLACK: Final = 10.0  # largest factor between mean and 90th percentile; a wrong unit gives a larger factor
 WHOLE_MS: Final = "measured_duration_ms"  # key of the duration of all queries, if the app states nothing of LoadGen
 ACCURACY: Final = ("AccuracyOnly", "Accuracy")
 
 
 def read_loadgen(text: str) -> Found:
-    """Read mlperf_log_summary.txt."""
+    """Return the measurements in LoadGen's summary, mlperf_log_summary.txt."""
     found = Found("LoadGen summary", "latencies of queries, as percentiles")
     facts: dict[str, tuple[str, str]] = {}
     count = None
@@ -428,7 +440,10 @@ def _what(scenario: str) -> str:
 
 
 def _of_rate(scenario: str, facts: Mapping[str, tuple[str, str]], mean_ms: float) -> str:
-    """Return a sentence if the rate of a SingleStream run contradicts its mean latency; otherwise ""."""
+    """Return a sentence if the rate of a SingleStream run contradicts its mean latency; otherwise "".
+
+    `facts`: (place, value) of each line of the summary, by the line's key.
+    """
     rate = _number(facts.get("QPS w/o loadgen overhead", ("", ""))[1])
     if scenario != SINGLE or not isinstance(rate, float) or rate <= 0:
         return ""
@@ -451,7 +466,7 @@ def is_mlperf_app(document: object) -> bool:
 
 
 def _results(documents: Sequence[Any]) -> Iterator[tuple[str, Any]]:
-    """Yield (place in the file, table) of each benchmark."""
+    """Yield (place in the file, table) of each benchmark. `documents`: results of the app."""
     for number, each in enumerate(documents):
         results = each.get("results") if isinstance(each, dict) else None
         for index, result in enumerate(results if isinstance(results, list) else []):
@@ -459,7 +474,7 @@ def _results(documents: Sequence[Any]) -> Iterator[tuple[str, Any]]:
 
 
 def read_mlperf_app(document: Mapping[str, Any] | Sequence[Any]) -> Found:
-    """Read the result file of MLPerf's mobile app. Its latencies are seconds."""
+    """Return the measurements in the result file of MLPerf's mobile app, whose latencies are in seconds."""
     found = Found("MLPerf app results", "")
     divided = stated = False
     for row, result in _results(document if isinstance(document, list) else [document]):
@@ -487,14 +502,20 @@ def read_mlperf_app(document: Mapping[str, Any] | Sequence[Any]) -> Found:
 
 
 def _loadgen(run: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the table with LoadGen's latencies, which the app calls `loadgen` from 4.0 on; {} if there is none."""
+    """Return the table with LoadGen's latencies; {} if there is none. From 4.0 on the app calls it `loadgen`."""
     older = run.get("loadgen_info")
     table = older if isinstance(older, dict) and "latency_mean" in older else run.get("loadgen")
     return table if isinstance(table, dict) else {}
 
 
 def _of_older_app(found: Found, row: str, run: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the table that newer versions state. Its mean is the duration of all queries divided by their number."""
+    """Return a table like `_loadgen` of newer versions; its mean is the duration of all queries over their number.
+
+    The mean is in seconds; None if the duration is refused.
+
+    `row`: place and name of the benchmark, for messages.
+    `run`: table `performance_run` of the benchmark.
+    """
     info = run.get("loadgen_info")
     info = info if isinstance(info, dict) else {}
     key = next((key for key in ("duration", "duration_ms") if key in info), "duration" if info else WHOLE_MS)
@@ -553,7 +574,10 @@ def _add_result(
 def _fits(rate: float, mean_ms: float, p90_ms: float | None) -> bool:
     """Return whether a rate is about the reciprocal of the 90th percentile.
 
-    If no percentile is stated, the reciprocal of the mean must not differ as much as a wrong unit would.
+    Without a percentile, return whether the rate differs less from the reciprocal of the mean than a wrong unit would
+    make it.
+
+    `rate`: queries a second.
     """
     if p90_ms is not None:
         return (

@@ -1,7 +1,7 @@
 """Trilane: run, measure and predict a neural-avatar pipeline on CPU, GPU and DSP units.
 
-`run`, `predict` and `load_run` are its interface for programs and notebooks (docs/python.md). Rule: importing this
-module imports nothing else; the names of the interface are looked up on first use.
+`run`, `predict` and `load_run` are the interface for programs and notebooks (docs/python.md). Rule: importing this
+module imports nothing else of Trilane; the interface is imported on first use.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -13,7 +13,7 @@ __all__ = ["Prediction", "Run", "RunFailedError", "load_run", "predict", "run"]
 
 
 def __getattr__(name: str) -> Any:
-    """Return an object of the interface, or the version, at its first use: reading the version takes long."""
+    """Return a name of the interface, or `__version__`. Neither is made at import, because that takes long."""
     if name in __all__:
         from importlib import import_module
 

@@ -7,7 +7,7 @@ from typing import NoReturn
 
 
 def entry() -> NoReturn:
-    """Run the command line. While its modules are imported, Ctrl-C ends it at once, without a traceback."""
+    """Run the command line. During the imports, Ctrl-C ends the process at once, without a traceback."""
     handler = signal.getsignal(signal.SIGINT)
     if handler is signal.default_int_handler:  # a shell's background job ignores SIGINT
         signal.signal(signal.SIGINT, signal.SIG_DFL)

@@ -33,7 +33,7 @@ Shape = tuple[int, int]
 
 
 def parse_shape(text: str) -> Shape:
-    """Parse `HxW` as (height, width). Raises UnexpectedValue."""
+    """Return (height, width) from a text such as `256x128`. Raises UnexpectedValue for another text."""
     match = re.fullmatch(r"(\d+)x(\d+)", text)
     if match is None:
         raise UnexpectedValue(repr(text), "HEIGHTxWIDTH such as 256x256")
@@ -43,9 +43,9 @@ def parse_shape(text: str) -> Shape:
 def shape_buckets(size: str) -> list[Shape]:
     """Return the tensor shapes (height, width) that `size` allows.
 
-    `HxW` gives that one shape. A single number S gives shapes of at most S² pixels, with sides in multiples of 32 and
-    an aspect within 1:4. No shape contains another: tall shapes suit a standing body, wide shapes a lying body. Raises
-    UnexpectedValue when a side is no multiple of 32 or out of range.
+    If `size` is `HxW`, this one shape is allowed. If it is one number S, the result is `shapes_within(S²)`: tall shapes
+    suit a standing body, wide shapes a lying body. Raises UnexpectedValue for another text, and for a side that is not
+    a multiple of BUCKET_STEP or is out of range.
     """
     if re.fullmatch(r"\d+", size):
         return shapes_within(_check_side(int(size)) ** 2)
@@ -54,11 +54,11 @@ def shape_buckets(size: str) -> list[Shape]:
 
 
 def shapes_within(pixels: int) -> list[Shape]:
-    """Return the shapes (height, width) of at most `pixels` pixels. No shape contains another.
+    """Return the largest tensor shapes (height, width) of at most `pixels` pixels: none fits inside another.
 
-    Sides are multiples of `BUCKET_STEP`. The longer side has at most `MOST_ASPECT` times the length of the shorter one.
+    Sides are multiples of `BUCKET_STEP`. The longer side is at most `MOST_ASPECT` times as long as the shorter side.
 
-    `pixels`: at least `BUCKET_STEP`².
+    `pixels`: number of pixels, at least `BUCKET_STEP`².
     """
     longest = math.isqrt(MOST_ASPECT * pixels)
     widest = [(h, pixels // h // BUCKET_STEP * BUCKET_STEP) for h in range(BUCKET_STEP, longest + 1, BUCKET_STEP)]
@@ -73,6 +73,6 @@ def _check_side(side: int) -> int:
 
 
 def checked_size(size: str) -> str:
-    """Return `size` unchanged. Raises UnexpectedValue when `shape_buckets` does."""
+    """Return `size` unchanged. Raises UnexpectedValue if `shape_buckets` refuses it."""
     shape_buckets(size)
     return size

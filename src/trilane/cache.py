@@ -27,7 +27,7 @@ Arrays = Mapping[str, NDArray[Any]]
 
 
 def cache_dir(name: str) -> Path | None:
-    """Return the folder of the cache `name`, made if it is missing; None when it cannot be written."""
+    """Return the folder of the cache `name`, which is made if it is missing; None if it cannot be written."""
     try:
         folder = machine.here.cache_home() / "trilane" / name
         folder.mkdir(parents=True, exist_ok=True)
@@ -37,9 +37,9 @@ def cache_dir(name: str) -> Path | None:
 
 
 def cache_entry(name: str, file: str) -> Path | None:
-    """Return the path of `file` in the cache `name`; None when the cache cannot be written.
+    """Return the path of `file` in the cache `name`; None if the cache cannot be written.
 
-    Also None when the path leads to something other than a file, such as a pipe: reading a pipe would wait.
+    Return None too if the path exists but is not a file, such as a pipe, from which a read would wait.
     """
     folder = cache_dir(name)
     if folder is None:
@@ -49,9 +49,11 @@ def cache_entry(name: str, file: str) -> Path | None:
 
 
 def cached_arrays(name: str, sources: Iterable[NDArray[Any] | str], make: Callable[[], Arrays]) -> Arrays:
-    """Return the arrays that `make` computes from `sources`; take them from the cache if they are there.
+    """Return the arrays by name, from the cache if they are there, else from `make`.
 
     `name`: name of the arrays, with a version number. The number must grow when the code of `make` changes.
+    `sources`: everything from which `make` computes the arrays.
+    `make`: function that computes the arrays.
     """
     entry = cache_entry(ARRAYS, f"{_digest(name, sources)}.npz")
     if entry is None:
@@ -68,7 +70,7 @@ def cached_arrays(name: str, sources: Iterable[NDArray[Any] | str], make: Callab
 
 
 def _read(entry: Path) -> Arrays | None:
-    """Return the arrays in the file `entry`; None when the file is missing or damaged in any way."""
+    """Return the arrays in the file `entry`, by name; None if the file is missing or damaged in any way."""
     try:
         with entry.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             return {key: stored[key] for key in stored.files}

@@ -1,9 +1,9 @@
 """The errors that reach a person: each says what was found, what was expected and how to fix it.
 
-Code raises these for anything a user can cause; the command line turns them into one sentence and an exit code. The
-parts of a sentence are fields: no code parses them out of a text. A remedy may be the word that a person most likely
-meant, or the command that installs what is missing, to be typed as it is. That command fits the way in which this
-Trilane was installed. It never fetches Trilane from a package index, because no index has Trilane.
+Code raises these errors for anything that a user can cause; the command line turns each into one sentence and an exit
+code. The parts of the sentence are fields of the error, so that no code parses a text. A remedy may be the word that a
+person most likely meant, or a command that installs a missing package. This command can be typed as it is, and fits the
+way in which this Trilane was installed. It never fetches Trilane from a package index, because no index has Trilane.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from trilane.unexpected_value import UnexpectedValue
 
 
 def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:
-    """Return the remedy `did you mean 'x'?` with the word of `known` most like `word`; empty if no word is near.
+    """Return the remedy `did you mean 'x'?`, where x is the word of `known` most like `word`; empty if no word is near.
 
-    A word is also near if no other word of `known` begins with `word`.
+    If exactly one word of `known` begins with `word`, it is near too.
 
     `prefix`: text that the remedy puts before the suggested word, such as a folder.
     """
@@ -38,8 +38,8 @@ def _only_one(words: list[str]) -> list[str]:
 
 
 PACKAGE = Path(__file__).resolve().parent
-#: Used in place of the packages' names if no installed distribution lists them. The source tree is then a copied folder
-#: without its pyproject.toml.
+#: Text in place of the packages' names if no installed distribution lists them. This happens if the source tree was
+#: copied without its pyproject.toml.
 UNKNOWN = "(the packages that Trilane's pyproject.toml lists)"
 #: EGL and a software OpenGL driver, on Debian and Ubuntu.
 EGL_LINE = "apt-get install libegl1 libgl1-mesa-dri"
@@ -57,7 +57,7 @@ def clone() -> Path | None:
 def pip() -> str:
     """Return the command that runs this Python's pip.
 
-    Its path is relative if this Python is the clone's .venv and the clone is the working directory.
+    The command has a relative path if this Python is that of the clone's .venv, and the working directory is the clone.
     """
     root = clone()
     if root is None or Path(sys.prefix).resolve() != root / ".venv":
@@ -91,7 +91,7 @@ def _stands_in(root: Path) -> bool:
 
 
 def _requirements(extra: str) -> Iterator[str]:
-    """Yield what the installed distribution requires for `extra` (for "": in every run), without markers."""
+    """Yield the requirements of the installed distribution for `extra`, without markers; "": those of every run."""
     try:
         lines = importlib.metadata.requires("trilane") or []
     except importlib.metadata.PackageNotFoundError:
@@ -103,7 +103,7 @@ def _requirements(extra: str) -> Iterator[str]:
             yield requirement.strip()
 
 
-#: Error numbers of a place that takes no more data, and the remedy.
+#: Error numbers of a place that takes no more data, and the remedy for them.
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS})
 FREE_SPACE = "free space there or choose another --out"
 #: Most characters of `found` that a message shows.
@@ -111,10 +111,10 @@ LONGEST_FOUND = 500
 
 
 def reason(error: Exception) -> str:
-    """Return why `error` happened, as part of a sentence.
+    """Return the reason of `error` as part of a sentence.
 
-    For an OSError this is the system's text without number and path, with the limit on file sizes if that was reached.
-    For any other error it is the error's own text.
+    For an OSError it is the system's text without number and path. If the limit on file sizes was reached, the limit is
+    added. For any other error it is the error's own text.
     """
     if not isinstance(error, OSError):
         return str(error)
@@ -199,12 +199,11 @@ class UnitLostError(TrilaneError):
 
 
 class MissingPartError(TrilaneError):
-    """The environment lacks something. Exit code 3.
+    """A part that the program needs is not installed. Exit code 3.
 
-    `what`: sentence part that says what is missing.
-    `install`: command that installs it.
-    `extra`: Trilane's extra that contains it, or several joined by commas. If `install` is empty, the command installs
-    these extras.
+    `what`: sentence part that names the missing part.
+    `install`: command that installs this part; empty: the command that installs `extra`.
+    `extra`: Trilane's extra that contains this part, or several extras joined by commas.
     """
 
     exit_code = 3
@@ -220,7 +219,7 @@ class MissingPartError(TrilaneError):
 def require(checks: Iterable[Callable[[], object]]) -> None:
     """Call all `checks`, and raise one MissingPartError for all missing parts, with one command that installs them.
 
-    A check whose part is missing raises a MissingPartError with an `extra`.
+    `checks`: functions, each of which raises a MissingPartError with an `extra` if its part is missing.
     """
     missing: list[MissingPartError] = []
     for check in checks:

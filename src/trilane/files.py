@@ -1,8 +1,9 @@
-"""Input files are opened with suspicion: sizes are read from headers before memory is taken, nothing is unpickled.
+"""Reads untrusted input files: sizes are read from headers before memory is taken, and nothing is unpickled.
 
 Any defect of a file becomes one BadInputError that names the file. A file's first bytes tell its format, not its
-suffix. Signatures come from the format's own specification, or from libmagic's list. Each format that Trilane does not
-read has a remedy, such as a way to convert it. `expected` is always the sentence part that says what a file should be.
+suffix. Signatures come from the format's own specification, or from libmagic's list. Most formats that Trilane does not
+read have a remedy, such as a way to convert the file. In every function, `expected` is the sentence part that says what
+the file should be.
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ _ARRAYS = "save its arrays with NumPy: np.savez(FILE, poses=..., trans=..., moca
 class Signature:
     """A known file format.
 
-    `name`: name with its article. `group`: `PICTURE`, `VIDEO`, `ARRAY`, `PICKLE`, `ARCHIVE` or `FOREIGN`. `remedy`: how
-    to make such a file usable.
+    `name`: name with its article. `group`: `PICTURE`, `VIDEO`, `ARRAY`, `PICKLE`, `ARCHIVE` or `FOREIGN`.
+    `remedy`: way to make a file of this format usable, as part of a sentence; may be empty.
     """
 
     name: str
@@ -46,7 +47,7 @@ class Signature:
     remedy: str = ""
 
 
-#: The first signature that matches the head of a file counts.
+#: Pairs of a pattern of a file's first bytes and the format that it shows. The first pattern that matches counts.
 SIGNATURES: tuple[tuple[bytes, Signature], ...] = (
     (rb"Kaydara FBX Binary|; FBX ", Signature("an FBX file", remedy=_OTHER_3D)),
     (rb"glTF", Signature("a binary glTF file (GLB, VRM)", remedy=_OTHER_3D)),
@@ -93,14 +94,17 @@ _PATTERNS = tuple((re.compile(pattern, re.DOTALL), signature) for pattern, signa
 
 
 def signature_of(path: Path) -> Signature | None:
-    """Return the format of the regular file `path`; None if it is unknown. Raises OSError if the file is unreadable."""
+    """Return the format of the regular file `path`; None if the format is not known.
+
+    Raises OSError if the file cannot be read.
+    """
     with path.open("rb") as file:
         head = file.read(HEAD_BYTES)
     return signature_of_head(head)
 
 
 def signature_of_head(head: bytes) -> Signature | None:
-    """Return the format of a file that begins with `head`, up to HEAD_BYTES bytes; None if it is unknown."""
+    """Return the format of a file; None if it is not known. `head`: the file's first bytes, up to HEAD_BYTES."""
     return next((signature for pattern, signature in _PATTERNS if pattern.match(head)), None)
 
 
@@ -127,7 +131,7 @@ _HEADERS = {
 
 
 def require_file(path: Path, expected: str, if_empty: str = "") -> int:
-    """Return the size of a regular, non-empty file in bytes. Raises BadInputError.
+    """Return the size of the file `path` in bytes. Raises BadInputError if it is no regular file, or is empty.
 
     `if_empty`: remedy for an empty file.
     """
@@ -143,7 +147,7 @@ def require_file(path: Path, expected: str, if_empty: str = "") -> int:
 
 
 def instead_of_file(path: Path) -> str:
-    """Return a sentence part that says what `path` is, if it is no regular file."""
+    """Return a sentence part that says what is at `path`, where no regular file is."""
     if path.is_dir():
         return "a folder"
     try:
@@ -156,7 +160,7 @@ def instead_of_file(path: Path) -> str:
 
 
 def read_text(path: Path, expected: str) -> str:
-    """Return the file as text. Raises BadInputError when it is missing, empty, over 256 MiB, not UTF-8 or not text."""
+    """Return the text of the file. Raises BadInputError if it is missing, empty, over 256 MiB, or no text in UTF-8."""
     size = require_file(path, expected)
     if size > MAX_TEXT_BYTES:
         raise BadInputError(path, f"{size} bytes", f"at most {MAX_TEXT_BYTES}")
@@ -176,7 +180,7 @@ def read_text(path: Path, expected: str) -> str:
 
 
 def refuse_other(path: Path, expected: str, *groups: str) -> None:
-    """Raise BadInputError for a file whose head belongs to a known format outside of `groups`."""
+    """Raise BadInputError for a file of a known format that belongs to none of `groups`."""
     try:
         signature = signature_of(path)
     except OSError as error:
@@ -186,9 +190,9 @@ def refuse_other(path: Path, expected: str, *groups: str) -> None:
 
 
 def read_npy(path: Path, expected: str) -> NDArray[Any]:
-    """Return the array of a `.npy` file.
+    """Return the array of a `.npy` file. Raises BadInputError.
 
-    Raises BadInputError; pickled, truncated and huge files are refused unread.
+    The data of a pickled, truncated or huge file are not read.
     """
     size = require_file(path, expected)
     try:
@@ -204,9 +208,10 @@ def read_npy(path: Path, expected: str) -> NDArray[Any]:
 
 
 def read_npz(path: Path, keys: Collection[str], expected: str) -> dict[str, NDArray[Any]]:
-    """Return those arrays of the `.npz` file that `keys` name, without opening others. Raises BadInputError.
+    """Return the arrays that `keys` name in the `.npz` file, by name. Raises BadInputError.
 
-    A key without an array is left out. The arrays may have at most MAX_ARRAY_BYTES bytes together.
+    A key without an array is left out, and other arrays are not opened. The returned arrays may have at most
+    MAX_ARRAY_BYTES bytes together.
     """
     require_file(path, expected)
     try:
@@ -234,12 +239,12 @@ def npz_names(path: Path, expected: str) -> list[str]:
 
 
 def npz_pickles(path: Path, keys: Collection[str], most: int, expected: str) -> dict[str, bytes]:
-    """Return the bytes of those arrays of an `.npz` file that hold Python objects. Raises BadInputError.
+    """Return the bytes of the arrays of Python objects in an `.npz` file, by name. Raises BadInputError.
 
     The bytes are the `.npy` header and the pickle, which stays pickled.
 
-    `keys`: names of the arrays to look at.
-    `most`: most bytes that the result may have in all.
+    `keys`: names of the arrays to check; arrays of numbers are left out.
+    `most`: most bytes that all returned arrays may have together.
     """
     require_file(path, expected)
     found: dict[str, bytes] = {}
@@ -285,16 +290,16 @@ def npy_pickle(path: Path, most: int, expected: str) -> bytes | None:
 
 
 def _holds_objects(file: IO[bytes]) -> bool:
-    """Return whether the array that comes next in `file` holds Python objects; leave `file` after its header.
+    """Read the `.npy` header that comes next in `file`, and return whether its array holds Python objects.
 
-    Raises one of DAMAGED on a broken header.
+    Raises one of DAMAGED for a broken header.
     """
     version = np.lib.format.read_magic(file)
     return version in _HEADERS and _header(file, version)[2].hasobject
 
 
 def read_bytes(path: Path, most: int, expected: str, if_empty: str = "") -> bytes:
-    """Return the whole file. Raises BadInputError when it is missing, empty or has more than `most` bytes.
+    """Return the bytes of the whole file. Raises BadInputError if it is missing, empty or larger than `most` bytes.
 
     `if_empty`: remedy for an empty file.
     """
@@ -319,9 +324,11 @@ def _member(path: Path, archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDAr
 
 
 def read_header(where: Path | str, file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return shape, whether the order is Fortran's, and dtype of the array whose `.npy` header comes next in `file`.
+    """Read the `.npy` header that comes next in `file`; return (shape, whether the order is Fortran's, dtype).
 
-    Raises BadInputError on pickled objects and unknown versions, one of DAMAGED on a broken header.
+    Raises BadInputError for pickled objects or an unknown version, and one of DAMAGED for a broken header.
+
+    `where`: place that errors name.
     """
     version = np.lib.format.read_magic(file)
     if version not in _HEADERS:
@@ -333,9 +340,9 @@ def read_header(where: Path | str, file: IO[bytes]) -> tuple[tuple[int, ...], bo
 
 
 def _header(file: IO[bytes], version: tuple[int, int]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return shape, whether the order is Fortran's, and dtype, from the rest of a header of this `version`.
+    """Return (shape, whether the order is Fortran's, dtype) from a header whose `version` was read already.
 
-    Raises one of DAMAGED.
+    Raises one of DAMAGED for a broken header.
     """
     try:
         with warnings.catch_warnings():
@@ -354,7 +361,10 @@ def _read_array(file: IO[bytes]) -> NDArray[Any]:
 
 
 def _checked_bytes(where: Path | str, file: IO[bytes], expected: str) -> int:
-    """Return the number of data bytes that the header announces; leave `file` at the first data byte."""
+    """Read the `.npy` header that comes next in `file`, and return the number of data bytes that it announces.
+
+    Raises BadInputError for an array that is too large, and as `read_header` does.
+    """
     shape, _, dtype = read_header(where, file)
     if any(side < 0 for side in shape):
         raise BadInputError(where, f"shape {shape}", expected)
@@ -365,12 +375,15 @@ def _checked_bytes(where: Path | str, file: IO[bytes], expected: str) -> int:
 
 
 def whole_number(digits: str) -> int | float:
-    """Return the value of `digits`, a whole number of a JSON document; ±infinity if no float can hold it."""
+    """Return the value of a whole number in a JSON document; ±infinity for a number beyond the range of floats.
+
+    `digits`: the number as text.
+    """
     return int(digits) if len(digits) < LONGEST_WHOLE else math.copysign(math.inf, -1 if digits.startswith("-") else 1)
 
 
 def as_numbers(where: Path | str, array: NDArray[Any], expected: str) -> NDArray[np.float64]:
-    """Return `array` as float64. Raises BadInputError when it holds no real numbers."""
+    """Return `array` as float64. Raises BadInputError, which names `where`, if it does not hold real numbers."""
     if array.dtype.kind not in "fiu":
         raise BadInputError(where, f"dtype {array.dtype}", expected)
     with np.errstate(invalid="ignore"):

@@ -5,15 +5,15 @@ every other file (`banned-api` in pyproject.toml). There are two exceptions: `tr
 and code that measures reads clocks, because a clock is read in every job.
 
 This module also decides whether a failure comes from a **lack of memory**. Rule: a shortage is reported only if a limit
-is below what a run takes, or if the kernel has ended a process for lack of memory. The needs of a run are measured
-(docs/limits.md); a larger scene, avatar or background takes more.
+is below the memory that a run takes, or if the kernel has ended a process for lack of memory. The memory of a run is
+measured (docs/limits.md); a larger scene, avatar or background takes more.
 
-This module also asks the kernel to **wake soon** a process that a message waits for; a refusal changes only the speed.
-Linux makes a woken thread wait until the time slice of the running thread ends, about 3 ms. A thread that has asked for
-a shorter slice need not wait (EEVDF since Linux 6.12; older kernels ignore the request). With another busy process on
-the same core, the request lowered the 99th percentile of the wake-up from 3.4 ms to 0.2 ms. This matters most for
-ZeroMQ's I/O threads. A unit that has sent a message begins its next job at once. Without the request, the thread that
-carries the message waits on the same core for the end of that job's slice: 1.6 ms between two units.
+This module also asks the kernel to **wake soon** a thread for which a message has come; a refusal changes only the
+speed. Linux makes a woken thread wait until the time slice of the running thread ends, about 3 ms. A thread that has
+asked for a shorter slice need not wait (EEVDF since Linux 6.12; older kernels ignore the request). With another busy
+process on the same core, the request lowered the 99th percentile of the wake-up from 3.4 ms to 0.2 ms. The request
+matters most for ZeroMQ's I/O threads. A unit that has sent a message begins its next job at once. Without the request,
+the I/O thread that carries the message waits on the same core for the end of the job's slice: 1.6 ms between two units.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _LIBC.syscall.restype = ctypes.c_long
 
 
 class Machine:
-    """This machine. `root`: folder that holds the kernel's folders `proc` and `sys`; a test gives its own."""
+    """This machine. `root`: folder with the kernel's folders `proc` and `sys`; a test gives another folder."""
 
     def __init__(self, root: Path = Path("/")) -> None:
         self.proc = root / "proc"
@@ -56,11 +56,11 @@ class Machine:
         return tuple(sorted(os.sched_getaffinity(0)))
 
     def core_count(self) -> int:
-        """Return how many cores the machine has, at least 1."""
+        """Return the number of the machine's cores, at least 1."""
         return os.cpu_count() or 1
 
     def architecture(self) -> str:
-        """Return the kernel's name of the architecture, such as `x86_64` and `aarch64`."""
+        """Return the kernel's name of the architecture, such as `x86_64` or `aarch64`."""
         return platform.machine()
 
     def cpu_fields(self) -> dict[str, str]:
@@ -78,11 +78,11 @@ class Machine:
         return frozenset((fields.get("flags") or fields.get("Features") or "").split())
 
     def cpu_model(self) -> str:
-        """Return the processor's name, or at least its architecture."""
+        """Return the processor's name; if it is not known, the architecture."""
         return self.cpu_fields().get("model name") or platform.processor() or self.architecture()
 
     def clock_ghz(self) -> float:
-        """Return the cores' highest clock in GHz; if that is unknown the present clock, if both are unknown 0."""
+        """Return the highest clock of the cores in GHz, or else the present clock; 0 if both are unknown."""
         frequency = psutil.cpu_freq()
         return (frequency.max or frequency.current) / 1e3 if frequency else 0.0
 
@@ -106,7 +106,7 @@ class Machine:
         return max(values) if values else None
 
     def memory_bytes(self) -> int:
-        """Return the physical memory in bytes."""
+        """Return the size of the physical memory in bytes."""
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
     def free_bytes(self) -> int:
@@ -114,7 +114,10 @@ class Machine:
         return int(psutil.virtual_memory().available)
 
     def memory_limit_bytes(self) -> int | None:
-        """Return the lowest memory limit of this process's control group and its parents; None if none limits it."""
+        """Return the lowest memory limit, in bytes, of this process's control group and its parents.
+
+        Return None if no limit is below the physical memory.
+        """
         limits = [int(text) for file in self._limit_files() if (text := _text_of(file)).isdecimal()]
         return min((limit for limit in limits if limit < self.memory_bytes()), default=None)
 
@@ -128,14 +131,14 @@ class Machine:
                 yield from (self.sys / "fs/cgroup" / kind / part / name for part in (group, *group.parents))
 
     def oom_kills(self) -> int:
-        """Return how many processes the kernel has ended since its start because memory ran out; 0 if unknown."""
+        """Return the number of processes that the kernel has ended so far because memory ran out; 0 if unknown."""
         lines = (line.split() for line in _text_of(self.proc / "vmstat").splitlines())
         return next((int(words[1]) for words in lines if words[0] == "oom_kill"), 0)
 
     def open_counter(self, attributes: bytes, flags: int) -> int:
-        """Return a file descriptor that counts an event of this thread, by perf_event_open(2). Raises OSError.
+        """Return the file descriptor of a counter of events of this thread (perf_event_open(2)). Raises OSError.
 
-        `attributes`: bytes of a `perf_event_attr`. `flags`: flags of the system call.
+        `attributes`: bytes of a `perf_event_attr`, which names the event. `flags`: flags of the system call.
         """
         number = PERF_EVENT_OPEN.get(self.architecture())
         if number is None:
@@ -148,11 +151,11 @@ class Machine:
         return file
 
     def read_counter(self, file: int, size: int) -> bytes:
-        """Return up to `size` bytes that the kernel gives for the counter behind the descriptor `file`."""
+        """Return up to `size` bytes of the present values of a counter. `file`: descriptor from `open_counter`."""
         return os.read(file, size)
 
     def system(self) -> str:
-        """Return the names and versions of the kernel and the C library."""
+        """Return a text with names and versions of the kernel and the C library."""
         return platform.platform()
 
     def python(self) -> str:
@@ -172,7 +175,7 @@ class Machine:
         return shutil.which(name, path=path if first is None else f"{first}{os.pathsep}{path}")
 
     def package_file(self, name: str) -> Path | None:
-        """Return the file that importing `name` would run, without importing it; None if `name` is not installed."""
+        """Return the file of the module or package `name`, without importing it; None if it is not installed."""
         found = importlib.util.find_spec(name)
         return None if found is None else Path(found.origin or "")
 
@@ -206,9 +209,11 @@ def last_level_bytes(cores: Iterable[int]) -> int:
 
 
 def moved_of_kept(kept_bytes: int) -> int:
-    """Return how many of `kept_bytes` each frame reads from memory again: all if they exceed the cache, else 0.
+    """Return the bytes that a stage reads from memory again in each frame, of the bytes that it keeps between frames.
 
-    `kept_bytes`: bytes that a stage keeps from frame to frame, such as a network's weights.
+    If the kept bytes exceed the last-level cache, all of them are read again, else none.
+
+    `kept_bytes`: number of bytes that the stage keeps, such as a network's weights.
     """
     return 0 if kept_bytes <= last_level_bytes(here.cores()) else kept_bytes
 
@@ -237,8 +242,8 @@ def _bytes(text: str) -> int:
 MB: Final = 1 << 20
 #: Address space of the largest process of a default run: unit dsp, with OpenVINO.
 ADDRESS_BYTES: Final = 1700 * MB
-#: Address space that any process of a run needs. With less, no OpenGL driver loads. With less than half of it, NumPy
-#: ends the process.
+#: Address space that every process of a run needs. With less, no OpenGL driver loads. With less than half of this
+#: size, NumPy ends the process.
 LEAST_ADDRESS_BYTES: Final = 512 * MB
 #: Memory of the smallest run: tensors of 64x64, pictures of 160x120. With less, the kernel ends processes of the run.
 LEAST_RUN_BYTES: Final = 255 * MB
@@ -250,7 +255,7 @@ _KILLS = here.oom_kills()
 
 
 def require_memory(part: int = 1) -> None:
-    """Raise TrilaneError when a limit on memory is below what the smallest run takes, divided by `part`."""
+    """Raise TrilaneError if a limit on memory is below the need of the smallest run, divided by `part`."""
     if (limit := _address_limit()) < LEAST_ADDRESS_BYTES // part:
         found = f"found a limit of {limit // MB} MB of addresses (ulimit -v)"
         expected = f"expected at least {ADDRESS_BYTES // MB} MB for a run"
@@ -264,8 +269,8 @@ def require_memory(part: int = 1) -> None:
 def shortage() -> str:
     """Return the evidence that memory is short, as part of a sentence; "" without evidence.
 
-    Call it only after a failure that a lack of memory may have caused: a run of small tensors passes under limits that
-    count as evidence here.
+    Call this only after a failure that a lack of memory may have caused. Limits that count as evidence here may still
+    let a run of small tensors pass.
     """
     if (limit := _address_limit()) < ADDRESS_BYTES:
         needed = f"a run's largest process takes {ADDRESS_BYTES // MB} MB: ulimit -v unlimited"
@@ -277,7 +282,10 @@ def shortage() -> str:
 
 
 def ended_by_system() -> str:
-    """Return a sentence part if the kernel has ended a process for lack of memory since this one began, else ""."""
+    """If the kernel has ended a process for lack of memory since this process began, return part of a sentence.
+
+    Otherwise return "".
+    """
     if here.oom_kills() <= _KILLS:
         return ""
     free = f"{here.free_bytes() // MB} MB are free now"
@@ -304,9 +312,9 @@ AWAKE = "wait awake"
 
 
 def use_slice(slice_ns: int) -> bool:
-    """Ask for a time slice of `slice_ns` for this thread and the processes it starts.
+    """Ask the kernel for a time slice of `slice_ns` for this thread, and for processes and threads that it starts.
 
-    Return whether the kernel accepted it.
+    Return whether the kernel accepted the request.
     """
     number = SCHED_SETATTR.get(here.architecture())
     if number is None or os.sched_getscheduler(0) != os.SCHED_OTHER:
@@ -318,10 +326,11 @@ def use_slice(slice_ns: int) -> bool:
 
 @contextlib.contextmanager
 def awake(wanted: bool = True) -> Iterator[str]:
-    """Keep idle cores of the whole machine awake inside the `with` block. Yield AWAKE, or `sleep: ` and the reason.
+    """Keep idle cores of the whole machine awake inside the `with` block, if this is `wanted`.
 
-    A sleeping core takes 50 us and more to react to a message; a core that is kept awake takes power. Usually only root
-    may keep cores awake. When the process ends, the kernel lets them sleep again.
+    Yield AWAKE; if cores may sleep, yield `sleep: ` and the reason. A sleeping core takes 50 us and more to react to a
+    message; a core that is kept awake takes power. Usually only root may keep cores awake. When the process ends, the
+    kernel lets cores sleep again.
     """
     if not wanted:
         yield "sleep: the performance profile asks for no haste"

@@ -1,6 +1,6 @@
-"""What an option is: a field of a pydantic model, with its help text, default, range, unit and words.
+"""Options as fields of a pydantic model, each with help text, default, range, unit of measure and accepted words.
 
-The command line and programs read their options from the fields. Rule: a model of options is the only list of them.
+The command line and Python read the options from the model's fields. Rule: options are listed nowhere else.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ NOTHING: Final = "none"
 
 @dataclass(frozen=True)
 class Option:
-    """Facts about an option that its field's type does not state.
+    """Facts about an option that the type of the option's field does not state.
 
     `spelling`: name on the command line, such as `--latch`; empty if it follows from the field's name.
     `synonyms`: other names on the command line.
     `is_argument`: whether the command line takes the value without a name.
-    `unit`: unit of a number, as a plural noun.
+    `unit`: unit of measure of a number, as a plural noun.
     `words`: the only words that the field accepts; if empty, the field accepts any text.
-    `offered`: words that the dashboard's control offers besides what this machine has; None if the dashboard has no
-    control for the option.
+    `offered`: words that the dashboard's control always offers, besides choices that this machine adds; None if the
+    dashboard has no control for the option.
     """
 
     spelling: str = ""
@@ -57,12 +57,12 @@ class Option:
 
 
 def option_of(field: FieldInfo) -> Option:
-    """Return the field's `Option`; a default one if the field has none."""
+    """Return the field's `Option`; if the field has none, an `Option` of default values."""
     return next((each for each in field.metadata if isinstance(each, Option)), Option())
 
 
 def kind_of(field: FieldInfo) -> Any:
-    """Return the bare type of the field: str, int, float, bool, Path or tuple. None and limits are left out."""
+    """Return the type of the field without limits and without None: str, int, float, bool, Path or tuple."""
     kind: Any = field.annotation
     while get_origin(kind) in (Annotated, Union, UnionType):
         kind = next(each for each in get_args(kind) if each is not NoneType)
@@ -78,7 +78,7 @@ def element_of(field: FieldInfo) -> Any:
 
 
 def limits_of(field: FieldInfo) -> tuple[float | None, float | None]:
-    """Return the least and the largest number that the field accepts; None for each limit that is absent."""
+    """Return (least number, largest number) that the field accepts; None for a limit that is absent."""
     least, most = (
         next((getattr(one, key) for one in field.metadata if hasattr(one, key)), None) for key in ("ge", "le")
     )
@@ -94,7 +94,7 @@ def texts_of(value: object) -> object:
     return tuple(value) if isinstance(value, Sequence) and not isinstance(value, str) else value
 
 
-#: Found and expected, for the error about an empty path: Path would turn it into the working directory.
+#: Found and expected, for the error about an empty path, which `Path` would turn into the working directory.
 EMPTY_PATH: Final = ("an empty path", "a file or a folder")
 
 
@@ -106,7 +106,10 @@ def path_of(value: object) -> object:
 
 
 def paths_of(value: object) -> object:
-    """Return one file or several files as a tuple of paths. Raises UnexpectedValue for an empty text."""
+    """Return one path, or several, as a tuple of paths; return any other value unchanged.
+
+    Raises UnexpectedValue for an empty text.
+    """
     several = [value] if isinstance(value, str | PurePath) else value
     return tuple(map(path_of, several)) if isinstance(several, Iterable) else value
 
@@ -137,7 +140,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 
 
 class Options(BaseModel):
-    """A model of options. `model_fields_set` names the options that somebody gave."""
+    """Base class of models of options. `model_fields_set` has the names of the options that somebody gave."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
@@ -163,7 +166,7 @@ class Options(BaseModel):
 
     @classmethod
     def value_of(cls, name: str, word: str) -> Any:
-        """Return the value of field `name` that the dashboard writes as `word`. Raises BadInputError."""
+        """Return the value of field `name` for `word`, the text that the dashboard sent. Raises BadInputError."""
         field = cls.model_fields[name]
         try:
             return None if word == NOTHING else TypeAdapter(kind_of(field)).validate_python(word)
@@ -175,7 +178,7 @@ class Options(BaseModel):
         return self.checked({**dict(self), **values})
 
     def as_json(self) -> dict[str, Any]:
-        """Return the value of every option as JSON, by field name. The report holds these values."""
+        """Return the value of every option as a JSON value, by field name, as the report contains them."""
         return {name: _as_json(value) for name, value in self}
 
 
@@ -186,7 +189,7 @@ def _as_json(value: object) -> object:
 
 
 def expected(field: FieldInfo) -> str:
-    """Return what a field's value must be, such as `a whole number, 1 or more`, from its type, range and unit."""
+    """Return a description of the values that a field accepts, such as `a whole number, 1 or more`."""
     kind, unit = kind_of(field), option_of(field).unit
     if kind not in (int, float):
         return {str: "text", bool: "true or false", tuple: "a list of texts", Path: "a path"}[kind]

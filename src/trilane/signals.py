@@ -1,4 +1,4 @@
-"""The signals that end a command. They end it as Ctrl-C does, so that begun files are finished or removed.
+"""The signals that end a command. They act as Ctrl-C does, so that files in work are finished or removed.
 
 Rule: this module imports nothing of Trilane, because a command imports it before anything else.
 """
@@ -32,9 +32,9 @@ def _raise(number: int, _frame: FrameType | None) -> NoReturn:
 
 
 def that_end() -> list[signal.Signals]:
-    """Return SIGINT, SIGTERM, and the other signals of ENDING that the caller neither ignores nor handles.
+    """Return SIGINT, SIGTERM, and all further signals of ENDING that have their default action (or `_raise`).
 
-    A command that was started by `nohup` or as a shell's background job ignores some of them.
+    A command that was started by `nohup`, or as a shell's background job, ignores some signals of ENDING.
     """
     always = (signal.SIGINT, signal.SIGTERM)
     return [number for number in ENDING if number in always or signal.getsignal(number) in (signal.SIG_DFL, _raise)]

@@ -14,7 +14,7 @@ def student_tails(t: float, freedom: float) -> float:
     """Return the probability that Student's t is beyond ±`t`.
 
     `freedom`: degrees of freedom, a whole number or inf.
-    Abramowitz and Stegun, Handbook of Mathematical Functions, 26.7.3 and 26.7.4.
+    Source: Abramowitz and Stegun, Handbook of Mathematical Functions, 26.7.3 and 26.7.4.
     """
     if freedom == inf or t == inf:
         return erfc(t / sqrt(2))
@@ -30,9 +30,9 @@ def student_tails(t: float, freedom: float) -> float:
 
 @lru_cache(maxsize=256)
 def student_quantile(freedom: float, confidence: float = CONFIDENCE) -> float:
-    """Return the two-sided quantile of Student's t: |t| exceeds it with probability 1 - `confidence`.
+    """Return the two-sided quantile q of Student's t: |t| exceeds q with probability 1 - `confidence`.
 
-    `freedom`: degrees of freedom, a whole number or inf. The quantile is found by bisection.
+    `freedom`: degrees of freedom, a whole number or inf.
     """
     low, high = 0.0, 1e3
     for _ in range(80):

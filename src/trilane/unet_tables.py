@@ -1,7 +1,7 @@
 """The avatar's U-Nets as tables: encoders, decoder, heads and normalisations.
 
-Rule: each channel count, kernel and stride stands once, here. The trained network (`training/`) and the shapes that the
-predictions count (`hw_profiles/`) are both built from these tables.
+Rule: each channel count, kernel and stride stands only here. The trained network (`training/`), and the layers whose
+work predictions count (`hw_profiles/`), are both built from these tables.
 Sources: He et al. 2015 (ResNet18); Sandler et al. 2018 (MobileNetV2); Howard et al. 2019 (MobileNetV3 large); Tan and
 Le 2019 with the changes of TensorFlow's EfficientNet-Lite (no squeeze, ReLU6, stem and head unscaled).
 """
@@ -25,8 +25,9 @@ RESNET18_STAGES = ((64, 1), (128, 2), (256, 2), (512, 2))
 
 @dataclass(frozen=True)
 class MobileBlock:
-    """One inverted residual block: 1x1 to `expanded` channels, depthwise `kernel`, 1x1 to `channels`.
+    """One inverted residual block: 1x1 to `expanded` channels, depthwise convolution, 1x1 to `channels`.
 
+    `kernel`, `stride`: side of the depthwise kernel, and its stride.
     `activation`: `relu`, `relu6` or `hardswish`. `squeeze`: whether the block has squeeze-and-excitation.
     """
 
@@ -42,8 +43,8 @@ class MobileBlock:
 class MobileEncoder:
     """An encoder of inverted residual blocks.
 
-    `stem`: channels of the first 3x3 convolution. `activation`: activation of the stem and of the last layer. `rows`:
-    blocks, from first to last. `last`: channels of the last 1x1 convolution.
+    `stem`: channels of the first 3x3 convolution. `activation`: activation of the stem and of the last layer.
+    `rows`: blocks, from first to last. `last`: channels of the last 1x1 convolution.
     """
 
     stem: int
@@ -53,7 +54,10 @@ class MobileEncoder:
 
 
 def squeeze_channels(channels: int) -> int:
-    """Return the channels inside a squeeze-and-excitation: `channels` / 4, rounded to a multiple of 8, at least 8."""
+    """Return the number of inner channels of a squeeze-and-excitation: `channels` / 4, rounded to a multiple of 8.
+
+    The result is at least 8.
+    """
     return max(8, (channels // 4 + 4) // 8 * 8)
 
 

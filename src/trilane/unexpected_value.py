@@ -1,7 +1,8 @@
 """A value that is not what it should be, described in parts.
 
-Rule: it is raised where the value's place (a file, key or option) is not known. A caller that knows the place makes a
-`BadInputError` with `BadInputError.at`. This module imports nothing, so the scheduler's core may raise the error too.
+Rule: `UnexpectedValue` is raised where the place of the value (a file, key or option) is not known. A caller that knows
+the place turns it into a `BadInputError` with `BadInputError.at`. This module imports nothing of Trilane, so that the
+scheduler's core may raise the error too.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Words that all folders share: units, profiles, the host's name, the avatar's stages, sources of figures.
 
-Rule: each list and each phrase stands once.
+Rule: each list and each phrase stands only here.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ SUSTAINED = PerformanceProfile.SUSTAINED_HIGH_PERFORMANCE.value
 HOST = "host"
 HOST_CLOCK = "host"
 
-#: Stages of the avatar's pipeline, each with its unit: before the network's stage, that stage, and after it.
+#: Stages of the avatar's pipeline, each with its unit: before the network's stage, the network's stage, and after it.
 BEFORE_INFER: tuple[tuple[str, UnitName], ...] = (("pose", "cpu"), ("raster", "gpu"))
 INFER: tuple[str, UnitName] = ("infer", "dsp")
 AFTER_INFER: tuple[tuple[str, UnitName], ...] = (("composite", "gpu"), ("present", "cpu"))
 #: The stage at whose end a frame's latency ends.
 LATENCY_TO = "composite"
-#: Frames that need no new picture of the avatars skip the stages between these two.
+#: Frames that need no new picture of the avatars skip the stages between these two stages.
 BYPASS = ("pose", "composite")
 
 

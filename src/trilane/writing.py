@@ -1,7 +1,7 @@
-"""Output files that are whole or absent: written under a temporary name beside their place, then renamed.
+"""Writes output files that are whole or absent: under a temporary name in the same folder, then renamed.
 
-Rule: when writing ends early for any reason, the old file stays as it was, and no other file is left. Only a process
-that is killed outright may leave its temporary file, `.trilane-*`.
+Rule: if writing ends early for any reason, the old file stays as it was, and no other file is left. Only a process that
+is killed outright may leave its temporary file, `.trilane-*`.
 """
 
 from __future__ import annotations
@@ -24,10 +24,12 @@ REMOVED = "it was removed while it was written"
 
 @contextmanager
 def write_atomically(path: Path, remedy: str = "") -> Iterator[Path]:
-    """Yield a temporary path to write to. When the block ends without an error, that file is renamed to `path`.
+    """Yield a temporary path to write to. If the block ends without an error, the file there is renamed to `path`.
 
     The temporary path is new and has the suffix of `path`. If `path` is a device or a pipe (/dev/stdout), `path` itself
-    is yielded. Raises BadInputError with `remedy` if the file cannot be written; an OSError about another file passes.
+    is yielded.
+
+    Raises BadInputError with `remedy` if the file cannot be written. An OSError about another file is not changed.
     """
     draft = path.parent / f"{PREFIX}{secrets.token_hex(8)}{path.suffix}"
     try:
@@ -44,29 +46,31 @@ def write_atomically(path: Path, remedy: str = "") -> Iterator[Path]:
 
 
 def require_writable(path: Path) -> None:
-    """Raise BadInputError, before long work, when `write_atomically` cannot write `path`."""
+    """Raise BadInputError if `write_atomically` cannot write `path`; called before long work."""
     with _os_errors_about(path), tempfile.TemporaryFile(prefix=PREFIX, dir=path.parent):
         pass
 
 
 def require_name(path: Path, fd: int) -> None:
-    """Raise UnwrittenError when somebody has removed the file `path`, which is still open as `fd`."""
+    """Raise UnwrittenError if somebody has removed the file `path`, which is still open with the descriptor `fd`."""
     if not os.fstat(fd).st_nlink:
         raise UnwrittenError(path, FileNotFoundError(errno.ENOENT, REMOVED))
 
 
 def write_bytes(path: Path, content: bytes, remedy: str = "") -> None:
-    """Write `content` as the file `path`, by `write_atomically`. Raises BadInputError."""
+    """Write `content` to `path` with `write_atomically`, and raise BadInputError as it does."""
     with write_atomically(path, remedy) as draft:
         draft.write_bytes(content)
 
 
 @contextmanager
 def write_folder(folder: Path) -> Iterator[Path]:
-    """Yield an empty folder to write files to. The files move into `folder` when the block ends without an error.
+    """Yield an empty folder to write files to. If the block ends without an error, the files move into `folder`.
 
-    Each file of `folder` is whole at any moment, but the files are replaced one after the other. Files with other names
-    stay. Raises BadInputError when a file cannot be written; an OSError about a file elsewhere passes.
+    The files replace those of the same names in `folder` one after the other; each file there is whole at any moment.
+    Files with other names stay.
+
+    Raises BadInputError if a file cannot be written. An OSError about a file elsewhere is not changed.
     """
     with _os_errors_about(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
@@ -84,7 +88,7 @@ def write_folder(folder: Path) -> Iterator[Path]:
 def _os_errors_about(path: Path, remedy: str = "", own: Sequence[Path] = ()) -> Iterator[None]:
     """Turn an OSError of the block into a BadInputError about `path`.
 
-    `own`: files and folders that the block writes. If given, an OSError that names a file elsewhere passes unchanged.
+    `own`: files and folders that the block writes. If given, an OSError that names a file elsewhere is not changed.
     """
     try:
         yield

@@ -1,7 +1,7 @@
 """A capture: frames of one person, each with its mask and the fit of the body, and the camera that took them.
 
-Rule: a `Capture` has no faults. All faults of a folder are found before anything starts, and are listed together.
-docs/captures.md describes the files.
+Rule: a `Capture` has no faults. All faults of a capture's files are found before anything starts, and are listed
+together. docs/captures.md describes the files.
 """
 
 from __future__ import annotations
@@ -49,9 +49,12 @@ Track = Callable[[Sequence[int]], Iterable[int]]
 class Capture:
     """A capture without faults.
 
-    `file`: content of capture.toml. `body_file`: file from which the body was read. `shaped`: body with the shape
-    `betas`, `expression`, which are means over the fits. `fits`: fit of each frame. `views`: view matrix (4,4) of each
-    frame. `mask_of`: for each frame, the number of its mask in `masks`.
+    `folder`: folder of the capture. `file`: content of capture.toml.
+    `body_file`: file from which the body was read.
+    `betas`, `expression`: coefficients of shape and of expression, means over the fits.
+    `shaped`: body with these coefficients.
+    `fits`: fit of each frame. `views`: view matrix (4,4) of each frame's camera.
+    `frames`, `masks`: pictures. `mask_of`: for each frame, the number of its mask in `masks`.
     """
 
     folder: Path
@@ -87,14 +90,14 @@ class Capture:
         return np.dstack([self.frames.read(number), self.masks.read(self.mask_of[number])])
 
     def directions(self) -> list[tuple[float, float]]:
-        """Return (yaw, height) of each frame's camera in degrees, see `camera_direction`."""
+        """Return (yaw, height) in degrees of each frame's camera, as `camera_direction` defines them."""
         return directions(self.shaped, self.fits, self.views)
 
 
 def directions(shaped: ShapedBody, fits: Sequence[Fit], views: Sequence[F64]) -> list[tuple[float, float]]:
-    """Return (yaw, height) in degrees of the camera of each of `fits`, see `camera_direction`.
+    """Return (yaw, height) in degrees of each frame's camera, as `camera_direction` defines them.
 
-    `shaped`: body that was fitted. `views`: view matrix (4,4) of each camera.
+    `shaped`: body that was fitted. `fits`: fit of each frame. `views`: view matrix (4,4) of each frame's camera.
     """
     root = shaped.joints[0]
     return [camera_direction(fit.pose, root + fit.place, view) for fit, view in zip(fits, views, strict=True)]
@@ -103,14 +106,15 @@ def directions(shaped: ShapedBody, fits: Sequence[Fit], views: Sequence[F64]) ->
 def open_capture(folder: Path, track: Track = iter) -> Capture:
     """Open the capture in `folder` and check every picture and fit.
 
-    `track`: wraps the numbers of the frames to show progress.
-    Raises BadInputError for a capture.toml that cannot be read, FaultyCaptureError with all faults of the other files.
+    `track`: function that gets the numbers of the frames, and yields them again while it shows progress.
+
+    Raises BadInputError for a capture.toml that cannot be read, and FaultyCaptureError with all faults of other files.
     """
     return _Opening(folder, read_capture_file(folder)).opened(track)
 
 
 class _Opening:
-    """Reads a capture and gathers its faults."""
+    """Reads a capture, and collects its faults. `file`: content of capture.toml."""
 
     def __init__(self, folder: Path, file: CaptureFile) -> None:
         self.folder, self.file = folder, file
@@ -155,9 +159,9 @@ class _Opening:
             self.faults.append(Fault(self.file.frames, count, expected))
 
     def _matched(self, frames: Pictures, masks: Pictures) -> list[int]:
-        """Return the number of each frame's mask; -1 and a fault for a frame without one.
+        """Return, for each frame, the number of its mask. A frame without a mask gets -1 and a fault.
 
-        If frames and masks both lie in folders, they are matched by file name, else by number.
+        If frames and masks are both files in folders, the names of the files match them, else their numbers.
         """
         if isinstance(frames, PictureFolder) and isinstance(masks, PictureFolder):
             by_stem = {Path(name).stem: number for number, name in enumerate(masks.names)}
@@ -171,7 +175,10 @@ class _Opening:
         return found
 
     def _look(self, frames: Pictures, masks: Pictures | None, mask_of: Sequence[int], track: Track) -> None:
-        """Read every frame and its mask, and add a fault for each unusable one."""
+        """Read every frame and its mask, and add a fault for each that cannot be used.
+
+        `mask_of`: for each frame, the number of its mask; -1: it has none.
+        """
         shape = self.file.camera.shape
         for number in track(range(len(frames.names))):
             frame = self._read(frames, number, f"{self.file.frames}/{frames.names[number]}", shape)
@@ -195,7 +202,7 @@ class _Opening:
         return picture
 
     def _fits(self, names: Sequence[str], body: Body) -> list[Fit]:
-        """Return the fits that can be read, and add a fault for each unreadable fit. `names`: names of the frames."""
+        """Return the fits that can be read, and add a fault for every other fit. `names`: names of the frames."""
         path, fits = self.folder / self.file.fits, []
         one = self._try(lambda: _fits_of_file(path, len(names))) if path.is_file() else None
         if not path.is_dir() and one is None:
@@ -234,15 +241,17 @@ class _Opening:
 
 
 def _mean(rows: Sequence[F64]) -> F64:
-    """Return the mean of rows of coefficients; coefficients that a shorter row lacks count as 0."""
+    """Return the mean (K,) of rows of coefficients, where K is the longest row; missing coefficients count as 0."""
     longest = max(len(row) for row in rows)
     return np.asarray(np.mean([np.pad(row, (0, longest - len(row))) for row in rows], axis=0))
 
 
 def _fits_of_file(path: Path, count: int) -> list[Mapping[str, NDArray[Any]]]:
-    """Return the arrays of each frame's fit from one file of `count` frames. Raises BadInputError.
+    """Return, for each frame, the arrays of its fit by name, from one file for all frames. Raises BadInputError.
 
-    An array of `SHAPE` with one dimension applies to all frames.
+    A one-dimensional array of shape or expression coefficients holds for all frames.
+
+    `count`: number of frames.
     """
     arrays = read_npz(path, NAMES, EXPECTED_FITS)
     shared = {name: arrays.pop(name) for name in SHAPE if name in arrays and arrays[name].ndim < 2}
@@ -254,7 +263,7 @@ def _fits_of_file(path: Path, count: int) -> list[Mapping[str, NDArray[Any]]]:
 
 # The sides from which a capture shows the person: the direction of the camera in the body's own axes.
 #
-# Rule: directions are relative to the root joint; the body faces +Z, and its left is +X.
+# Rule: directions are relative to the root joint; the body faces +Z, and its left side is +X.
 
 #: Yaw in degrees of a camera that looks straight at each side.
 SIDES = {"front": 0.0, "left": 90.0, "back": 180.0, "right": -90.0}
@@ -263,13 +272,14 @@ STEP_DEG = 30
 
 
 def camera_direction(pose: F64, root: F64, view: F64) -> tuple[float, float]:
-    """Return (yaw, height) of a camera in the body's own axes, degrees.
+    """Return (yaw, height) of a camera in the body's own axes, in degrees.
 
-    The yaw is 0 in front of the body and 90 on its left, in -180..180. The height is the angle above the body's
+    The yaw is 0 in front of the body and 90 on its left, in -180..180. The height is the angle above the body's own
     horizontal plane.
 
-    `pose`: axis-angle (55,3). `root`: place of the posed root joint, (3,). `view`: matrix (4,4) from the world to the
-    camera.
+    `pose`: pose of the body, axis-angle (55,3) in radians.
+    `root`: place (3,) of the posed root joint in the world, in metres.
+    `view`: matrix (4,4) from the world to the camera.
     """
     eye = np.linalg.inv(view)[:3, 3]
     x, y, z = rodrigues(pose[0]).T @ (eye - root)
@@ -277,25 +287,25 @@ def camera_direction(pose: F64, root: F64, view: F64) -> tuple[float, float]:
 
 
 def side_of(yaw_deg: float) -> str:
-    """Return the side of the body, a name of `SIDES`, that is nearest to a camera at `yaw_deg`."""
+    """Return the side of the body, a name of `SIDES`, that a camera at `yaw_deg` shows best."""
     return min(SIDES, key=lambda side: abs((yaw_deg - SIDES[side] + 180) % 360 - 180))
 
 
 def frames_by_side(yaws_deg: Sequence[float]) -> dict[str, int]:
-    """Return the number of frames that show each side, by name, from the yaw of each frame's camera."""
+    """Return the number of frames that show each side, by the side's name. `yaws_deg`: yaw of each frame's camera."""
     sides = [side_of(yaw) for yaw in yaws_deg]
     return {side: sides.count(side) for side in SIDES}
 
 
 def widest_gap_deg(yaws_deg: Sequence[float]) -> float:
-    """Return the widest gap, in degrees, between neighbouring cameras about the body; 360 for one camera."""
+    """Return the widest angle, in degrees of yaw, between neighbouring cameras about the body; 360 for one camera."""
     turns = np.sort(np.asarray(yaws_deg) % 360)
     return float(np.diff(turns, append=turns[0] + 360).max())
 
 
 # Fits: pose, place and shape of the body in each frame, from .npz files with the names of SMPL-X or AMASS.
 #
-# Rule: a fit holds the arguments of the `smplx` library. Every array is checked, and each defect is a separate fault.
+# Rule: a file of fits holds arguments of the `smplx` library. Every array is checked, and each defect is one fault.
 
 #: For each part of the pose, its range (start, stop) among the 165 numbers, and the names that files have for it.
 PARTS: dict[tuple[int, int], tuple[str, ...]] = {
@@ -314,7 +324,7 @@ PLACE = ("transl", "trans")
 CAMERA = {"camera_rotation": 9, "camera_translation": 3}
 SHAPE = ("betas", "expression")
 NAMES = (*WHOLE, *(name for names in PARTS.values() for name in names), *PLACE, *SHAPE, *CAMERA)
-#: Sizes of pose arrays of other body models, in words for people.
+#: Descriptions of pose arrays of other body models for people, by the number of values.
 OTHER_BODIES = {69: "23 joints: the SMPL layout", 72: "24 joints: the SMPL layout", 66: "22 joints", 63: "21 joints"}
 #: For whole poses of 156 numbers (SMPL-H) and 165 numbers (SMPL-X): the joints, in the order of the numbers.
 COLUMNS = {width: WIDTHS[width][0] for width in (156, 165)}
@@ -327,9 +337,10 @@ Arrays = Mapping[str, NDArray[Any]]
 class Fit:
     """The fit of one frame.
 
-    `pose`: axis-angle (55,3), radians. `place`: translation (3,) added to the root joint, metres.
-    `betas`, `expression`: coefficients of shape and expression. `rotation` (3,3), `translation` (3,): the frame's own
-    camera; None if the frame has the camera of capture.toml.
+    `pose`: axis-angle (55,3), in radians. `place`: translation (3,) that is added to the root joint, in metres.
+    `betas`, `expression`: coefficients of shape and expression.
+    `rotation` (3,3), `translation` (3,), metres: transform from the world to the frame's own camera; None if the frame
+    has the camera of capture.toml.
     """
 
     pose: F64
@@ -341,10 +352,12 @@ class Fit:
 
 
 def read_fit(where: str, arrays: Arrays, body: Body, flat_hand_mean: bool) -> tuple[Fit | None, list[Fault]]:
-    """Return the fit in the `arrays` of one frame, None if it has faults, and the faults.
+    """Return (fit of a frame, faults); the fit is None if there are faults.
 
-    `where`: name of the file. `body`: body with the hand components and the mean hand. `flat_hand_mean`: whether the
-    fit's hands already include the mean hand.
+    `where`: name of the file, for faults.
+    `arrays`: arrays of the frame by their names in the file.
+    `body`: body with the hand components and the mean hand.
+    `flat_hand_mean`: whether the hands in the file already include the mean hand.
     """
     faults: list[Fault] = []
     values = {name: _numbers(f"{where}[{name}]", arrays[name], faults) for name in NAMES if name in arrays}
@@ -366,7 +379,7 @@ def read_fit(where: str, arrays: Arrays, body: Body, flat_hand_mean: bool) -> tu
 
 
 def _numbers(where: str, array: NDArray[Any], faults: list[Fault]) -> F64:
-    """Return `array` as a flat row; if it has anything but finite numbers, add a fault and return zeros."""
+    """Return `array` as a flat row; if it has anything but finite numbers, add to `faults` and return zeros."""
     if array.dtype.kind not in "fiu":
         faults.append(Fault(where, f"dtype {array.dtype}", "numbers"))
         return np.zeros(array.size)
@@ -385,7 +398,10 @@ def _require_size(where: str, row: F64, size: int, faults: list[Fault]) -> bool:
 
 
 def _pose(where: str, values: Mapping[str, F64], body: Body, faults: list[Fault]) -> F64:
-    """Return the pose (165,) from an array of the whole pose, or from its parts; add a fault without root or body."""
+    """Return the pose (165,) from an array of the whole pose, or from arrays of its parts.
+
+    Add to `faults` if an array has a wrong size, or if the part of the root or the body is missing.
+    """
     for name in WHOLE:
         if name in values:
             return _whole(f"{where}[{name}]", values[name], faults)

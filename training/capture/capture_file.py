@@ -24,7 +24,7 @@ from trilane.scene.lens import Lens
 from trilane.scene.schema import LISTED, Finite, Table
 from trilane.unexpected_value import UnexpectedValue
 
-# The faults of a capture: they are listed together, so that a person fixes all of them before trying again.
+# The faults of a capture are listed together, so that a person can fix all of them before the next try.
 #
 # Rule: a fault names the file, what was found and what was expected. Faults that differ only in the file share a line.
 
@@ -36,7 +36,7 @@ MOST_NAMED = 12
 class Fault:
     """A fault of a capture.
 
-    `where`: file, with key or number of the frame. `found`, `expected`, `remedy`: sentence parts.
+    `where`: file, with the key or the number of the frame. `found`, `expected`, `remedy`: sentence parts.
     """
 
     where: str
@@ -51,7 +51,7 @@ class Fault:
 
 
 class FaultyCaptureError(BadInputError):
-    """A capture with faults. Exit code 2. The `details` list all `faults`."""
+    """A capture has faults. Exit code 2. `details` has the lines that list all `faults`."""
 
     def __init__(self, folder: str, faults: Sequence[Fault]) -> None:
         count = "1 fault" if len(faults) == 1 else f"{len(faults)} faults"
@@ -64,7 +64,7 @@ class FaultyCaptureError(BadInputError):
 
 
 def fault_lines(faults: Sequence[Fault]) -> list[str]:
-    """Return a line for each kind of fault, with its files. Kinds and files are in the order of `faults`."""
+    """Return a line for each kind of fault, with the files that have it. Kinds and files keep the order of `faults`."""
     kinds: dict[tuple[str, str, str], list[str]] = {}
     for fault in faults:
         kinds.setdefault((fault.found, fault.expected, fault.remedy), []).append(fault.where)
@@ -86,10 +86,13 @@ OPENGL_FROM_OPENCV: F64 = np.diag([1.0, -1.0, -1.0])
 
 
 class CameraTable(Table):
-    """The camera. `fx`, `fy`, `cx`, `cy` are those of `Lens` in `scene/lens.py`, in pixels from the top left corner.
+    """The table of the camera.
 
-    `axes`: convention of the camera's axes. `rotation` (rows of the matrix), `translation` (metres): transform from the
-    world of the fits to the camera. By default, fits are in camera axes.
+    `width`, `height`: size of a frame in pixels.
+    `fx`, `fy`, `cx`, `cy`: focal lengths and principal point in pixels, as in `Lens` (`scene/lens.py`).
+    `axes`: convention of the camera's axes.
+    `rotation` (rows of the matrix), `translation` (metres): transform from the world of the fits to the camera. By
+    default, fits are in camera axes.
     """
 
     width: int = Field(ge=64, le=2 * MAX_SIDE)
@@ -119,7 +122,7 @@ class CameraTable(Table):
     def view(self, rotation: Any = None, translation: Any = None) -> F64:
         """Return the matrix (4,4) from the world of the fits to the OpenGL camera.
 
-        `rotation` (3,3), `translation` (3,): a frame's own camera; None: the camera of this table.
+        `rotation` (3,3), `translation` (3,): transform to a frame's own camera; None: the transform in this table.
         """
         axes = OPENGL_FROM_OPENCV if self.axes == "opencv" else np.eye(3)
         view = np.eye(4)
@@ -131,9 +134,11 @@ class CameraTable(Table):
 class CaptureFile(Table):
     """The content of `capture.toml`. File names are relative to the folder of the capture.
 
-    `body`: `default` or a body file. `frames`, `masks`: a folder of pictures or a video. `fits`: a folder with a .npz
-    for each frame, or one .npz for all frames. `flat_hand_mean`: whether the fits' hands already include the body's
-    mean hand. `missing_views`: sides of the person that need no frame.
+    `body`: `default` or a body file.
+    `frames`, `masks`: a folder of pictures or a video.
+    `fits`: a folder with a .npz for each frame, or one .npz for all frames.
+    `flat_hand_mean`: whether the hands of the fits already include the body's mean hand.
+    `missing_views`: sides of the person that need no frame.
     """
 
     schema_: Literal[1] = Field(default=1, alias="schema")
@@ -149,7 +154,7 @@ class CaptureFile(Table):
 def read_capture_file(folder: Path) -> CaptureFile:
     """Return the content of `capture.toml` in `folder`.
 
-    Raises BadInputError for a file that is no TOML, FaultyCaptureError with every defect of the keys.
+    Raises BadInputError for a file that is no TOML, and FaultyCaptureError with every defect of the keys.
     """
     path = folder / NAME
     try:
@@ -176,12 +181,12 @@ def _fault(details: dict[str, Any]) -> Fault:
 
 # Pictures of a capture: a folder of files, or a video.
 #
-# Rule: a picture is read as it is stored. A picture of a wrong mode is refused, never converted. A video is decoded
-# forwards; reading its pictures in order decodes each of them once.
+# Rule: a picture is read as it is stored. A picture with other channels than expected is refused, never converted. A
+# video is decoded forwards: if its pictures are read in order, each is decoded once.
 
 ENDINGS = (".png", ".jpg", ".jpeg")
 VIDEO_ENDINGS = (".mp4", ".mkv", ".mov", ".avi", ".webm")
-#: Modes of Pillow in words for people.
+#: Descriptions of Pillow's modes (kinds of channels) for people.
 MODES = {
     "L": "one channel (grey)",
     "1": "one channel (black and white)",
@@ -191,8 +196,8 @@ MODES = {
     "RGBA": "four channels (RGBA)",
     "CMYK": "four channels (CMYK)",
 }
-#: For each kind of picture: allowed modes of Pillow, expected and remedy of the error about another mode, and the PyAV
-#: format into which a video's pictures are decoded.
+#: For each kind of picture: (allowed modes of Pillow, expected and remedy for the error about another mode, PyAV format
+#: into which a video's pictures are decoded).
 FRAME, MASK = "frame", "mask"
 STORED: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     FRAME: (
@@ -214,11 +219,11 @@ class Pictures(Protocol):
     names: tuple[str, ...]
 
     def read(self, number: int) -> U8:
-        """Return picture `number`: (h,w,3) for a frame, (h,w) for a mask. Raises UnexpectedValue."""
+        """Return picture `number`: a frame (h,w,3) or a mask (h,w). Raises UnexpectedValue if it cannot be used."""
 
 
 def open_pictures(path: Path, kind: str) -> Pictures:
-    """Open the pictures at `path`, a folder or a video. Raises BadInputError when there are no pictures.
+    """Return the pictures at `path`, a folder or a video. Raises BadInputError if there are no pictures.
 
     `kind`: `FRAME` or `MASK`.
     """
@@ -236,13 +241,13 @@ def open_pictures(path: Path, kind: str) -> Pictures:
 
 
 class PictureFolder:
-    """Pictures that are the files `names` in `folder`."""
+    """Pictures that are the files `names` in `folder`. `kind`: `FRAME` or `MASK`."""
 
     def __init__(self, folder: Path, names: tuple[str, ...], kind: str) -> None:
         self.folder, self.names, self._kind = folder, names, kind
 
     def read(self, number: int) -> U8:
-        """Return picture `number`, see `Pictures.read`."""
+        """Return picture `number`, as `Pictures.read` describes."""
         modes, expected, remedy, _ = STORED[self._kind]
         try:
             with Image.open(self.folder / self.names[number]) as image:
@@ -256,7 +261,10 @@ class PictureFolder:
 
 
 class PictureVideo:
-    """Pictures that are frames of a video. The constructor decodes the whole video to count the frames."""
+    """Pictures that are frames of a video. `kind`: `FRAME` or `MASK`.
+
+    The constructor decodes the whole video to count the frames.
+    """
 
     def __init__(self, path: Path, kind: str) -> None:
         self._path, self._kind = path, kind
@@ -267,7 +275,7 @@ class PictureVideo:
             raise BadInputError(path, "a video without frames", f"a video of {kind}s")
 
     def read(self, number: int) -> U8:
-        """Return picture `number`, see `Pictures.read`. A smaller number than before opens the video again."""
+        """Return picture `number`, as `Pictures.read`. If an earlier call read it or a later one, reopen the video."""
         if number < self._next or not self._next:
             self._stream, self._next = self._frames(), 0
         frame = None
@@ -280,7 +288,7 @@ class PictureVideo:
         return np.asarray(frame.to_ndarray(format=form))
 
     def __getstate__(self) -> dict[str, Any]:
-        """Return the state to pickle. Another process that unpickles it opens the video itself."""
+        """Return the state to pickle, without the open video. A process that unpickles it opens the video itself."""
         return self.__dict__ | {"_stream": iter(()), "_next": 0}
 
     def _frames(self) -> Iterator[Any]:

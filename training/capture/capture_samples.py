@@ -1,7 +1,8 @@
 """Samples of a capture for training: random views of its frames, cropped as the pipeline crops.
 
-Rule: the UV image is drawn with the view's own camera, and the ground truth is resampled once from the whole frame.
-Both are empty outside the frame. A sample depends only on its seed.
+A sample is a UV image of the body and a ground truth. Rule: the UV image is drawn with the camera of the random view,
+and the ground truth is resampled once from the whole frame. Both are empty outside the frame. A sample depends only on
+its seed.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ from trilane.training.surface import vertex_areas
 TRIES = 1000
 #: Number of frames that are kept decoded, because successive samples often use the same frame.
 KEPT = 4
-#: One frame of this many successive ones is held out.
+#: One of so many successive frames is held out of training.
 HELD_OUT_EVERY = 10
 
 
@@ -40,9 +41,11 @@ HELD_OUT_EVERY = 10
 class CaptureSample:
     """A planned sample of a capture.
 
-    `picture`: number of the frame. `crop`: crop whose projection draws the body; if `mirrored`, the drawn columns must
-    be reversed afterwards, see `unmirrored`. `by`: map (3,3) from the frame's pixels to the tensor's pixels; it
-    includes the mirroring. `band`: an index into BAND_NAMES, or ANYWHERE_BAND.
+    `picture`: number of the frame.
+    `crop`: crop with which the body is drawn.
+    `by`: map (3,3) from the frame's pixels to the tensor's pixels; it includes the mirroring.
+    `mirrored`: whether the columns of the drawn UV image must be reversed afterwards (`unmirrored`).
+    `band`: index into BAND_NAMES, or ANYWHERE_BAND.
     """
 
     picture: int
@@ -60,7 +63,8 @@ class CaptureRenderer:
 
         `numbers`: numbers of the frames of `capture` that samples may show.
         `rule`: limits of the random views.
-        `threads`: number of threads of a software OpenGL driver.
+        `threads`: number of threads of a software OpenGL driver; None: the driver decides.
+
         Raises MissingPartError without OpenGL.
         """
         self.capture, self._numbers, self._rule = capture, list(numbers), rule
@@ -86,7 +90,10 @@ class CaptureRenderer:
         raise BadInputError(self.capture.folder, found, "frames that show the whole person")
 
     def whole_sample(self, number: int, size: str) -> CaptureSample | None:
-        """Return a sample of frame `number` without augmentation, cropped to the person; None if no body is in it."""
+        """Return a planned sample of a whole frame, cropped to the person; None if the body is not in the frame.
+
+        `number`: number of the frame. `size`: tensor size, as `shape_buckets` takes it.
+        """
         capture = self.capture
         posed, view, frame = self._raster.posed(capture.fits[number]), capture.views[number], capture.shape
         crop = self._cropper.crop(posed, View(view, self._projection, frame[1] / frame[0]), shape_buckets(size))
@@ -96,7 +103,7 @@ class CaptureRenderer:
         return CaptureSample(number, crop, by, False, ANYWHERE_BAND)
 
     def placed(self, sample: CaptureSample) -> tuple[F64, Placement]:
-        """Return the view matrix (4,4) of a sample without mirroring, and the placement of its body for the raster."""
+        """Return (view matrix (4,4), placement of the body for the raster) of a sample that is not mirrored."""
         pose, crop = self._raster.body_pose(self.capture.fits[sample.picture]), sample.crop
         placement = Placement(pose.joints, crop.projection, (0, 0, *crop.shape), pose.feature)
         return self.capture.views[sample.picture], placement
@@ -120,7 +127,7 @@ class CaptureRenderer:
         return CaptureSample(number, crop, whole, mirrored, BAND_NAMES.index(band) if band in BANDS else ANYWHERE_BAND)
 
     def render(self, sample: CaptureSample) -> tuple[F32, U8]:
-        """Return the UV image (h,w,3) float32 (u, v, coverage) and the ground truth (h,w,4) uint8, straight alpha."""
+        """Return (UV image (h,w,3): u, v, coverage; ground truth (h,w,4) uint8, straight alpha)."""
         capture, crop = self.capture, sample.crop
         view = capture.views[sample.picture]
         uv = self._raster.uv(capture.fits[sample.picture], view, crop.projection, crop.shape)
@@ -138,9 +145,9 @@ class CaptureRenderer:
 
 
 def held_out_frames(count: int, bad: Sequence[int]) -> tuple[list[int], list[int]]:
-    """Return the numbers of the training frames and of the held-out frames, which are every tenth.
+    """Return (numbers of the training frames, numbers of the held-out frames). Every tenth good frame is held out.
 
-    `count`: number of all frames. `bad`: numbers of frames to leave out of both.
+    `count`: number of all frames. `bad`: numbers of frames with bad fits, which are in neither list.
     """
     good = [number for number in range(count) if number not in set(bad)]
     held_out = good[HELD_OUT_EVERY // 2 :: HELD_OUT_EVERY]
@@ -158,7 +165,9 @@ class BodyRaster:
     def __init__(self, shaped: ShapedBody, threads: int | None = None) -> None:
         """Open the context.
 
-        `threads`: number of threads of a software OpenGL driver. Raises MissingPartError without OpenGL.
+        `threads`: number of threads of a software OpenGL driver; None: the driver decides.
+
+        Raises MissingPartError without OpenGL.
         """
         self.ctx = open_context(threads)
         self._blended = shaped.body.posedirs is not None
@@ -171,14 +180,14 @@ class BodyRaster:
         return self.skeleton.pose(fit.pose, fit.place)
 
     def body_pose(self, fit: Fit) -> BodyPose:
-        """Return the pose of `fit` as the mesh takes it; valid until the next call."""
+        """Return the pose of `fit` in the form that the mesh takes; valid until the next call."""
         posed = self.posed(fit)
         return BodyPose(posed.matrices, posed.feature if self._blended else None)
 
     def uv(self, fit: Fit, view: F64, projection: F64, shape: Shape) -> F32:
         """Return the UV image (h,w,3) of `fit`: u, v, coverage.
 
-        `view`, `projection`: matrices (4,4) of the camera. `shape`: (height, width).
+        `view`, `projection`: matrices (4,4) of the camera. `shape`: (height, width) of the UV image.
         """
         pose = self.body_pose(fit)
         return self._raster.render(pose.joints, view, projection, shape, pose.feature)
@@ -191,11 +200,11 @@ class BodyRaster:
 # Affine maps from a frame to a tensor's picture, and the same maps applied to the camera: camera-space augmentation.
 #
 # Rule: a single map, in pixels, resamples the ground truth from its full resolution. The same map, converted to clip
-# space, changes the projection that rasterises the body. Picture and body thus agree for any camera matrix, any turn,
-# scale, flip and shift, and any aspect ratio. The body is rasterised for each view and never resampled.
+# space, changes the projection that rasterises the body. Therefore picture and body agree for any camera matrix, any
+# turn, scale, flip and shift, and any aspect ratio. The body is rasterised for each view and never resampled.
 #
-# The thesis (section 3.3, formulas 3.18 to 3.20) turns and scales the extrinsics and moves the principal point. That is
-# equivalent only for lenses with fx = fy. A map that is applied after the projection is exact for every lens.
+# The thesis (section 3.3, formulas 3.18 to 3.20) turns and scales the extrinsics and moves the principal point. This is
+# equivalent to the map only for lenses with fx = fy. A map after the projection is exact for every lens.
 #
 # Pixels: x to the right, y down, from the picture's top left corner; the centre of the first pixel is (0.5, 0.5).
 
@@ -206,9 +215,11 @@ NO_FLIP = (False, False)
 class Augmentation:
     """The geometric changes by which a frame becomes a sample.
 
-    `centre` (x, y): point of the frame, in pixels, that moves to the middle of the target. `turn_rad`: clockwise turn
-    about that point, radians. `scale` (x, y): target pixels per frame pixel along x and y, before the turn. `flip`
-    (left-right, upside-down): mirroring before the turn. `shift` (x, y): shift after the turn, in target pixels.
+    `centre`: point (x, y) of the frame, in pixels, that moves to the middle of the target.
+    `turn_rad`: clockwise turn about this point, in radians.
+    `scale`: target pixels per frame pixel along (x, y), before the turn.
+    `flip`: whether the frame is mirrored before the turn: (left-right, upside-down).
+    `shift`: shift (x, y) after the turn, in target pixels.
     """
 
     centre: tuple[float, float]
@@ -219,7 +230,7 @@ class Augmentation:
 
 
 def image_map(augmentation: Augmentation, target: Shape) -> F64:
-    """Return the map (3,3) from pixels of the frame to pixels of a target of shape (height, width)."""
+    """Return the map (3,3) from pixels of the frame to pixels of the target. `target`: its (height, width)."""
     c, s = np.cos(augmentation.turn_rad), np.sin(augmentation.turn_rad)
     signed = np.where(augmentation.flip, -1.0, 1.0) * augmentation.scale
     result = np.eye(3)
@@ -230,7 +241,7 @@ def image_map(augmentation: Augmentation, target: Shape) -> F64:
 
 
 def moved(points: ArrayLike, by: F64) -> F64:
-    """Return `points` (..., 2), in pixels, after the affine map `by` (3,3)."""
+    """Return the points (..., 2), in pixels, to which the affine map `by` (3,3) moves `points` (..., 2)."""
     return np.asarray(points, np.float64) @ by[:2, :2].T + by[:2, 2]
 
 
@@ -239,7 +250,8 @@ def augmented_projection(projection: ArrayLike, by: F64, frame: Shape, target: S
 
     Depth does not change, and only a flip reverses the winding of triangles.
 
-    `by`: affine map (3,3) from pixels of a picture of shape `frame` to pixels of a picture of shape `target`.
+    `by`: affine map (3,3) from pixels of the picture of `projection` to pixels of the new picture.
+    `frame`, `target`: (height, width) of these two pictures.
     """
     plane = _ndc_from_pixels(target) @ by @ np.linalg.inv(_ndc_from_pixels(frame))
     after = np.eye(4)
@@ -248,9 +260,11 @@ def augmented_projection(projection: ArrayLike, by: F64, frame: Shape, target: S
 
 
 def map_between(before: ArrayLike, after: ArrayLike, frame: Shape, target: Shape) -> F64:
-    """Return the map (3,3) by which `augmented_projection` makes the projection `after` (4,4) from `before` (4,4).
+    """Return the affine map (3,3) from pixels of the picture of `before` to pixels of the picture of `after`.
 
-    `frame`, `target`: (height, width) of the pictures of `before` and of `after`.
+    `augmented_projection` makes `after` from `before` with this map.
+
+    `before`, `after`: projections (4,4). `frame`, `target`: (height, width) of their pictures.
     """
     clip = np.asarray(after, np.float64) @ _inverse(np.asarray(before, np.float64))
     plane = np.eye(3)
@@ -259,9 +273,9 @@ def map_between(before: ArrayLike, after: ArrayLike, frame: Shape, target: Shape
 
 
 def projected(points: ArrayLike, clip: F64, shape: Shape) -> F64:
-    """Return the pixel coordinates (..., 2) of world `points` (..., 3) in a picture of `shape`.
+    """Return the pixel coordinates (x, y), (..., 2), of world `points` (..., 3) in a picture.
 
-    `clip`: projection @ view, (4,4).
+    `clip`: projection @ view, (4,4). `shape`: (height, width) of the picture.
     """
     homogeneous = np.asarray(points, np.float64) @ clip[:, :3].T + clip[:, 3]
     ndc = homogeneous[..., :2] / homogeneous[..., 3:]
@@ -269,10 +283,12 @@ def projected(points: ArrayLike, clip: F64, shape: Shape) -> F64:
 
 
 def unmirrored(by: F64, target: Shape) -> tuple[F64, bool]:
-    """Return the map `by` (3,3) without its mirroring, and whether drawn columns must be reversed afterwards.
+    """Return (map `by` (3,3) without its mirroring, whether drawn columns must be reversed afterwards).
 
-    A mirroring camera would reverse the winding of triangles, and the raster would cull the wrong ones. Reversing the
-    columns of the drawn picture is exact, because pixel centres lie symmetrically.
+    A mirroring camera would reverse the winding of triangles, and the raster would cull the wrong triangles. To reverse
+    the columns of the drawn picture is exact, because pixel centres lie symmetrically.
+
+    `target`: (height, width) of the drawn picture.
     """
     if np.linalg.det(by[:2, :2]) > 0:
         return by, False
@@ -283,7 +299,7 @@ def unmirrored(by: F64, target: Shape) -> tuple[F64, bool]:
 def seen_of_frame(by: F64, frame: Shape, target: Shape) -> Mask:
     """Return which of the target's pixels (h,w) have their centre inside the frame.
 
-    `by`: map (3,3) from the frame's pixels to the target's pixels.
+    `by`: map (3,3) from the frame's pixels to the target's pixels. `frame`, `target`: their (height, width).
     """
     rows, columns = np.mgrid[: target[0], : target[1]] + 0.5
     x, y = np.moveaxis(moved(np.stack([columns, rows], axis=-1), _inverse(by)), -1, 0)
@@ -291,10 +307,10 @@ def seen_of_frame(by: F64, frame: Shape, target: Shape) -> Mask:
 
 
 def resampled(rgba: U8, by: F64, target: Shape) -> U8:
-    """Return `rgba` (H,W,4) after the map `by` (3,3), as a picture (h,w,4) of shape `target`; both have straight alpha.
+    """Return the picture (h,w,4) of shape `target` that the map `by` (3,3) makes from `rgba` (H,W,4), straight alpha.
 
-    Where the map shrinks, whole blocks of pixels are first averaged. The result is then sampled bilinearly once. It is
-    0, 0, 0, 0 outside `rgba`. Colours are weighted by alpha.
+    Where the map shrinks the picture, whole blocks of pixels are averaged first. This average is sampled bilinearly
+    once. Colours are weighted by alpha, and pixels outside `rgba` are 0, 0, 0, 0.
     """
     whole = Image.fromarray(rgba, "RGBA").convert("RGBa")
     columns, rows = (max(1, int(1 / length)) for length in np.linalg.norm(by[:2, :2], axis=0))
@@ -317,12 +333,12 @@ def _inverse(matrix: F64) -> F64:
 # probable.
 #
 # Rule: the probability of a vertex is its share of the surface's area. SMPL-X has about as many vertices in the head as
-# in the rest of the body. The thesis (section 3.3) therefore weights joints by the volume about them; here, shares of
-# the area give exactly equal probabilities.
+# in all other parts together. Therefore the thesis (section 3.3) weights joints by the volume about them. Here, shares
+# of the area make equal areas exactly equally probable.
 
 
 class VertexCentres:
-    """Chooses random vertices, with probabilities by area, among the vertices that a band's joints move most."""
+    """Chooses random vertices among those that a band's joints move most; the probability of a vertex is by area."""
 
     def __init__(self, shaped: ShapedBody) -> None:
         self._shaped = shaped
@@ -336,7 +352,7 @@ class VertexCentres:
         return np.asarray(area / area.sum())
 
     def draw(self, rng: np.random.Generator, band: str, posed: Posed) -> F64:
-        """Return a random vertex (3,) of the body `posed`, world metres.
+        """Return the place (3,) of a random vertex of the body `posed`, in metres of the world.
 
         `band`: band of the view, a name of `BANDS` or `anywhere`.
         """
@@ -348,9 +364,9 @@ class VertexCentres:
 
 # Random views of a frame of a capture: the part of the frame that becomes the screen, by the bands of `random_views`.
 #
-# Rule: a view is an affine map of the frame's pixels (`image_map`), applied to the frame's camera too. A band states
-# how many metres fill the screen's height, so the bands mean the same as for the synthetic person. A frame is enlarged
-# by at most `most_enlarged`.
+# Rule: a view is an affine map of the frame's pixels (`image_map`), and the same map is applied to the frame's camera.
+# A band states how many metres fill the screen's height, so it means the same as for the synthetic person. A frame is
+# enlarged by at most `most_enlarged`.
 
 #: Least and most metres over the screen's height in band `anywhere`, as in `random_view`.
 ANYWHERE_M = (0.4, 2.5)
@@ -360,10 +376,12 @@ ANYWHERE_M = (0.4, 2.5)
 class ViewRule:
     """Limits of random views.
 
-    `turn_deg`: largest turn, degrees. `squeeze`: largest relative difference between the scales along x and y.
-    `flip_share`: share of views with left and right exchanged. `shift`: largest distance along x or y between the
-    view's centre and the screen's middle, as a share of the screen's height. `most_enlarged`: most screen pixels per
-    frame pixel, along a side.
+    `turn_deg`: largest turn, in degrees.
+    `squeeze`: largest relative difference between the scales along x and y.
+    `flip_share`: share (0 to 1) of views with left and right exchanged.
+    `shift`: largest distance along x or y between the view's centre and the screen's middle, as a share of the screen's
+    height.
+    `most_enlarged`: most screen pixels per frame pixel, along a side.
     """
 
     turn_deg: float = 8.0
@@ -404,10 +422,15 @@ def zoomed_view(
     rule: ViewRule,
     screen: Shape,
 ) -> F64 | None:
-    """Return a random map (3,3) from the frame's pixels to the screen's; None if the view's centre is off the frame.
+    """Return a random map (3,3) from the frame's pixels to the screen's pixels.
 
-    `band`: band of the view, a name of `BANDS` or `anywhere`. `posed`: body in the frame. `centres`: chooses the
-    vertex at the view's centre. `screen`: (height, width).
+    Return None if the view's centre is outside the frame.
+
+    `band`: band of the view, a name of `BANDS` or `anywhere`.
+    `posed`: body in the frame. `camera`: camera of the frame.
+    `centres`: object that chooses the vertex at the view's centre.
+    `rule`: limits of the view.
+    `screen`: (height, width) of the screen.
     """
     least, most = BANDS[band][1:] if band in BANDS else ANYWHERE_M
     point = centres.draw(rng, band, posed)

@@ -21,11 +21,11 @@ from trilane.training.capture.capture_samples import BodyRaster
 from trilane.training.first_texture import LEAST_WEIGHT, grown, head_on, lay_out
 from trilane.training.surface import BodyArrays, body_arrays, vertex_normals
 
-#: Least IoU of a good fit. Below a half, the common area of body and mask is smaller than the rest of their union.
+#: Least IoU of a good fit. Below a half, body and mask differ on a larger area than they have in common.
 LEAST_IOU = 0.5
-#: A frame is an outlier if its IoU is below the median by more than `OUTLYING` deviations and more than `LEAST_DROP`.
-#: The deviation is the median absolute deviation, times `NORMAL_MAD` to estimate a standard deviation. Rough outlines
-#: of masks cause drops of up to `LEAST_DROP`.
+#: A fit is bad if its IoU is below the median by more than `OUTLYING` deviations and more than `LEAST_DROP`. The
+#: deviation is the median absolute deviation, times `NORMAL_MAD` to estimate a standard deviation. Rough outlines of
+#: masks cause drops of up to `LEAST_DROP`.
 OUTLYING, NORMAL_MAD = 4.0, 1.4826
 LEAST_DROP = 0.05
 
@@ -34,9 +34,11 @@ LEAST_DROP = 0.05
 class CheckedFrame:
     """The agreement of a frame's body and mask.
 
-    `number`: number of the frame. `iou`: intersection over union of the drawn body and the mask. `outside`: share of
-    the drawn body that the mask does not cover.
-    Clothes and hair make the mask larger than the body. A good fit thus has a small `outside`, and an IoU below 1.
+    `number`: number of the frame.
+    `iou`: intersection over union of the drawn body and the mask.
+    `outside`: share (0 to 1) of the drawn body that the mask does not cover.
+
+    Clothes and hair make the mask larger than the body. Therefore a good fit has a small `outside`, and an IoU below 1.
     """
 
     number: int
@@ -53,7 +55,7 @@ def check_frames(capture: Capture, raster: BodyRaster, coverage: TexelCoverage) 
 
 
 def checked_frame(capture: Capture, raster: BodyRaster, number: int) -> tuple[CheckedFrame, F32, Mask]:
-    """Return the check of frame `number`, the UV image (h,w,3) of its body, and the mask of the person (h,w)."""
+    """Return (check of frame `number`, UV image (h,w,3) of its body, mask (h,w) of the person)."""
     uv = raster.uv_of(capture, number)
     mask = np.asarray(capture.masks.read(capture.mask_of[number]) >= HALF)
     return checked(number, uv[..., 2] > 0, mask), uv, mask
@@ -62,7 +64,7 @@ def checked_frame(capture: Capture, raster: BodyRaster, number: int) -> tuple[Ch
 def checked(number: int, drawn: Mask, mask: Mask) -> CheckedFrame:
     """Return the check of frame `number`.
 
-    `drawn`: (h,w), whether a pixel shows the drawn body. `mask`: (h,w), whether a pixel shows the person.
+    `drawn`, `mask`: (h,w), whether a pixel shows the drawn body, and whether it shows the person.
     """
     together, both = int((drawn | mask).sum()), int((drawn & mask).sum())
     bodys = int(drawn.sum())
@@ -70,7 +72,7 @@ def checked(number: int, drawn: Mask, mask: Mask) -> CheckedFrame:
 
 
 def bad_frames(frames: Sequence[CheckedFrame]) -> list[CheckedFrame]:
-    """Return the frames with a bad fit, worst first: their IoU is below `LEAST_IOU`, or far below the median."""
+    """Return the frames with bad fits, worst first. Their IoU is below `LEAST_IOU`, or far below the median IoU."""
     ious = np.array([frame.iou for frame in frames])
     median = float(np.median(ious))
     deviation = NORMAL_MAD * float(np.median(np.abs(ious - median)))
@@ -107,7 +109,7 @@ CROWN_SHARE, ARMPIT_REACH = 0.25, 0.5
 
 
 def vertex_regions(body: BodyArrays) -> NDArray[np.int64]:
-    """Return the index (V,) in `REGIONS` of each vertex."""
+    """Return the region (V,) of each vertex, as an index into `REGIONS`."""
     by_joint = np.array([_region_of(name) for name in JOINT_NAMES])
     regions: NDArray[np.int64] = by_joint[body.weights.argmax(axis=1)]
     up = vertex_normals(body.vertices, body.faces)[:, 1]
@@ -142,8 +144,8 @@ def _on_crown(body: BodyArrays, regions: NDArray[np.int64]) -> Mask:
 
 # Which texels of the body a capture shows: each pixel of a UV image that lies on the mask shows its texel.
 #
-# Rule: a texel counts as seen only if it was seen at less grazing an angle than at the outline. Regions that no frame
-# shows are named, because their colours are filled from their surroundings.
+# Rule: a texel does not count as seen if it was seen only at a grazing angle, as at the body's outline. Regions that no
+# frame shows are named, because their colours are filled from their surroundings.
 
 #: A region counts as never seen if at most this share of its texels is seen.
 HARDLY = 0.05
@@ -152,7 +154,7 @@ SIDE = 256
 
 
 class TexelCoverage:
-    """Counts which texels of one body were seen, frame by frame."""
+    """Collects which texels of one body were seen, frame by frame. `side`: side S of the texture in texels."""
 
     def __init__(self, body: BodyArrays, side: int = SIDE) -> None:
         regions = np.eye(len(REGIONS))[vertex_regions(body)]
@@ -162,7 +164,7 @@ class TexelCoverage:
         self._side = side
 
     def add(self, drawn: Mask) -> None:
-        """Count a frame that shows the texels `drawn` (S,S)."""
+        """Add a frame that shows the texels `drawn` (S,S)."""
         self._drawn |= drawn
 
     def drawn(self, uv: F32, mask: Mask) -> Mask:
@@ -178,7 +180,7 @@ class TexelCoverage:
 
     @property
     def seen(self) -> Mask:
-        """Texels (S,S) of the body that were seen, and their neighbours: a pixel may span two texels."""
+        """Texels (S,S) of the body that were seen. Neighbours count too, because a pixel may span two texels."""
         return np.asarray(grown(self._drawn) & self.used)
 
     @property
@@ -187,11 +189,11 @@ class TexelCoverage:
         return np.asarray(self.used & ~self.seen)
 
     def share(self) -> float:
-        """Return the share of the body's texels that were seen."""
+        """Return the share (0 to 1) of the body's texels that were seen."""
         return float(self.seen.sum() / self.used.sum())
 
     def share_by_region(self) -> dict[str, float]:
-        """Return the share of seen texels in each region."""
+        """Return the share (0 to 1) of seen texels in each region, by the region's name."""
         seen, shares = self.seen, {}
         for number, name in enumerate(REGIONS):
             inside = self.used & (self.region == number)
@@ -209,9 +211,9 @@ class TexelCoverage:
 
 
 def require_fits(capture: Capture, frames: Sequence[CheckedFrame], sheet: object) -> None:
-    """Raise FaultyCaptureError when the median IoU of `frames` is below `LEAST_IOU`.
+    """Raise FaultyCaptureError if the median IoU of `frames` is below `LEAST_IOU`.
 
-    `sheet`: file of the pictures that show the fits, or words for these pictures; the remedy names it.
+    `sheet`: file of the sheet that shows the fits, or words for it; the remedy names it.
     """
     median = float(np.median([frame.iou for frame in frames]))
     if median < LEAST_IOU:
@@ -226,7 +228,7 @@ def capture_facts(
 ) -> dict[str, Any]:
     """Return the result of a check as JSON values.
 
-    Keys: `capture`, `frames`, `size`, `betas`, `fit`, `bad`, `views`, `texels`; see docs/captures.md.
+    Keys: `capture`, `frames`, `size`, `betas`, `fit`, `bad`, `views`, `texels` (docs/captures.md explains them).
 
     `frames`: checks of all frames. `bad`: checks of the frames with bad fits.
     """
@@ -250,20 +252,21 @@ def capture_facts(
 def texel_facts(coverage: TexelCoverage) -> dict[str, Any]:
     """Return a coverage as JSON values.
 
-    Keys: `seen`, share of the body's texels that are seen; `regions`, the same share of each region; `never_seen`,
-    names of the regions that are hardly seen.
+    Keys: `seen`, share of the body's texels that were seen; `regions`, share of each region's texels that were seen;
+    `never_seen`, names of the regions whose share is at most `HARDLY`.
     """
     names = coverage.never_seen()
     return {"seen": coverage.share(), "regions": coverage.share_by_region(), "never_seen": names}
 
 
 def view_facts(directions: Sequence[tuple[float, float]]) -> dict[str, Any]:
-    """Return counts of the frames' cameras as JSON values.
+    """Return figures of the frames' cameras as JSON values.
 
-    Keys: `by_side`, number of frames that show each side; `by_yaw`, number of frames in each step of `STEP_DEG` from
-    yaw -180 (behind) over the right, the front and the left; `widest_gap_deg`; `height_deg`, least and greatest height.
+    Keys: `by_side`, number of frames that show each side; `by_yaw`, number of frames in each bin of `STEP_DEG` degrees,
+    from yaw -180 (behind the body) over its right, front and left; `widest_gap_deg`, widest angle between neighbouring
+    cameras; `height_deg`, least and greatest height.
 
-    `directions`: (yaw, height) of each frame's camera, degrees.
+    `directions`: (yaw, height) of each frame's camera, in degrees.
     """
     yaws = [yaw for yaw, _ in directions]
     heights = [height for _, height in directions]
@@ -276,9 +279,9 @@ def view_facts(directions: Sequence[tuple[float, float]]) -> dict[str, Any]:
     }
 
 
-# A sheet that shows how the fits of a capture lie over its frames.
+# A sheet that shows the fits of a capture over its frames.
 #
-# Rule: the drawn body is tinted red, and the part of the mask without body blue. Each cell names its frame and IoU.
+# Rule: the drawn body is tinted red, and the part of the mask without body blue. Each cell states its frame and IoU.
 
 COLUMNS, MOST_CELLS = 4, 16
 CELL_WIDTH = 320
@@ -286,7 +289,10 @@ BODY_COLOUR, MASK_COLOUR = (255.0, 0.0, 0.0), (0.0, 64.0, 255.0)
 
 
 def chosen(frames: Sequence[CheckedFrame], bad: Sequence[CheckedFrame]) -> list[CheckedFrame]:
-    """Return the frames for the sheet: the worst of `bad`, at most half of the cells, then others at even steps."""
+    """Return the frames for the sheet: first the worst of `bad`, for at most half of the cells; then other frames.
+
+    The other frames are spread evenly over the capture.
+    """
     worst = list(bad[: MOST_CELLS // 2])
     others = [frame for frame in frames if frame not in bad]
     room = min(MOST_CELLS - len(worst), len(others))
@@ -294,7 +300,7 @@ def chosen(frames: Sequence[CheckedFrame], bad: Sequence[CheckedFrame]) -> list[
 
 
 def overlaid(picture: U8, uv: F32) -> U8:
-    """Return a frame (h,w,3) with its drawn body and its mask in colour.
+    """Return a frame (h,w,3) uint8 on which the drawn body and the mask are tinted.
 
     `picture`: frame (h,w,4) with its mask as alpha. `uv`: UV image (h,w,3) of the frame's body.
     """
@@ -306,7 +312,7 @@ def overlaid(picture: U8, uv: F32) -> U8:
 
 
 def sheet(cells: Sequence[tuple[str, U8]]) -> Image.Image:
-    """Return one image of all `cells` in rows; each cell is a line of text and a picture (h,w,3) of the same size."""
+    """Return one image of all cells in rows. `cells`: (line of text, picture (h,w,3)); all pictures have one size."""
     height, width = cells[0][1].shape[:2]
     size = (CELL_WIDTH, max(1, round(CELL_WIDTH * height / width)))
     columns = min(COLUMNS, len(cells))

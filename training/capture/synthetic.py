@@ -1,7 +1,7 @@
 """Writes a synthetic capture of the clothed default body: any number of frames, in random poses, from all sides.
 
-Rule: a frame depends only on the recipe and its number. If fits and masks have noise, the capture states the noise, and
-a second capture in the folder `truth` has the exact fits and masks.
+Rule: a frame depends only on the recipe and the frame's number. If fits and masks have noise, capture.toml states the
+noise, and a second capture in the folder `truth` has the exact fits and masks.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ TRUTH = "truth"
 FOV_Y_DEG = 40.0
 PITCH_DEG = (-12.0, 4.0, 30.0)
 ROLL_DEG = 1.0
-#: Largest random turn of a frame's camera from its even place about the body, as a share of the turn between two
-#: frames. It is small enough that four frames show all sides.
+#: Cameras are evenly spaced about the body, and then turned at random. This is the largest such turn, as a share of the
+#: angle between two cameras. It is small enough that four frames show all sides.
 JITTER = 0.3
 #: Largest share of the picture that the person fills along a side. The camera may be `MOST_FARTHER` times as far away.
 FILLED = 0.94
 MOST_FARTHER = 1.3
 FAST_PNG = 1
-#: Distances in pixels between the random values that move a mask's outline, and between those of the background.
+#: Distance in pixels between the random values that move a mask's outline, and between those of the background.
 MASK_PATCH_PX, BACKGROUND_PATCH_PX = 24, 160
 #: A straight edge after a Gaussian blur has a tenth of its height at this many standard deviations.
 TENTH_AT = 1.2816
@@ -45,12 +45,15 @@ TENTH_AT = 1.2816
 
 @dataclass(frozen=True)
 class Recipe:
-    """What a synthetic capture shows.
+    """The content of a synthetic capture.
 
-    `frames`: number of frames. `shape`: (height, width) of a frame. `seed`: seed of all random numbers. `look`: look of
-    the person, a name of `LOOKS`.
-    The noise: `fit_deg`, largest turn of each joint of a fit about a random axis, degrees; `fit_mm`, largest move of
-    the body along each axis, millimetres; `mask_px`, largest move of a mask's outline, pixels.
+    `frames`: number of frames.
+    `shape`: (height, width) of a frame.
+    `seed`: seed of all random numbers.
+    `fit_deg`: noise of fits: largest turn of each joint about a random axis, in degrees.
+    `fit_mm`: noise of fits: largest move of the body along each axis, in millimetres.
+    `mask_px`: noise of masks: largest move of the outline, in pixels.
+    `look`: look of the person, a name of `LOOKS`.
     """
 
     frames: int
@@ -81,8 +84,8 @@ class Recipe:
 class SyntheticFrame:
     """One frame with its mask and its fit.
 
-    `frame`: (h,w,3). `mask`: (h,w). `pose` (55,3), `place` (3,): pose and place as in `Fit`, in the camera's OpenCV
-    axes.
+    `frame`: (h,w,3). `mask`: (h,w), 0 to 255.
+    `pose` (55,3), `place` (3,): pose and place of the fit, as in `Fit`, in OpenCV camera axes.
     """
 
     frame: U8
@@ -95,9 +98,11 @@ class SyntheticCapture:
     """Draws the frames of a recipe, with an OpenGL context of its own."""
 
     def __init__(self, shaped: ShapedBody, recipe: Recipe) -> None:
-        """Open the context and put the clothes of the recipe's look on `shaped`. Raises MissingPartError.
+        """Open the context, and put the clothes of the recipe's look on `shaped`.
 
         `shaped`: body with the shape of the recipe's look.
+
+        Raises MissingPartError without OpenGL.
         """
         self._recipe, self._root = recipe, shaped.joints[0]
         self._renderer = SampleRenderer(shaped, look=look_named(recipe.look))
@@ -119,7 +124,7 @@ class SyntheticCapture:
         return SyntheticFrame(frame, rgba[..., 3].copy(), *in_camera(pose, self._root, view))
 
     def noisy(self, number: int, exact: SyntheticFrame) -> SyntheticFrame:
-        """Return frame `number` with the recipe's noise on its fit and its mask; `exact` is the frame without noise."""
+        """Return frame `number` with the recipe's noise on fit and mask. `exact`: the same frame without noise."""
         recipe = self._recipe
         rng = np.random.default_rng((recipe.seed, 5, number))
         pose = turned_at_random(rng, exact.pose, recipe.fit_deg)
@@ -129,10 +134,13 @@ class SyntheticCapture:
 
 
 def framing_view(rng: np.random.Generator, yaw: float, points: F64, projection: F64) -> F64:
-    """Return the view matrix (4,4) of a camera at `yaw`, radians, whose picture is nearly filled by `points` (N,3).
+    """Return the view matrix (4,4) of a camera whose picture is nearly filled by `points` (N,3).
 
-    Let (x, y, z) be a point relative to the aim, in camera axes, and t the tangent of half the field of view. The point
-    is in the picture if the camera's distance from the aim is at least |x| / t + z.
+    The camera aims at the middle of the points' bounding box. Let (x, y, z) be a point relative to this aim, in camera
+    axes, and t the tangent of half the field of view. The point is in the picture if the camera's distance from the aim
+    is at least |x| / t + z (and the same for y).
+
+    `yaw`: direction of the camera about the body, in radians. `projection`: matrix (4,4) of the camera.
     """
     aim = (points.min(axis=0) + points.max(axis=0)) / 2
     pitch = np.radians(rng.triangular(*PITCH_DEG))
@@ -146,10 +154,11 @@ def framing_view(rng: np.random.Generator, yaw: float, points: F64, projection: 
 
 
 def in_camera(pose: F64, root: F64, view: F64) -> tuple[F64, F64]:
-    """Return a body's pose (55,3) and place (3,) in OpenCV camera axes.
+    """Return (pose (55,3), place (3,)) of a body in OpenCV camera axes.
 
-    `pose`: pose (55,3) of the body in the world, where its place is 0. `root`: root joint at rest, (3,), about which
-    the body turns. `view`: matrix (4,4) from the world to the OpenGL camera.
+    `pose`: pose (55,3) of the body in the world, where its place is 0.
+    `root`: root joint (3,) at rest, about which the body turns.
+    `view`: matrix (4,4) from the world to the OpenGL camera.
     """
     to_camera = OPENGL_FROM_OPENCV @ view[:3]  # the matrix is its own inverse
     turned = pose.copy()
@@ -167,7 +176,8 @@ def turned_at_random(rng: np.random.Generator, pose: F64, most_deg: float) -> F6
 def moved_outline(rng: np.random.Generator, mask: U8, most_px: float) -> U8:
     """Return `mask` (h,w), 255 or 0, with its outline moved in or out by up to `most_px` pixels.
 
-    The mask is blurred, then cut at a level from 0.1 to 0.9 that varies smoothly over the picture.
+    The mask is blurred. Then its pixels above a level become 255; the level, 0.1 to 0.9, varies smoothly over the
+    picture.
     """
     blurred = np.asarray(Image.fromarray(mask).filter(ImageFilter.GaussianBlur(most_px / TENTH_AT)), np.float64) / 255
     level = 0.5 + 0.4 * _patches(rng, (mask.shape[0], mask.shape[1]), MASK_PATCH_PX, 1)[..., 0]
@@ -175,7 +185,10 @@ def moved_outline(rng: np.random.Generator, mask: U8, most_px: float) -> U8:
 
 
 def _patches(rng: np.random.Generator, shape: Shape, side: int, channels: int) -> F64:
-    """Return random values (h,w,channels) in -1..1 that vary smoothly, with a new value about every `side` pixels."""
+    """Return random values (h,w,channels) in -1..1 that vary smoothly.
+
+    `shape`: (h, w). `side`: distance in pixels between independent values, which are interpolated.
+    """
     coarse = rng.uniform(-1, 1, (channels, shape[0] // side + 2, shape[1] // side + 2)).astype(np.float32)
     planes = [np.asarray(Image.fromarray(plane).resize(shape[::-1], Image.Resampling.BILINEAR)) for plane in coarse]
     return np.stack(planes, axis=-1).astype(np.float64)
@@ -203,7 +216,7 @@ def _write_shot(folder: Path, number: int, shot: SyntheticFrame, recipe: Recipe)
 
 
 def fit_arrays(pose: F64, place: F64, betas: F64) -> dict[str, Any]:
-    """Return the float32 arrays of a fit by their SMPL-X names, from `pose` (55,3), `place` (3,), `betas` (10,)."""
+    """Return the float32 arrays of a fit by their SMPL-X names. `pose` (55,3), `place` (3,), `betas` (10,): the fit."""
     row = pose.reshape(-1)
     parts: dict[str, Floats] = {
         "global_orient": row[:3],
@@ -245,14 +258,14 @@ cy = {float(lens.cy)!r}
 
 @dataclass(frozen=True)
 class DrawingCost:
-    """The measured cost of a frame: `seconds` to draw and encode it, and `disk_bytes` of its files."""
+    """The measured cost of a frame. `seconds`: time to draw and encode it. `disk_bytes`: size of its files."""
 
     seconds: float
     disk_bytes: int
 
 
 def measured_cost(capture: SyntheticCapture, recipe: Recipe) -> DrawingCost:
-    """Measure the cost of a frame of `recipe`: draw one frame to warm up, then draw and encode another in memory."""
+    """Return the cost of a frame of `recipe`: draw one frame to warm up, then draw and encode another in memory."""
     capture.frame(0)
     start = time.monotonic()
     exact = capture.frame(recipe.frames // 2)

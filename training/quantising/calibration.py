@@ -1,8 +1,9 @@
-"""Calibration: the range of each tensor of a network on real frames, and the scales that follow from it.
+"""Calibration: the range of each tensor of a network on real frames, and the scales that follow from the ranges.
 
-Rule: ranges are measured, then changed in four cases. The logits' range is narrowed to what bytes can show. The range
-of a tensor that a norm over the picture reads is widened. The inputs and the output of a Concat get one range. If all
-runtimes can round alike, each range becomes 256 steps of a power of two.
+Rule: ranges are measured, and then changed in four cases. The range of the logits (inputs of the last Sigmoid) is
+narrowed to values that bytes can show. The range of a tensor that a norm over the picture reads is widened. The inputs
+and the output of a Concat get one range. If all runtimes can round alike, each range becomes 256 steps of a power of
+two.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ METHODS = {
     "percentile": (CalibrationMethod.Percentile, {"percentile": 99.99}),
     "entropy": (CalibrationMethod.Entropy, {}),
 }
-#: At this logit and beyond, the sigmoid rounds to byte 0 or 255, so a wider range would only make steps coarser.
+#: If a logit's size is at least this, its sigmoid rounds to byte 0 or 255. A wider range would only make steps coarser.
 LOGIT_LIMIT = 6.5
 #: Operators that only move bytes, so that their output has the range of their input.
 MOVES = ("Resize", "MaxPool", "Reshape", "Transpose", "Slice", "Split", "DepthToSpace", "SpaceToDepth")
@@ -44,12 +45,13 @@ class _OneFrame(CalibrationDataReader):
 
 
 def measure(path: Path, frames: Sequence[NDArray[np.float32]], method: str, operators: Sequence[str]) -> Any:
-    """Return the ranges of the tensors on `frames`, ONNX Runtime's TensorsData.
+    """Return the range of each tensor on `frames`, as ONNX Runtime's TensorsData.
 
     `path`: file of the float network; a second file is written beside it.
-    `frames`: (H, W, C) float32 each. They are fed one by one, so that memory does not grow with their number.
+    `frames`: inputs (H, W, C) float32. They are fed one by one, so that memory does not grow with their number.
     `method`: a name of `METHODS`.
     `operators`: types of the operators whose inputs and outputs are measured.
+
     Raises BadInputError for an unknown method or tensors that are not finite.
     """
     if method not in METHODS:
@@ -74,9 +76,11 @@ def measure(path: Path, frames: Sequence[NDArray[np.float32]], method: str, oper
 
 
 def limit_logits(model: onnx.ModelProto, ranges: Any) -> None:
-    """Narrow the range of the last sigmoid's input to ±`LOGIT_LIMIT`, in place.
+    """Narrow the range of the last Sigmoid's input to ±`LOGIT_LIMIT`, in place.
 
-    Raises BadInputError if the last node is no sigmoid.
+    `ranges`: ONNX Runtime's TensorsData.
+
+    Raises BadInputError if the last node of `model` is no Sigmoid.
     """
     last = next((node for node in model.graph.node if node.output[0] == model.graph.output[0].name), None)
     if last is None or last.op_type != "Sigmoid":
@@ -87,9 +91,9 @@ def limit_logits(model: onnx.ModelProto, ranges: Any) -> None:
 
 
 def saturated(frames: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float32]]:
-    """Return `frames` with each positive value replaced by their largest value, each negative one by the smallest.
+    """Return `frames` with every positive value set to the largest of all, and every negative value to the smallest.
 
-    These are the pictures of the strongest contrast that the network's input can hold.
+    These are the frames of the strongest contrast that the network's input can hold.
     """
     low, high = min(frame.min() for frame in frames), max(frame.max() for frame in frames)
     ends = np.float32(min(low, 0)), np.float32(max(high, 0))
@@ -97,14 +101,14 @@ def saturated(frames: Sequence[NDArray[np.float32]]) -> list[NDArray[np.float32]
 
 
 def norm_inputs(model: onnx.ModelProto) -> set[str]:
-    """Return the tensors that norms over the picture read, directly or through operators of `MOVES`."""
+    """Return the names of the tensors that norms over the picture read, directly or through operators of `MOVES`."""
     makers = {out: node for node in model.graph.node for out in node.output}
     norms = (node for node in model.graph.node if node.op_type == "InstanceNormalization")
     return {source for node in norms for source in _sources(node.input[0], makers)}
 
 
 def widen(ranges: Any, names: set[str], wider: Any) -> None:
-    """Extend the ranges of the tensors `names`, in place, to include their ranges in `wider`.
+    """Extend the ranges of the tensors `names` in `ranges`, in place, to include their ranges in `wider`.
 
     A norm divides by the picture's own deviation, so its output is the same at any contrast. If its input were clipped
     at the contrast of usual frames, pictures of stronger contrast would change.
@@ -120,8 +124,10 @@ def share_ranges(model: onnx.ModelProto, ranges: Any) -> None:
     """Give the inputs and the output of each Concat one range, in place, so that the Concat rounds nothing.
 
     With different ranges, runtimes that fuse a Concat into the layers before it would clamp at other values than
-    runtimes that do not fuse. If the common range would include negative values and a tensor is rectified, the ranges
-    of that Concat stay: the tensor would lose its clamp at 0.
+    runtimes that do not fuse. The ranges of a Concat stay if one of its tensors is rectified and the common range would
+    include negative values, because the tensor would lose its clamp at 0.
+
+    `ranges`: ONNX Runtime's TensorsData.
     """
     makers = {out: node for node in model.graph.node for out in node.output}
     for node in model.graph.node:
@@ -138,18 +144,22 @@ def share_ranges(model: onnx.ModelProto, ranges: Any) -> None:
 
 
 def _sources(name: str, makers: dict[str, onnx.NodeProto]) -> Iterator[str]:
-    """Yield `name`, then the tensors from which it was made by operators of `MOVES` alone."""
+    """Yield the tensor `name`, and then each tensor from which operators of `MOVES` alone have made it.
+
+    `makers`: node that makes each tensor, by the tensor's name.
+    """
     yield name
     while name in makers and makers[name].op_type in MOVES:
         name = makers[name].input[0]
         yield name
 
 
-# Makes the scales powers of two and keeps sums off the middle between two bytes, so that all runtimes round alike.
+# Makes the scales powers of two, and keeps sums away from the middle between two bytes, so that all runtimes round
+# alike.
 #
-# Rule: between bytes there are only integer sums and shifts, so float32, float64 and fixed point agree on every sum.
-# Weights are even and biases odd, so every sum is odd and never half way between two bytes. It then makes no difference
-# how a runtime rounds halves.
+# Rule: from bytes to bytes there are only integer sums and shifts, so float32, float64 and fixed point agree on every
+# sum. Weights are even and biases odd. Therefore every sum is odd and never half way between two bytes, and it does not
+# matter how a runtime rounds halves.
 #
 # A range need cover only the share `COVER` of the measured range; values outside are clipped. A smaller range often
 # halves the step.
@@ -161,13 +171,13 @@ SHARING = (*MOVES, "Concat", "Add")
 #: Only a network of these operators can round alike on all runtimes. Other operators (norms over the picture, means,
 #: products) round intermediate values, and runtimes differ in how they round them.
 ALIKE = {*SHARING, "Conv", "Relu", "Sigmoid", "Constant", "Identity"}
-#: Largest integer weight, by `reduce_range`; all weights are even.
+#: Largest integer weight with (True) and without (False) `reduce_range`; all weights are even.
 WEIGHT_TOP = {True: 64, False: 126}
 #: Least unit of a layer's integer sum, in steps of the layer's output. With a smaller unit, float32 could not represent
 #: every sum exactly.
 FINEST = 2.0**-16
-#: Greatest unit of a layer's integer sum, in steps of the layer's output. At ½, all odd sums would be half way between
-#: bytes; above ¼, HTP was seen to give another picture.
+#: Greatest unit of a layer's integer sum, in steps of the layer's output. With ½, all odd sums would be half way
+#: between bytes. Above ¼, Qualcomm's HTP was seen to give another picture.
 COARSEST = 0.25
 #: Largest bias in units of the layer's integer sum, so that float32 represents every sum exactly.
 LARGEST_BIAS = 2.0**22
@@ -178,12 +188,12 @@ class CannotRoundAlikeError(ValueError):
 
 
 def may_round_alike(model: onnx.ModelProto) -> bool:
-    """Return whether all operators of the float network `model` can be made to round alike on every runtime."""
+    """Return whether the float network `model` has only operators that can round alike on every runtime."""
     return all(node.op_type in ALIKE for node in model.graph.node)
 
 
 def power_of_two_ranges(model: onnx.ModelProto, ranges: Any) -> None:
-    """Change each range of `ranges`, in place, to 256 steps whose size is a power of two.
+    """Change each range of `ranges`, in place, so that bytes 0 to 255 are equal steps whose size is a power of two.
 
     The inputs and the output of an operator of `SHARING` get the same step, so that the operator rounds nothing. Ranges
     of rectified tensors begin at 0.
@@ -202,12 +212,13 @@ def power_of_two_ranges(model: onnx.ModelProto, ranges: Any) -> None:
 def power_of_two_weights(model: onnx.ModelProto, ranges: Any, reduce_range: bool) -> dict[str, list[dict[str, Any]]]:
     """Round the weights and biases of every Conv in place. Return the scales of the weights, all powers of two.
 
-    Weights become even numbers of steps and biases odd ones, so that no sum is half way between two bytes. The result
-    has a scale for each output channel, by the weights' name, as ONNX Runtime's `TensorQuantOverrides`. Raises
-    CannotRoundAlikeError.
+    Weights become even numbers of steps, and biases odd numbers, so that no sum is half way between two bytes. The
+    result has, by the name of the weights, a scale for each output channel, as ONNX Runtime's `TensorQuantOverrides`.
 
     `ranges`: ranges from `power_of_two_ranges`.
     `reduce_range`: whether weights have 7 bits instead of 8.
+
+    Raises CannotRoundAlikeError if a layer's weights are too large.
     """
     stored = _stored_as(model)
     constants = {tensor.name: tensor for tensor in model.graph.initializer}
@@ -235,7 +246,10 @@ def power_of_two_weights(model: onnx.ModelProto, ranges: Any, reduce_range: bool
 def _bias_of(
     node: onnx.NodeProto, kernel: onnx.TensorProto, constants: dict[str, onnx.TensorProto], model: onnx.ModelProto
 ) -> onnx.TensorProto:
-    """Return the bias (O,) of the Conv `node`; if it has none, add a bias of zeros to `model` and `constants` first."""
+    """Return the bias (O,) of the Conv `node`. If it has none, first add a bias of zeros to `model` and `constants`.
+
+    `kernel`: weights of the Conv. `constants`: constants of `model`, by name.
+    """
     if len(node.input) == 2:
         zeros = numpy_helper.from_array(np.zeros(kernel.dims[0], np.float32), f"{node.output[0]}_bias")
         constants[zeros.name] = model.graph.initializer.add()
@@ -245,7 +259,10 @@ def _bias_of(
 
 
 def _stored_as(model: onnx.ModelProto) -> dict[str, str]:
-    """Return the tensor that is stored as bytes for each tensor: itself, or the output of its only reader, a Relu."""
+    """Return, for each tensor by name, the name of the tensor that is stored as bytes in its place.
+
+    If a Relu is the only reader of a tensor, it is the Relu's output, else the tensor itself.
+    """
     readers: dict[str, list[onnx.NodeProto]] = {}
     for node in model.graph.node:
         for name in node.input:
@@ -258,9 +275,11 @@ def _stored_as(model: onnx.ModelProto) -> dict[str, str]:
 
 
 def _round_weights(kernel: onnx.TensorProto, finest: NDArray[np.float64], top: int) -> NDArray[np.float64]:
-    """Round `kernel` (O, I, h, w), in place, to even multiples of the returned scales (O,), one by output channel.
+    """Round `kernel` (O, I, h, w) in place, and return the scale (O,) of each output channel, a power of two.
 
-    `finest`: (O,) lower limit of the scales, which are powers of two.
+    The weights of a channel become even multiples of its scale.
+
+    `finest`: lower limit (O,) of the scales.
     `top`: largest multiple.
     """
     values = numpy_helper.to_array(kernel).astype(np.float64)
@@ -275,8 +294,8 @@ def _round_weights(kernel: onnx.TensorProto, finest: NDArray[np.float64], top: i
 def _round_bias(bias: onnx.TensorProto, scales: NDArray[np.float64]) -> None:
     """Round `bias` (O,) to odd multiples of `scales` (O,), in place.
 
-    A bias of 0 lies half way between two odd multiples. It is rounded up in even channels and down in odd channels: if
-    all were rounded up, the whole picture would become brighter.
+    A bias of 0 lies half way between two odd multiples. It is rounded up in even channels and down in odd channels,
+    because the whole picture would become brighter if all were rounded up.
     """
     steps = numpy_helper.to_array(bias).astype(np.float64) / scales
     below = 2 * np.floor(steps / 2) + 1
@@ -293,10 +312,12 @@ def _step_of(data: Any) -> float:
 
 
 def _cut(name: str, data: Any, model: onnx.ModelProto) -> tuple[float, float]:
-    """Return the ends (low, high) of the part of the measured range `data` that bytes must cover; 0 is included.
+    """Return (low, high) of the part of a tensor's measured range that bytes must cover; 0 is included.
 
-    Bytes must cover the whole range of the network's input, its output and the logits: with clipped logits, no pixel
-    would be fully transparent.
+    Bytes must cover the whole range of the network's input, of its output and of the logits: with clipped logits, no
+    pixel would be fully transparent.
+
+    `name`: name of the tensor. `data`: its measured range, from ONNX Runtime's TensorsData.
     """
     makers = {out: node for node in model.graph.node for out in node.output}
     ends = {value.name for value in (model.graph.input[0], model.graph.output[0])}
@@ -308,9 +329,9 @@ def _cut(name: str, data: Any, model: onnx.ModelProto) -> tuple[float, float]:
 
 
 def _step(low: float, high: float) -> float:
-    """Return the step of a range: the least power of two so large that 256 steps from `low` reach `high`.
+    """Return the step of a range: the least power of two with which 256 steps from `low` reach `high`.
 
-    The last byte may be up to one step below `high`.
+    The value of byte 255 may be up to one step below `high`.
     """
     step = 2.0 ** math.ceil(math.log2(max(high - low, 1e-9) / (BYTE + 1)))
     while high / step + _zero_point(low, step) > BYTE + 1:
@@ -323,7 +344,7 @@ def _zero_point(low: float, step: float) -> int:
 
 
 def _groups(model: onnx.ModelProto, known: Iterable[str]) -> list[set[str]]:
-    """Return the tensors `known` in groups; the tensors of a group share a step."""
+    """Return the names `known` of tensors in groups; the tensors of a group must have the same step."""
     group = {name: {name} for name in known}
     for names in _sharing(model):
         together: set[str] = set().union(*(group[name] for name in names if name in group))
@@ -332,9 +353,9 @@ def _groups(model: onnx.ModelProto, known: Iterable[str]) -> list[set[str]]:
 
 
 def _sharing(model: onnx.ModelProto) -> Iterator[list[str]]:
-    """Yield the tensors that share a step: inputs and output of each operator of `SHARING`.
+    """Yield lists of tensors that must have the same step: inputs and output of an operator of `SHARING`.
 
-    If a Relu follows an Add, the Relu's output shares the step too.
+    If a Relu follows an Add, the Relu's output must have this step too.
     """
     followers = {name: node for node in model.graph.node for name in node.input}
     for node in model.graph.node:

@@ -1,6 +1,6 @@
 """Compares calibration methods and numbers of frames by the error of the picture.
 
-Rule: the error is measured on frames that no row was calibrated on, against the float network's pictures.
+Rule: the error is measured on frames that are never used for calibration, against the float network's pictures.
 """
 
 from __future__ import annotations
@@ -22,10 +22,10 @@ from trilane.training.quantising.calibration import METHODS
 from trilane.training.quantising.quantise import quantise
 from trilane.writing import write_atomically
 
-#: Errors that are this close to each other are a tie.
+#: PSNRs that differ by at most this many dB count as equal.
 TIE_DB = 0.1
 COUNTS = (5, 10, 50, 100)
-#: Number of frames, the last ones, on which the error is measured unless more are held out.
+#: Default number of frames, at the end of all frames, on which the error is measured.
 EVALUATED = 5
 PROVIDERS = ["CPUExecutionProvider"]
 ERRORS_ONLY = 3
@@ -38,16 +38,18 @@ def calibration_table(
     counts: Sequence[int] = COUNTS,
     held_out: int = EVALUATED,
 ) -> Iterator[dict[str, Any]]:
-    """Yield a row for each method and count: `method`, `count`, `psnr_db`, and `mean` and `largest` error (of 255).
+    """Yield a row for each method and count: `method`, `count`, `psnr_db`, `mean`, `largest`.
 
-    `psnr_db` is the mean over the last `held_out` frames.
+    `psnr_db` is the mean PSNR over the last `held_out` frames. `mean` and `largest` are the mean and the largest
+    absolute error of a value, in steps of 1/255.
 
-    `model`: float network (1, C, H, W).
-    `frames`: (H, W, C) each.
+    `model`: float network with an input of (1, C, H, W).
+    `frames`: inputs (H, W, C) float32.
     `methods`: names of `METHODS`.
     `counts`: numbers of calibration frames. A count that would reach into the last `held_out` frames is left out.
-    `held_out`: number of frames to measure the error on.
-    Raises BadInputError when there are too few frames for the smallest count, or for an unknown method.
+    `held_out`: number of frames, at the end of `frames`, on which the error is measured.
+
+    Raises BadInputError for too few frames for the smallest count, and for an unknown method.
     """
     spare = len(frames) - held_out
     possible = [count for count in counts if count <= spare]
@@ -69,9 +71,9 @@ def calibration_table(
 
 
 def recommended(rows: Sequence[Mapping[str, Any]]) -> Mapping[str, Any]:
-    """Return the recommended row of the table: the one with the fewest frames within `TIE_DB` of the best PSNR.
+    """Return the row with the fewest frames among the rows whose PSNR is within `TIE_DB` of the best PSNR.
 
-    If several rows have as few frames, the one with the highest PSNR is returned. Raises ValueError without rows.
+    If several rows have equally few frames, return the row with the highest PSNR. Raises ValueError without rows.
     """
     best = max(float(row["psnr_db"]) for row in rows)
     ties = [row for row in rows if best - float(row["psnr_db"]) <= TIE_DB]
@@ -88,7 +90,7 @@ def recommendation(rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def _session(model: onnx.ModelProto) -> Any:
-    """Return a function that runs the network: from its only input array to its only output array."""
+    """Return a function that runs the network: it takes the only input array and returns the only output array."""
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = ERRORS_ONLY
     session = onnxruntime.InferenceSession(model.SerializeToString(), settings, providers=PROVIDERS)
@@ -106,7 +108,7 @@ def _errors(float_pictures: Sequence[F32], pictures: Sequence[NDArray[np.uint8]]
     }
 
 
-# Draws the calibration table: the error of the picture over the number of frames, a line for each method.
+# Draws the calibration table: the PSNR of the picture over the number of frames, with a line for each method.
 #
 # Rule: nothing is computed here.
 

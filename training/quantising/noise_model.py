@@ -1,7 +1,8 @@
 """Predicts how far an integer network's picture is from the float network's, without running integers.
 
-Rule: the float network is computed with an error at every place where the integer network rounds or clips. The rounding
-error of each stored tensor and each weight is uniform, half a step to either side. docs/networks.md has the derivation.
+Rule: the float network is computed with an error at every place where the integer network rounds or clips. A stored
+tensor is one that the integer network holds as bytes. The rounding error of each stored tensor and each weight is
+uniform, up to half a step to either side. docs/networks.md has the derivation.
 
 Sources: for the uniform rounding error, Widrow & Kollar 2008, "Quantization Noise", chapter 4; for the prediction
 interval, Hahn & Meeker 1991, "Statistical Intervals", section 4.2.
@@ -30,7 +31,7 @@ from trilane.training.quantising.quantise import Quantised
 
 #: Number of pictures with random rounding errors from which the bound is computed.
 DRAWS = 16
-#: Probability that one more such picture has an error above the bound.
+#: Probability that a further picture with random rounding errors has an error above the bound.
 RISK = 0.001
 #: Student's t with `DRAWS` - 1 degrees of freedom exceeds this value with the probability `RISK`.
 STUDENT_T = 3.7328
@@ -47,9 +48,10 @@ TOP = 255
 class NoiseModel:
     """A float network that rounds and clips where the integer network does.
 
-    `model`: model whose first input is the integer network's bytes. Its other inputs are the constants and `offsets`.
-    `constants`: float value of each constant and largest error of each element, by name.
-    `offsets`: names of inputs that shift the steps of the stored tensors; drawn from -½..½ steps.
+    `model`: model whose first input has the bytes of the integer network's input. Its other inputs are the constants
+    and `offsets`.
+    `constants`: (float value, largest error of each element) of each constant, by the constant's name.
+    `offsets`: names of the inputs that shift the steps of a stored tensor, by a random number from -½ to ½ steps.
     """
 
     model: onnx.ModelProto = field(repr=False)
@@ -61,7 +63,10 @@ class NoiseModel:
         return session(self.model)
 
     def pictures(self, tensor: U8, draws: int, seed: int) -> Iterator[F32]:
-        """Yield `draws` pictures (N, H, W, 4), in 0..255, with random errors, for the bytes `tensor` (N, H, W, C)."""
+        """Yield pictures (N, H, W, 4), in 0..255, with random errors.
+
+        `tensor`: input bytes (N, H, W, C). `draws`: number of pictures. `seed`: seed of the errors.
+        """
         rng = np.random.default_rng(seed)
         source = self.model.graph.input[0].name
         for _ in range(draws):
@@ -74,9 +79,11 @@ class NoiseModel:
 
 
 def float_picture(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> F32:
-    """Return the float network's picture (N, H, W, 4), in 0..255, for the bytes `tensor` (N, H, W, C).
+    """Return the float network's picture (N, H, W, 4), in 0..255.
 
-    `model`: float network. `quantised`: integer network, whose scale and zero point turn the bytes into real numbers.
+    `model`: float network.
+    `quantised`: integer network, whose scale and zero point turn bytes into real numbers.
+    `tensor`: input bytes (N, H, W, C).
     """
     encoding = quantised.network.input
     real = (tensor.astype(np.float32) - encoding.zero_point) * np.float32(encoding.scale)
@@ -87,13 +94,14 @@ def float_picture(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> F
 
 
 def predicted_bound(model: NoiseModel, wanted: F32, tensor: U8, seed: int = 0) -> tuple[float, float]:
-    """Return the expected mean absolute error of the picture, and its bound: one more draw exceeds it with `RISK`.
+    """Return (expected mean absolute error of the picture, bound of this error), in steps of 1/255.
 
-    Both are in steps of 1/255. bound = m + t s sqrt(1 + 1/n), with mean m and standard deviation s of n = `DRAWS`
-    draws and t = `STUDENT_T`.
+    The error of a further draw exceeds the bound with the probability `RISK`: bound = m + t s sqrt(1 + 1/n). Here m is
+    the mean and s the standard deviation of n = `DRAWS` draws, and t = `STUDENT_T`.
 
     `wanted`: float network's picture (N, H, W, 4), in 0..255.
-    `tensor`: bytes (N, H, W, C).
+    `tensor`: input bytes (N, H, W, C).
+    `seed`: seed of the draws.
     """
     errors = [float(np.abs(picture - wanted).mean()) for picture in model.pictures(tensor, DRAWS, seed)]
     mean = float(np.mean(errors))
@@ -101,7 +109,7 @@ def predicted_bound(model: NoiseModel, wanted: F32, tensor: U8, seed: int = 0) -
 
 
 def noise_model(quantised: Quantised) -> NoiseModel:
-    """Return the noise model of an integer network. Raises BadInputError when a constant has no float value."""
+    """Return the noise model of an integer network. Raises BadInputError if a constant has no float value."""
     graph = NoiseGraph(quantised)
     for node in quantised.network.model.graph.node:
         graph.take(node)
@@ -135,11 +143,11 @@ class NoiseGraph:
             self.nodes.append(node)
 
     def _constant(self, node: onnx.NodeProto) -> None:
-        """Turn the constant that `node` dequantises into an input of the model."""
+        """Make the constant that `node` dequantises an input of the noise model, so that each draw can change it."""
         self.constants[node.output[0]] = self.constant(node)
 
     def constant(self, node: onnx.NodeProto) -> tuple[F32, NDArray[np.float64]]:
-        """Return the float value of the constant that `node` dequantises, and the largest error of each element."""
+        """Return (float value of the constant that `node` dequantises, largest error of each element)."""
         stored, scale = self.values[node.input[0]], np.asarray(self.values[node.input[1]], np.float64)
         axis = next((attribute.i for attribute in node.attribute if attribute.name == "axis"), 1)
         if scale.ndim and stored.ndim:
@@ -155,7 +163,9 @@ class NoiseGraph:
     def float_value(self, stored: str, shape: tuple[int, ...]) -> F32:
         """Return the float value of the integer constant named `stored`. Raises BadInputError if it has none.
 
-        ONNX Runtime appends a number to the name of each further copy of a bias that several layers read.
+        If several layers read a bias, ONNX Runtime copies it, and appends a number to the name of each further copy.
+
+        `shape`: shape that the value must have.
         """
         name = stored.removesuffix("_quantized")
         originals = [known for known in self.floats if name.startswith(known) and f"0{name[len(known) :]}".isdigit()]
@@ -165,7 +175,7 @@ class NoiseGraph:
         return value.astype(np.float32)
 
     def store(self, node: onnx.NodeProto) -> None:
-        """Add nodes that clip the tensor that `node` stores, and round it unless it consists of multiples of a step."""
+        """Add nodes that clip the tensor that `node` stores, and that round it if it has values between the steps."""
         x, y = node.input[0], node.output[0]
         lowest, highest, step = self.bytes_of(node)
         low, high = self._limit(f"{y}.low", lowest), self._limit(f"{y}.high", highest)
@@ -176,16 +186,18 @@ class NoiseGraph:
             self._round(x, y, step, (low, high))
 
     def bytes_of(self, node: onnx.NodeProto) -> tuple[float, float, float]:
-        """Return the real values of bytes 0 and 255 of the tensor that `node` stores, and the tensor's step."""
+        """Return (value of byte 0, value of byte 255, step) of the tensor that `node` stores, all as real numbers."""
         step, zero = float(self.values[node.input[1]]), int(self.values[node.input[2]])
         return -zero * step, (TOP - zero) * step, step
 
     def _round(self, x: str, y: str, step: float, ends: tuple[str, str]) -> None:
-        """Add nodes for `y` = (round(`x` / step + offset) - offset) step, which has an error of ±½ step.
+        """Add nodes for `y` = (round(`x` / step + offset) - offset) step, which has an error of at most ½ step.
 
-        A value of exactly 0 or at an end of the range is only clipped.
+        A value that is exactly 0, or at an end of the range or beyond, is only clipped.
 
-        `ends`: names of the constants at the lower and the upper end of the range.
+        `x`, `y`: names of the tensor before and after rounding.
+        `step`: step of the stored tensor, as a real number.
+        `ends`: names of the constants (lower end, upper end) of the range.
         """
         step_name, none = self._limit(f"{y}.step", step), self._limit(f"{y}.none", 0.0)
         offset = f"{y}.offset"
@@ -248,10 +260,10 @@ def session(model: onnx.ModelProto) -> Any:
 # quantiser.
 #
 # Rule: only two facts are taken from the integer network: the places where it rounds, and whether its steps are powers
-# of two. The range of a stored tensor covers its float values on this input, and has 255 steps. The weights of an
-# output channel have `LARGEST_WEIGHT` steps to either side of 0; biases are exact. If steps are powers of two, each is
-# `POWER_OF_TWO` times as wide. For a stored tensor, rounding up to a power of two costs at most that factor; for a
-# weight, using only even multiples costs that factor. The steps of the picture are 1/255.
+# of two. The range of a stored tensor covers the tensor's float values on this input, and has 255 steps. The weights of
+# an output channel have `LARGEST_WEIGHT` steps to either side of 0; biases are exact. If steps are powers of two, each
+# step is `POWER_OF_TWO` times as wide. The reason: a step that is rounded up to a power of two grows by at most this
+# factor, and weights that are only even multiples have steps wider by this factor. The steps of the picture are 1/255.
 
 #: Greatest ratio between a step that was rounded up to a power of two and the step itself.
 POWER_OF_TWO = 2
@@ -265,9 +277,12 @@ Range = tuple[float, float]
 
 
 def ideal_noise_model(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> NoiseModel:
-    """Return the noise model with the steps of an ideal quantiser for the bytes `tensor` (N, H, W, C).
+    """Return the noise model with the steps of an ideal quantiser.
 
-    `model`: float network from which `quantised` was made. Raises BadInputError as `noise_model` does.
+    `model`: float network from which `quantised` was made.
+    `tensor`: input bytes (N, H, W, C), whose ranges the steps must cover.
+
+    Raises BadInputError as `noise_model` does.
     """
     graph = _IdealGraph(quantised, float_ranges(model, quantised, tensor))
     for node in quantised.network.model.graph.node:
@@ -276,9 +291,11 @@ def ideal_noise_model(model: onnx.ModelProto, quantised: Quantised, tensor: U8) 
 
 
 def float_ranges(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> dict[str, Range]:
-    """Return the range (low, high) of each stored tensor's float values on the bytes `tensor`; 0 is included.
+    """Return (low, high) of each stored tensor's float values for an input; 0 is included.
 
-    The keys are the names of the Quantize nodes' outputs.
+    The keys are the names of the stored tensors, which are outputs of QuantizeLinear nodes.
+
+    `model`: float network from which `quantised` was made. `tensor`: input bytes (N, H, W, C).
     """
     graph = _FloatGraph(model, quantised)
     for node in quantised.network.model.graph.node:
@@ -296,8 +313,8 @@ def float_ranges(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> di
 class _FloatGraph(NoiseGraph):
     """Builds a float network that rounds nothing, and collects the names of the tensors that would be stored.
 
-    The integer network has no Relu, because the range of a rectified tensor begins at 0. Without ranges, a Relu is
-    necessary; it is added where `model` has one.
+    The integer network has no Relu, because the range of a rectified tensor begins at 0. This network has no ranges, so
+    it needs a Relu wherever the float network `model` has one.
     """
 
     def __init__(self, model: onnx.ModelProto, quantised: Quantised) -> None:
@@ -336,9 +353,9 @@ class _IdealGraph(NoiseGraph):
         return self.widened * low, self.widened * high, step
 
     def is_multiple(self, name: str, step: float) -> bool:
-        """Return whether all values of tensor `name` are already multiples of a stored tensor's step.
+        """Return whether tensor `name` is a copy of a stored tensor, so that its values are multiples of a step.
 
-        Only copies of a stored tensor are: joined and added tensors have their own steps.
+        Joined and added tensors have steps of their own.
         """
         maker = self.makers.get(name)
         if maker is None or maker.op_type == "DequantizeLinear":
@@ -355,12 +372,12 @@ MAX_DB = 200.0
 
 
 def layer_report(model: onnx.ModelProto, quantised: Quantised, frame: NDArray[np.float32]) -> list[dict[str, Any]]:
-    """Return a row `name`, `op_type`, `sqnr_db` for each layer that both networks have, the lowest SQNR first.
+    """Return a row (`name`, `op_type`, `sqnr_db`) for each layer that both networks have, the lowest SQNR first.
 
-    SQNR = 10 log10(sum x² / sum (x - q)²). x is the layer's output after its activation in the float network, q the
-    same output as the integer network stores it.
+    SQNR = 10 log10(sum x² / sum (x - q)²). Here x is the layer's output after its activation in the float network, and
+    q is the same output as the integer network stores it.
 
-    `model`: float network (1, C, H, W). `frame`: real input (H, W, C).
+    `model`: float network with an input of (1, C, H, W). `frame`: real input (H, W, C).
     """
     network = quantised.network
     tensor = np.clip(np.round(frame / network.input.scale) + network.input.zero_point, 0, 255).astype(np.uint8)
@@ -377,7 +394,7 @@ def layer_report(model: onnx.ModelProto, quantised: Quantised, frame: NDArray[np
 
 
 def _stored(network: NetworkFile) -> dict[str, tuple[onnx.NodeProto, str]]:
-    """Return the layer and its output's name in the float network, by the name of the dequantised output."""
+    """Return (layer, name of its output in the float network) of each layer, by the name of its dequantised output."""
     graph = network.model.graph
     quantisers = {node.input[0]: node for node in graph.node if node.op_type == "QuantizeLinear"}
     readers = {node.input[0]: node for node in graph.node if node.op_type == "DequantizeLinear"}

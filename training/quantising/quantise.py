@@ -1,10 +1,10 @@
 """Makes the integer network: a float network is calibrated on real frames, then quantised.
 
-Rule: activations are unsigned bytes; weights are signed and symmetric with a scale per channel; real 0 is exact; the
-output bytes are the picture. All runtimes round alike if the network allows it, see `calibration`.
+Rule: activations are unsigned bytes. Weights are signed and symmetric, with a scale for each channel. Real 0 is exact.
+The output bytes are the picture. All runtimes round alike if the network's operators allow it (`calibration`).
 
-With `reduce_range`, weights stay within ±64: on a CPU without VNNI, the sum of two products of larger weights overflows
-16 bits.
+With `reduce_range`, weights stay within ±64. On a CPU without VNNI, the sum of two products of larger weights would
+overflow 16 bits.
 """
 
 from __future__ import annotations
@@ -48,9 +48,10 @@ MIN_FRAMES, MAX_FRAMES = 1, 1000
 
 @dataclass(frozen=True)
 class Quantised:
-    """An integer network and how it was made.
+    """An integer network, and facts about its making.
 
-    `facts`: method, number of frames, bits of the weights, float layers, version of ONNX Runtime, as in the manifest.
+    `facts`: key `quantisation` of the manifest: method, number of frames, bits of the weights, float layers, version of
+    ONNX Runtime.
     `float_constants`: weights and biases before rounding, by name.
     """
 
@@ -61,9 +62,9 @@ class Quantised:
 
 @dataclass(frozen=True)
 class ByteRanges:
-    """The byte ranges of a float network's tensors.
+    """The ranges that bytes cover for each tensor of a float network.
 
-    `ends`: real values of bytes 0 and 255, by the tensor's name.
+    `ends`: (real value of byte 0, real value of byte 255), by the tensor's name.
     `alike`: whether weights are even multiples of powers of two, so that all runtimes round alike.
     """
 
@@ -73,9 +74,10 @@ class ByteRanges:
 
 @dataclass(frozen=True)
 class _Calibrated:
-    """A float network with the ranges of its tensors, ONNX Runtime's TensorsData.
+    """A float network that is ready to be quantised.
 
-    `overrides`: scales of weights, by name; if empty, ONNX Runtime computes the scales.
+    `ranges`: ranges of its tensors, ONNX Runtime's TensorsData.
+    `overrides`: scales of weights, by the weights' name; if empty, ONNX Runtime computes the scales.
     `rounds_alike`: whether all runtimes round alike.
     """
 
@@ -94,11 +96,12 @@ def quantise(
 ) -> Quantised:
     """Return the integer network that is made from the float network `model`.
 
-    `model`: network with one float32 input (1, C, H, W) and one output (1, 4, H, W) in 0..1 made by a Sigmoid.
-    `frames`: real inputs for its calibration, (H, W, C) float32, 1 to 1000.
+    `model`: network with one float32 input (1, C, H, W), and one output (1, 4, H, W) in 0..1 from a Sigmoid.
+    `frames`: real inputs (H, W, C) float32 for the calibration; 1 to 1000 frames.
     `method`: calibration method, a name of `METHODS`.
     `reduce_range`: whether weights have 7 bits instead of 8.
     `keep_float`: names of nodes that stay in float.
+
     Raises BadInputError for wrong frames, an unknown method or layer, or a network that is not finite.
     """
     _check_frames(model, frames)
@@ -128,7 +131,7 @@ def quantise(
 
 
 def byte_ranges(model: onnx.ModelProto, frames: Sequence[F32], method: str = "minmax") -> ByteRanges:
-    """Return the ranges that `quantise` would give the tensors of `model`, from the same arguments.
+    """Return the ranges that `quantise` gives the tensors of `model` for the same arguments.
 
     Raises BadInputError as `quantise` does.
     """
@@ -146,14 +149,14 @@ def byte_ranges(model: onnx.ModelProto, frames: Sequence[F32], method: str = "mi
 
 
 def _float_constants(plain: onnx.ModelProto, rounded: onnx.ModelProto) -> dict[str, NDArray[Any]]:
-    """Return the constants of float model `plain`, and zeros for the biases that only `rounded` has, by name."""
+    """Return float constants by name: those of the model `plain`, and zeros for biases that only `rounded` has."""
     known = {name: numpy_helper.to_array(tensor) for name, tensor in constants_of(plain).items()}
     added = {name: np.zeros(tensor.dims, np.float32) for name, tensor in constants_of(rounded).items()}
     return added | known
 
 
 def _measured(model: onnx.ModelProto, frames: Sequence[F32], method: str) -> tuple[onnx.ModelProto, Any]:
-    """Return the model as ONNX Runtime prepares it for quantisation, and the measured ranges of its tensors."""
+    """Return (model as ONNX Runtime prepares it for quantising, measured ranges of its tensors)."""
     with tempfile.TemporaryDirectory(prefix="trilane-quantise-") as folder:
         prepared = Path(folder) / "prepared.onnx"
         source = Path(folder) / "float.onnx"
@@ -168,7 +171,10 @@ def _measured(model: onnx.ModelProto, frames: Sequence[F32], method: str) -> tup
 
 
 def _calibrated(model: onnx.ModelProto, ranges: Any, reduce_range: bool, keep_float: Sequence[str]) -> _Calibrated:
-    """Return `model` rounded so that all runtimes round alike; if that is impossible, `model` with measured ranges."""
+    """Return `model` rounded so that all runtimes round alike; if this is impossible, `model` with measured ranges.
+
+    `ranges`: measured ranges, ONNX Runtime's TensorsData. `reduce_range`, `keep_float`: as for `quantise`.
+    """
     if not keep_float and may_round_alike(model):
         rounded, widened = copy.deepcopy(model), copy.deepcopy(ranges)
         power_of_two_ranges(rounded, widened)
@@ -200,7 +206,7 @@ def _check_weights(model: onnx.ModelProto) -> None:
 
 
 def _describe(model: onnx.ModelProto, keep_float: Sequence[str]) -> None:
-    """Remove other operator sets than ONNX's, and all metadata. Then list the layers `keep_float` in the metadata."""
+    """Remove all metadata, and all operator sets but ONNX's. Then list the layers `keep_float` in the metadata."""
     for entry in [entry for entry in model.opset_import if entry.domain not in ("", "ai.onnx")]:
         model.opset_import.remove(entry)
     del model.metadata_props[:]
@@ -220,8 +226,9 @@ SCALE_LIMITS = (1e-2, 1e2)
 def equalised(model: onnx.ModelProto) -> onnx.ModelProto:
     """Return a copy of the float network with every Conv -> ReLU -> Conv chain equalised, except grouped layers.
 
-    Let r1 be the largest weight that makes a channel, r2 the largest weight that reads it, and s = sqrt(r1 / r2). The
-    first layer's row and bias are divided by s, and the second layer's column is multiplied by s.
+    For a channel between the two Convs, let r1 be the largest weight of the first Conv that makes the channel. Let r2
+    be the largest weight of the second Conv that reads it, and s = sqrt(r1 / r2). The first Conv's weights and bias of
+    the channel are divided by s, and the second Conv's weights are multiplied by s.
     """
     result = copy.deepcopy(model)
     weights = {tensor.name: tensor for tensor in result.graph.initializer}
@@ -238,7 +245,10 @@ def equalised(model: onnx.ModelProto) -> onnx.ModelProto:
 def _pairs(
     graph: onnx.GraphProto, weights: dict[str, onnx.TensorProto]
 ) -> Iterator[tuple[onnx.NodeProto, onnx.NodeProto]]:
-    """Yield pairs of Convs with only a ReLU between them."""
+    """Yield pairs (Conv, next Conv) with only a ReLU between them; grouped Convs are left out.
+
+    `weights`: constants of `graph`, by name.
+    """
     users: dict[str, list[onnx.NodeProto]] = {}
     for node in graph.node:
         for name in node.input:
@@ -251,13 +261,13 @@ def _pairs(
 
 
 def _only(users: dict[str, list[onnx.NodeProto]], node: onnx.NodeProto) -> onnx.NodeProto | None:
-    """Return the node that reads the output of `node`; None if several nodes read it, or none."""
+    """Return the only node that reads the output of `node`; None if several nodes read it, or no node does."""
     readers = users.get(node.output[0], [])
     return readers[0] if len(readers) == 1 else None
 
 
 def _plain(node: onnx.NodeProto, weights: dict[str, onnx.TensorProto], users: dict[str, list[onnx.NodeProto]]) -> bool:
-    """Return whether `node` is a Conv of one group that shares its weights with no other node."""
+    """Return whether `node` is a Conv of one group whose weights no other node reads."""
     if node.op_type != "Conv" or any(a.name == "group" and a.i != 1 for a in node.attribute):
         return False
     return all(name in weights and len(users[name]) == 1 for name in node.input[1:])
@@ -276,8 +286,9 @@ def _equalise(first: onnx.NodeProto, second: onnx.NodeProto, arrays: dict[str, N
 
 # Writes scales and zero points into a network, as Quantize and Dequantize nodes around its layers.
 #
-# Rule: every tensor at `QUANTISED_OPERATORS` has unsigned bytes. Weights are signed bytes with a scale per channel and
-# zero point 0. The output has the scale 1/255 and zero point 0, so its bytes are the picture.
+# Rule: every tensor that an operator of `QUANTISED_OPERATORS` reads or writes has unsigned bytes. Weights are signed
+# bytes with a scale for each channel and zero point 0. The output has the scale 1/255 and zero point 0, so its bytes
+# are the picture.
 
 OUTPUT_SCALE = 1 / 255
 QUANTISED_OPERATORS = [
@@ -289,7 +300,7 @@ QUANTISED_OPERATORS = [
 
 @contextmanager
 def _no_axis_warnings() -> Iterator[None]:
-    """Suppress the quantiser's warning that a vector, such as a norm's scale, has no second axis. It needs none."""
+    """Suppress the quantiser's warning that a vector, such as a norm's scale, has no second axis, which is right."""
 
     def other(record: logging.LogRecord) -> bool:
         return "is out-of-range for weight" not in record.getMessage()
@@ -305,7 +316,7 @@ def _no_axis_warnings() -> Iterator[None]:
 def insert_scales_and_zero_points(
     model: onnx.ModelProto, ranges: Any, overrides: dict[str, Any], reduce_range: bool, keep_float: Sequence[str]
 ) -> onnx.ModelProto:
-    """Return `model` with Quantize and Dequantize nodes.
+    """Return `model` with Quantize and Dequantize nodes around its layers.
 
     `model`: float network.
     `ranges`: ranges of the model's tensors, ONNX Runtime's TensorsData.
@@ -335,7 +346,7 @@ def insert_scales_and_zero_points(
 
 
 def set_picture_scale_and_zero_point(graph: onnx.GraphProto, node: onnx.NodeProto) -> None:
-    """Give the Quantize `node` of the output the scale 1/255 and the zero point 0."""
+    """Give `node`, the Quantize node of the output of `graph`, the scale 1/255 and the zero point 0."""
     values = {"picture_scale": np.float32(OUTPUT_SCALE), "picture_zero_point": np.uint8(0)}
     for slot, (name, value) in enumerate(values.items(), start=1):
         node.input[slot] = name
@@ -344,7 +355,8 @@ def set_picture_scale_and_zero_point(graph: onnx.GraphProto, node: onnx.NodeProt
 
 # Gives an integer network bytes at both ends: NHWC input bytes, and output bytes that are the picture.
 #
-# Rule: bytes are dequantised first and transposed after; in the other order OpenVINO computes the first layer in float.
+# Rule: bytes are dequantised first and then transposed. In the opposite order OpenVINO computes the first layer in
+# float.
 
 
 def replace_ends_by_bytes(model: onnx.ModelProto) -> None:
@@ -373,9 +385,10 @@ def replace_ends_by_bytes(model: onnx.ModelProto) -> None:
 
 
 def _nhwc_to_real(inner: list[onnx.NodeProto], source: str, quantised: str) -> list[onnx.NodeProto]:
-    """Return nodes that dequantise and transpose the input `source`.
+    """Return nodes that dequantise and transpose the input, and make the other nodes read their output.
 
-    The nodes of `inner` that dequantise the tensor `quantised` are removed; their readers read the new nodes' output.
+    `inner`: other nodes of the graph; those that dequantise the tensor `quantised` are removed.
+    `source`: name of the input.
     """
     readers = [node for node in inner if quantised in node.input]
     scale, zero_point = readers[0].input[1:3]
