@@ -101,7 +101,7 @@ def pixels_at(curve: Curve, picture: int) -> float:
     if at == len(curve):
         return curve[-1][1] * picture / curve[-1][0]
     (least, low), (most, high) = curve[at - 1 : at + 1]
-    return low * (high / low) ** (math.log(picture / least) / math.log(most / least))
+    return float(low * (high / low) ** (math.log(picture / least) / math.log(most / least)))
 
 
 def area(shape: Shape) -> int:

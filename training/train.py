@@ -157,7 +157,8 @@ def train_avatar(places: TrainingPlaces, asked: TrainingSettings, listener: List
     files = write_float_network(places.work, state.average, groups, settings.seed)
     network = kept_network(settings.start) if settings.keep_network else None
     network = network or integer_network(state.average, groups, settings.seed)
-    made = {"samples": settings.samples, "steps": state.step, "batch": settings.batch, "seed": settings.seed}
+    made: dict[str, Any] = {"samples": settings.samples, "steps": state.step}
+    made |= {"batch": settings.batch, "seed": settings.seed}
     made |= {"network_of": settings.start} if settings.keep_network else {}
     capture = [] if places.capture is None else [places.capture.name]
     command = shlex.join(["trilane", "avatar", "train", *capture, "--config", NAME])
