@@ -22,7 +22,7 @@ from trilane.errors import did_you_mean
 from trilane.options import one_of
 from trilane.pipeline.description import FACTORY, LONGEST_NAME
 from trilane.scheduler.policy import MOST_FRAMES, POLICIES
-from trilane.transport.slots import edge_rule
+from trilane.transport.slots import EDGE_WORDS, edge_rule
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import UNITS
 
@@ -114,7 +114,7 @@ class RunKeys(Keys):
     )
     edge: EdgeRule | None = Field(
         default=None,
-        description="Rule of each stream that [edges] does not name: single, double, triple, fifo:N or orphan:N. "
+        description=f"Rule of each stream that [edges] does not name: {EDGE_WORDS}. "
         "If absent: double, and fifo:N where branches meet.",
     )
     in_flight: int = Field(

@@ -55,7 +55,7 @@ from trilane.pipeline.measurements.measurement import Measurement
 from trilane.pipeline.measurements.read_file import chosen, read_measurements
 from trilane.scheduler.events import MOST_INPUTS
 from trilane.scheduler.policy import POLICIES
-from trilane.transport.slots import DEFAULT_EDGE, edge_rule
+from trilane.transport.slots import DEFAULT_EDGE, EDGE_WORDS, edge_rule
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
 from trilane.units import UNITS
 
@@ -525,7 +525,7 @@ def _check_edges(file: PipelineFile) -> None:
             remedy = did_you_mean(name, readers) or LEAVE_OUT
             raise BadInputError(where, kind, f"one of {', '.join(readers) or 'none, as nobody reads'}", remedy)
         if not isinstance(rule, str):
-            raise BadInputError(where, shown(rule), "single, double, triple, fifo:N or orphan:N", 'such as "double"')
+            raise BadInputError(where, shown(rule), EDGE_WORDS, 'such as "double"')
         try:
             edge_rule(rule)
         except UnexpectedValue as error:

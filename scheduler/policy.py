@@ -100,6 +100,11 @@ def policy_named(name: str) -> Policy:
     return POLICIES[name]
 
 
+def works_on_one_frame(name: str) -> bool:
+    """Return whether a policy lets only one frame be in flight; False for an unknown name, as in an old report."""
+    return name in POLICIES and POLICIES[name].in_flight == 1
+
+
 MOST_FRAMES = 1_000_000  # that a pipeline file may ask for
 DEADLINE_PERIODS = 3  # from a frame's release until it must be presented
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.metrics import structural_similarity
 
-from trilane.arrays import F32, F64, U8, Mask, Shape
+from trilane.arrays import F32, F64, U8, Mask, Shape, psnr_db
 from trilane.avatars.manifest import BANDS
 
 HALF, OPAQUE = 128, 255
@@ -28,8 +28,6 @@ SSIM_WINDOW = 7
 EDGE_PX = 2
 #: A pixel inside the person whose alpha is below this counts as see-through.
 SOLID = 0.9
-#: Lower bound of the mean squared error; it limits the PSNR to 100 dB.
-LEAST_SQUARE = 1e-10
 
 
 @dataclass(frozen=True)
@@ -67,12 +65,12 @@ def image_error(picture: U8, truth: U8) -> ImageError | None:
     box = np.s_[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     before = {kind: (over(picture, behind)[box], over(truth, behind)[box]) for kind, behind in _behind(truth)}
     squares = {kind: (shown - wanted) ** 2 for kind, (shown, wanted) in before.items()}
-    by_background = {kind: _psnr_db(square) for kind, square in squares.items()}
+    by_background = {kind: psnr_db(square.mean()) for kind, square in squares.items()}
     inside, edge, outside = regions(truth[..., 3])
     wrong = np.abs(picture[..., 3].astype(np.float64) - truth[..., 3]) / OPAQUE
     return ImageError(
         psnr_db=float(np.mean(list(by_background.values()))),
-        body_psnr_db=float(np.mean([_psnr_db(square[true_mask[box]]) for square in squares.values()])),
+        body_psnr_db=float(np.mean([psnr_db(square[true_mask[box]].mean()) for square in squares.values()])),
         by_background=by_background,
         background=1.0 - float(true_mask[box].mean()),
         ssim=float(np.mean([_ssim(shown, wanted) for shown, wanted in before.values()])),

@@ -54,6 +54,8 @@ class EdgeRule:
     yields: bool = False
 
 
+#: The rules in words, for a person.
+EDGE_WORDS: Final = "single, double, triple, fifo:N or orphan:N"
 #: The rules by name. A rule of COUNTED may have a number of slots, as NAME:N.
 RULES = {
     "single": EdgeRule("single", 1),
@@ -77,7 +79,7 @@ def edge_rule(text: str) -> EdgeRule:
     """
     name, colon, count = text.partition(":")
     if name not in RULES or (colon and name not in COUNTED):
-        raise UnexpectedValue(f"edge {text!r}", "single, double, triple, fifo:N or orphan:N", "such as fifo:3")
+        raise UnexpectedValue(f"edge {text!r}", EDGE_WORDS, "such as fifo:3")
     rule = RULES[name]
     if not colon:
         return rule

@@ -24,9 +24,10 @@ from trilane.apps.compare.comparison import (
 )
 from trilane.apps.compare.difference import ALPHA, LEAST_FRAMES, Difference, Finding, combined, rejected
 from trilane.apps.compare.gate import GatedPair
-from trilane.apps.compare.rows import BUSY_MACHINE, FRAME_TIME, MS, Figure, rows_of
+from trilane.apps.compare.rows import FRAME_TIME, MS, Figure, rows_of
 from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, changes, read_told
 from trilane.apps.run.report import Report
+from trilane.apps.run.verdict import MOST_OTHERS
 from trilane.apps.sweep.store import TRIALS, read_trials
 from trilane.errors import BadInputError
 
@@ -237,11 +238,11 @@ def _told(row: Difference) -> dict[str, Any]:
 
 def _notes(documents: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     """Yield remarks on other programs beside the trials, and on too few frames. `documents`: reports of all runs."""
-    shares = [share for document in documents if (share := document.get("other_programs") or 0.0) > BUSY_MACHINE]
+    shares = [share for document in documents if (share := document.get("other_programs") or 0.0) > MOST_OTHERS]
     if shares:
         runs = f"{len(shares)} of {len(documents)} runs"
         yield (
-            f"other programs had more than {100 * BUSY_MACHINE:.0f} % of the cores in {runs}, "
+            f"other programs had more than {100 * MOST_OTHERS:.0f} % of the cores in {runs}, "
             f"{100 * max(shares):.0f} % at most, which makes their intervals wider"
         )
     presented = [document["frames"]["presented"] for document in documents if "frames" in document]

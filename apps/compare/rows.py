@@ -27,6 +27,7 @@ from trilane.apps.compare.difference import (
 )
 from trilane.apps.compare.run_frames import CPU, INSTRUCTION_TIME, INSTRUCTIONS, Key
 from trilane.apps.compare.sides import ComparedRun, RunKind, Side, changes
+from trilane.apps.run.verdict import MOST_OTHERS
 from trilane.hw_profiles.schema import NORMAL_80
 from trilane.student import student_quantile
 from trilane.units import HOST_CLOCK
@@ -72,8 +73,6 @@ LEAST_LEFT = 0.01
 #: Deviation of a percentile as a multiple of the mean's: rare events decide it.
 TAILS: Final = {"p90": 1.5, "p99": 4.0}
 WAIT_FLOOR_MS: Final = 0.05  # deviation of any wait: the time of a message varies by so much
-#: Other programs' share of the cores above which a remark names it.
-BUSY_MACHINE = 0.05
 #: Settings that do not change the speed of a core.
 SAME_CORES: Final = ("policy", "edge", "made.", "config.pace_ns", "config.scene", "idle_cores")
 Documents = Sequence[Mapping[str, Any]]
@@ -426,7 +425,7 @@ def remarks(reports: Mapping[str, Mapping[str, Any]]) -> list[str]:
         others = report.get("other_programs")
         if report["clock"] == HOST_CLOCK and others is None:
             said.append(f"{name}: what other programs had of its cores is not known; they are taken to have had none")
-        elif others is not None and others > BUSY_MACHINE:
+        elif others is not None and others > MOST_OTHERS:
             longer = 1 / max(1 - others, LEAST_LEFT) - 1
             said.append(
                 f"{name}: other programs had {100 * others:.0f} % of its cores, by which frames may take up to "

@@ -32,9 +32,8 @@ from trilane.apps.experiments.reference_path import (
     up_to,
 )
 from trilane.apps.experiments.scene_pictures import region, spread
-from trilane.arrays import F64, U8, Shape
+from trilane.arrays import F64, U8, Shape, psnr_db
 from trilane.bench.lib.cast import Box, RasterLayer, laid_over
-from trilane.bench.lib.picture_error import psnr_db
 from trilane.errors import BadInputError
 from trilane.stages.configure import Checked
 from trilane.units import MEASURED

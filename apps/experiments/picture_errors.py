@@ -16,8 +16,8 @@ from typing import Any
 
 import numpy as np
 
+from trilane import arrays
 from trilane.arrays import F64, Floats, Mask
-from trilane.bench.lib import picture_error
 from trilane.bench.lib.picture_error import flip_map, require_metrics, ssim_map
 from trilane.errors import BadInputError, MissingPartError
 
@@ -107,7 +107,7 @@ def _no_error(side: int, masks: tuple[Mask, Mask] | None, lpips: Perceived | Non
     """Return the figures of two equal pictures without computing errors. `side`: their shorter side, pixels."""
     return ErrorFigures(
         mae=0.0,
-        psnr_db=picture_error.psnr_db(0.0),
+        psnr_db=arrays.psnr_db(0.0),
         ssim=None if side < LEAST_SSIM_PX else 1.0,
         ms_ssim=None if side < LEAST_MS_SSIM_PX else 1.0,
         flip=0.0,
@@ -131,7 +131,7 @@ def mse(picture: Floats, reference: Floats) -> float:
 
 def psnr_db(picture: Floats, reference: Floats) -> float:
     """Return the PSNR, -10 log10 of the mean square difference; at most 100 dB."""
-    return picture_error.psnr_db(mse(picture, reference))
+    return arrays.psnr_db(mse(picture, reference))
 
 
 def ssim(picture: Floats, reference: Floats) -> float | None:

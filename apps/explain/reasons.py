@@ -29,6 +29,7 @@ from trilane.pipeline.timeline import ExplainedJob, Presented
 from trilane.pipeline.unit_history import DOWN, HELD, LOST, OVERHEAD, PREEMPTED, THROTTLED
 from trilane.scheduler.events import Graph
 from trilane.scheduler.ledger import JobRecord
+from trilane.scheduler.policy import works_on_one_frame
 from trilane.units import NS_PER_MS
 
 DELAY: Final = 16  # in presented frames; all jobs that ran beside a frame's jobs have ended by then
@@ -298,7 +299,7 @@ def advice(
     """
     found = []
     works = [row for row in budget if row["what"] == WORK]
-    if policy == "sequential" and len(works) > 1:
+    if works_on_one_frame(policy) and len(works) > 1:
         found.append("one frame is worked on at a time: `--policy pipelined` lets the units work at once")
     nobodys = [row for row in budget if row["what"] == PREEMPTED]
     if sum(row["share"] for row in nobodys) >= LEAST_ADVISED_SHARE:

@@ -24,6 +24,7 @@ from trilane.apps.compare.overview import read_entries
 from trilane.apps.explain.trace import NAME as TRACE_NAME
 from trilane.apps.inspect.inspection import Inspection, Length, drawn_cameras, drawn_points, drawn_skeletons, used
 from trilane.apps.run.report import read_report
+from trilane.apps.run.run_files import SHEET
 from trilane.apps.sweep.definition import read_sweep
 from trilane.arrays import F32
 from trilane.avatars.bundle import DEFAULT, MANIFEST, bundle_folder, load_bundle
@@ -49,7 +50,6 @@ from trilane.scene.schema import AvatarSpec, CameraSpec, load_scene
 from trilane.stages.gpu.background import MOST_PACKETS, is_picture, open_background, pictures_in, read_picture, survey
 from trilane.stages.gpu.video_reader import quarters_of
 
-SHEET = "contact.png"
 MOMENTS = 6
 MOST_PATH_POINTS = 2000
 

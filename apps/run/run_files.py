@@ -23,12 +23,11 @@ from trilane.apps.explain.trace import TraceWriter
 from trilane.errors import UnwrittenError
 from trilane.pipeline.journal import NAME, Begun, Stepped, read_journal
 from trilane.scheduler.recording import header_line, step_line
-from trilane.stages.cpu.present import SEGMENTS, full_disk_told
+from trilane.stages.cpu.present import KEYFRAME_EVERY, SEGMENTS, full_disk_told
 
 EVENTS, VIDEO, SHEET = "events.jsonl", "video.mp4", "contact.png"
 COLUMNS, ROWS = 4, 5
 THUMB_WIDTH = 320
-KEYFRAME_EVERY = 30  # frames, as the present stage encodes them
 FAST_PNG = 1  # zlib level: files are a fifth larger than at the best level, but need a quarter of the time
 
 

@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple
 from trilane.scheduler.stats import samples_needed
 from trilane.units import HOST_CLOCK
 
-#: Share of the cores' time. If other programs take more, the run is not trusted.
+#: Share of the cores' time. If other programs take more, the run is not trusted, and a comparison names it.
 MOST_OTHERS = 0.05
 #: Temperature in °C at which processors may slow down. Laptops and phones begin at 90 to 105 °C.
 HOT_C = 90.0

@@ -30,7 +30,7 @@ from trilane.apps.run.verdict import (
     trust_of,
 )
 from trilane.hw_profiles.rates import wanted_drops
-from trilane.scheduler.policy import POLICIES
+from trilane.scheduler.policy import POLICIES, works_on_one_frame
 from trilane.units import NO_FIGURES, TARGET_FPS
 
 if TYPE_CHECKING:
@@ -191,7 +191,7 @@ def _tries(document: Mapping[str, Any], bound: NamedBound | None, target: float,
 
 def _shorter(document: Mapping[str, Any], bound: NamedBound | None) -> Iterator[str]:
     """Yield proposals to shorten the bound; none if the bound is no stage of a unit, such as the rate."""
-    if document.get("policy") == "sequential" and len(document["units"]) > 1:
+    if works_on_one_frame(document.get("policy", "")) and len(document["units"]) > 1:
         yield "--policy pipelined: the units then work at once"
     if bound is None or bound.unit not in document["units"] or not bound.stages:
         return  # no unit bounds the run, but other programs, the rate or the policy

@@ -14,13 +14,11 @@ from collections.abc import Sequence
 import numpy as np
 
 from trilane import machine
-from trilane.arrays import F64, U8, Mask
+from trilane.arrays import F64, U8, Mask, psnr_db
 from trilane.bench.lib.cast import Box
 from trilane.errors import MissingPartError
 
 MODULES = ("skimage", "flip_evaluator")
-#: Lower bound of the mean square of values in 0..1. Therefore the highest PSNR is 100 dB.
-LEAST_SQUARE = 1e-10
 
 
 class PictureErrors:
@@ -106,11 +104,6 @@ def inside(boxes: Sequence[Box], picture: U8) -> Mask:
     for box in boxes:
         mask[box.top : box.bottom, box.left : box.right] = True
     return mask
-
-
-def psnr_db(square: float) -> float:
-    """Return the PSNR, dB, at most 100. `square`: mean square difference of values in 0..1."""
-    return float(-10 * np.log10(max(square, LEAST_SQUARE)))
 
 
 def box_psnr_db(picture: U8, reference: U8, boxes: Sequence[Box]) -> float:

@@ -522,15 +522,15 @@ def _require_times(path: Path, times: F64, places: F64) -> None:
 
     The steps of a clock are equal. No camera moves so evenly along an axis while it is sampled at uneven times.
     """
-    if len(times) < LEAST_OF_A_CLOCK or _unevenness(times) < UNEVEN:
+    if len(times) < LEAST_OF_A_CLOCK or _worst_step(times) < UNEVEN:
         return
-    even = [name for name, column in zip("xyz", places.T, strict=True) if _unevenness(column) < EVEN]
+    even = [name for name, column in zip("xyz", places.T, strict=True) if _worst_step(column) < EVEN]
     if even:
         found = f"times whose steps differ, and in the place of {even[0]} numbers that grow by equal steps"
         raise BadInputError(path, found, "the times in the column of times", SAY_ORDER)
 
 
-def _unevenness(column: F64) -> float:
+def _worst_step(column: F64) -> float:
     """Return the largest deviation of the steps of `column` (N,) from their median, as a share of the median.
 
     The result is infinite if the column does not grow.

@@ -1,4 +1,4 @@
-"""Names for array types in annotations, and sizes of tensors as text and as shape buckets.
+"""Names for array types in annotations, sizes of tensors as text and as shape buckets, and the PSNR of pictures.
 
 Rules: the name of an array type states the elements, docstrings state the shape. A tensor's shape is (height, width),
 and both sides are multiples of `BUCKET_STEP`.
@@ -64,6 +64,15 @@ def shapes_within(pixels: int) -> list[Shape]:
     widest = [(h, pixels // h // BUCKET_STEP * BUCKET_STEP) for h in range(BUCKET_STEP, longest + 1, BUCKET_STEP)]
     shapes = [(h, w) for h, w in widest if w and max(h, w) <= min(MOST_ASPECT * min(h, w), MAX_SIDE)]
     return [(h, w) for h, w in shapes if not any(b > h and v >= w for b, v in shapes)]
+
+
+#: Lower bound of the mean square difference of values in 0..1. Therefore the highest PSNR is 100 dB.
+LEAST_SQUARE = 1e-10
+
+
+def psnr_db(square: float) -> float:
+    """Return the PSNR, dB, at most 100. `square`: mean square difference of values in 0..1."""
+    return float(-10 * np.log10(max(square, LEAST_SQUARE)))
 
 
 def _check_side(side: int) -> int:

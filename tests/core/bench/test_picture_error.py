@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from trilane.arrays import psnr_db
 from trilane.bench.lib import picture_error
 from trilane.bench.lib.cast import Box
 from trilane.bench.lib.picture_error import (
     PictureErrors,
     box_psnr_db,
     inside,
-    psnr_db,
     psnr_of_frames,
     require_metrics,
 )
