@@ -27,7 +27,7 @@ from trilane.apps.compare.difference import (
 )
 from trilane.apps.compare.run_frames import CPU, INSTRUCTION_TIME, INSTRUCTIONS, Key
 from trilane.apps.compare.sides import ComparedRun, RunKind, Side, changes
-from trilane.student import student_quantile
+from trilane.scheduler.stats import student_quantile
 from trilane.units import HOST_CLOCK
 
 Z_80: Final = 1.281552
