@@ -420,20 +420,20 @@ def measure_beside(
     """
     found: list[list[dict[str, float]]] = []
     with processes(asked) as pair:
-        before = [_ran(each, SEQUENTIAL) for each in pair]
+        before = [_ran_alone(each) for each in pair]
         for _ in range(rounds):
             for each in pair:
                 each.begin(PIPELINED)
             both = [each.result() for each in pair]
-            after = [_ran(each, SEQUENTIAL) for each in pair]
+            after = [_ran_alone(each) for each in pair]
             isolated = [isolated_of((*one.jobs, *other.jobs)) for one, other in zip(before, after, strict=True)]
             found.append(_round(both, isolated, asked))
             before = after
     return [_row(number, each, [rows[number] for rows in found]) for number, each in enumerate(asked)]
 
 
-def _ran(process: AvatarProcess, policy: str) -> Ran:
-    process.begin(policy)
+def _ran_alone(process: AvatarProcess) -> Ran:
+    process.begin(SEQUENTIAL)
     return process.result()
 
 

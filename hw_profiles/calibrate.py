@@ -61,7 +61,7 @@ from trilane.hw_profiles.schema import (
     corners_of,
 )
 from trilane.hw_profiles.unit_times import amounts, join, numbers_of, time_on
-from trilane.student import student_quantile
+from trilane.scheduler.stats import student_quantile
 from trilane.units import BURST, UNITS, UnitName
 
 #: Spreads of the prior, as standard deviations of logarithms: of a chip's speed, of one rate relative to other rates,

@@ -261,16 +261,13 @@ def lay_out(rects: Sequence[Rect], output: Shape, buckets: Sequence[Shape], marg
     return lay_out(rects, output, buckets, margin_px // 2)
 
 
-def lay_out_at(
-    rects: Sequence[Rect], output: Shape, shape: Shape, most_density: float = 1.0, margin_px: int = MARGIN_PX
-) -> DenseLayout | None:
+def lay_out_at(rects: Sequence[Rect], output: Shape, shape: Shape, most_density: float = 1.0) -> DenseLayout | None:
     """Return the layout of the visible avatars in a tensor of `shape`; None if there is no room for all.
 
     `rects`: the avatars' mesh rectangles on the screen, at least one; each is widened to whole pixels of the picture.
     `output`: (height, width) of the picture in pixels.
     `shape`: (height, width) of the tensor.
     `most_density`: largest density of the layout.
-    `margin_px`: background between two avatars, tensor pixels.
     """
     whole = [on_grid(rect, output) for rect in rects]
     sizes = [_pixels(rect, output) for rect in whole]
@@ -278,12 +275,12 @@ def lay_out_at(
         density = min(most_density, shape[0] / sizes[0][0], shape[1] / sizes[0][1])
         grown = grow_on_grid(whole[0], output, (shape[0] / density, shape[1] / density))
         return DenseLayout(TensorLayout(shape, ((grown, (0, 0, *shape)),)), density)
-    best = max(_arrangements(sizes, [shape], margin_px), key=lambda one: min(one.scale, most_density))
+    best = max(_arrangements(sizes, [shape], MARGIN_PX), key=lambda one: min(one.scale, most_density))
     if best.scale <= 0:
         return None
     density = min(best.scale, most_density)
     scaled = _Arrangement(best.shape, best.rows, density)
-    return DenseLayout(TensorLayout(shape, _crops(whole, sizes, output, scaled, margin_px)), density)
+    return DenseLayout(TensorLayout(shape, _crops(whole, sizes, output, scaled, MARGIN_PX)), density)
 
 
 def by_network(networks: Sequence[int]) -> list[list[int]]:
@@ -346,7 +343,7 @@ def _no_room(rects: Sequence[Rect], buckets: Sequence[Shape]) -> BadInputError:
     return BadInputError("tensor shapes", f"{list(buckets)}", f"room for {len(rects)} avatars", "use a larger --size")
 
 
-def tight_shape(rects: Sequence[Rect], output: Shape, density: float = 1.0, margin_px: int = MARGIN_PX) -> Shape:
+def tight_shape(rects: Sequence[Rect], output: Shape, density: float = 1.0) -> Shape:
     """Return the shape of least area with room for the avatars at `density`; sides are multiples of `BUCKET_STEP`.
 
     For several avatars, a shape whose longer side exceeds `MOST_ASPECT` times the shorter is taken only if every
@@ -356,7 +353,7 @@ def tight_shape(rects: Sequence[Rect], output: Shape, density: float = 1.0, marg
     sizes = [(math.ceil(height * density), math.ceil(width * density)) for height, width in whole]
     if len(sizes) == 1:
         return _whole_steps(sizes[0][0]), _whole_steps(sizes[0][1])
-    shapes = [_extent(sizes, rows, margin_px) for rows in _rows(sizes)]
+    shapes = [_extent(sizes, rows, MARGIN_PX) for rows in _rows(sizes)]
     return min(shapes, key=lambda shape: (max(shape) > MOST_ASPECT * min(shape), shape[0] * shape[1], max(shape)))
 
 

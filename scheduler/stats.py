@@ -19,7 +19,8 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Callable, Iterable, Sequence
-from math import ceil, comb, exp, log, sqrt
+from functools import lru_cache
+from math import atan, ceil, comb, cos, erfc, exp, inf, log, pi, sin, sqrt
 from statistics import fmean, stdev
 from typing import Final, Protocol
 
@@ -343,3 +344,35 @@ class Lateness:
         section 3).
         """
         return self._score / self.count if self.count else None
+
+
+@lru_cache(maxsize=4096)
+def student_tails(t: float, freedom: float) -> float:
+    """Return the probability that Student's t is beyond ±`t`.
+
+    `freedom`: degrees of freedom, a whole number or inf.
+    Abramowitz and Stegun, Handbook of Mathematical Functions, 26.7.3 and 26.7.4.
+    """
+    if freedom == inf or t == inf:
+        return erfc(t / sqrt(2))
+    angle, odd = atan(t / sqrt(freedom)), int(freedom) % 2
+    term = cos(angle) if odd else 1.0
+    total = term if freedom > 1 else 0.0
+    for count in range(2 + odd, int(freedom) - 1, 2):
+        term *= cos(angle) ** 2 * (count - 1) / count
+        total += term
+    inside = 2 / pi * (angle + sin(angle) * total) if odd else sin(angle) * total
+    return max(1 - inside, 0.0)
+
+
+@lru_cache(maxsize=256)
+def student_quantile(freedom: float, confidence: float = CONFIDENCE) -> float:
+    """Return the two-sided quantile of Student's t: |t| exceeds it with probability 1 - `confidence`.
+
+    `freedom`: degrees of freedom, a whole number or inf. The quantile is found by bisection.
+    """
+    low, high = 0.0, 1e3
+    for _ in range(80):
+        middle = (low + high) / 2
+        low, high = (middle, high) if student_tails(middle, freedom) > 1 - confidence else (low, middle)
+    return low

@@ -1,4 +1,4 @@
-"""`trilane check`: a pipeline file as text, JSON or a drawing.
+"""`trilane check`: a pipeline file as text, JSON or a drawing. `trilane init`: a first pipeline file for networks.
 
 Rule: this module shows the results of `trilane.apps.check`. It computes nothing and imports no code of the file.
 """
@@ -46,7 +46,7 @@ def check(file: FileArgument, svg: SvgOption = None, profile: ProfileOption = No
 
     For a scene, the command prints the pipeline file of its run. Nothing runs, and no Python of the file is imported.
     """
-    from trilane.apps.check.checked_file import draw_graph
+    from trilane.apps.check.checked import draw_graph
     from trilane.errors import BadInputError
     from trilane.writing import require_writable, write_bytes
 
@@ -77,8 +77,7 @@ def _checked(file: str, profile: str | None) -> tuple[dict[str, Any], str]:
 
     `profile`: chip for the times of a scene; not allowed with a pipeline file. Raises BadInputError, MissingPartError.
     """
-    from trilane.apps.check.checked_file import check_file
-    from trilane.apps.check.checked_scene import check_scene, is_scene
+    from trilane.apps.check.checked import check_file, check_scene, is_scene
     from trilane.errors import BadInputError
 
     if is_scene(file):
@@ -163,3 +162,49 @@ def _tail(document: Mapping[str, Any]) -> list[str]:
     if document["imports"]:
         lines.append(f"imports   {', '.join(document['imports'])}, by `trilane run` alone")
     return lines
+
+
+INIT_EPILOG = """\b
+Examples:
+  trilane init detector.onnx --video street.mp4 --out street.toml
+  trilane init detector.onnx segmenter.onnx --video street.mp4 --out street.toml
+
+\b
+Exit codes:
+  0 the file is written, 2 a file that is wrong, lies elsewhere or exists
+"""
+
+NetworkArgument = Annotated[list[Path], typer.Argument(help="ONNX files that take pictures.")]
+VideoOption = Annotated[Path, typer.Option("--video", help="Video that the networks look at.")]
+OutOption = Annotated[Path, typer.Option("--out", help="Pipeline file to write, in a folder above the others.")]
+InitUnitOption = Annotated[str, typer.Option("--unit", help="Unit of the networks: cpu, gpu or dsp.")]
+ShapeOption = Annotated[
+    list[str] | None,
+    typer.Option("--input-shape", help="Sizes that a network does not fix: NAME=1x3x224x224."),
+]
+
+
+@app.command(epilog=INIT_EPILOG)
+def init(
+    networks: NetworkArgument,
+    video: VideoOption,
+    out: OutOption,
+    unit: InitUnitOption = "dsp",
+    input_shape: ShapeOption = None,
+) -> None:
+    """Write a pipeline file that runs networks on a video, ready for `trilane check`, `predict` and `run`.
+
+    Each network looks at every frame on a branch of its own. Sizes and rate are read from the files.
+    """
+    from trilane.apps.check.new_file import write_new_file
+    from trilane.apps.predict.predict_options import shape_of
+    from trilane.errors import BadInputError
+    from trilane.unexpected_value import UnexpectedValue
+
+    try:
+        shapes = dict(map(shape_of, input_shape or ()))
+    except UnexpectedValue as error:
+        raise BadInputError.at("--input-shape", error) from None
+    console = stdout_console()
+    console.print(write_new_file(out, networks, video, unit, shapes), markup=False, soft_wrap=True, end="")
+    console.print(f"\nwritten: {out}; next: trilane check {out}, trilane run {out}", markup=False, soft_wrap=True)

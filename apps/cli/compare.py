@@ -203,10 +203,10 @@ def _are_sweeps(names: list[str]) -> bool:
 
 
 def _write_page(path: Path, comparisons: list[Comparison]) -> None:
-    from trilane.apps.compare.page import page
+    from trilane.apps.compare.pages import comparison_page
     from trilane.writing import write_bytes
 
-    write_bytes(path, page(comparisons).encode(), "choose another --html")
+    write_bytes(path, comparison_page(comparisons).encode(), "choose another --html")
     say(f"page: {path}")
 
 
@@ -433,7 +433,7 @@ def report(
     validation; the table names the source.
     """
     from trilane.apps.compare.overview import read_entries, table_rows, write_csv, write_parquet
-    from trilane.apps.compare.overview_page import page
+    from trilane.apps.compare.pages import overview_page
     from trilane.writing import require_writable, write_bytes
 
     targets = [target for target in (out, csv, parquet) if target is not None]
@@ -447,7 +447,7 @@ def report(
     if parquet is not None:
         write_parquet(parquet, entries)
     with stderr_console().status("the page"):
-        write_bytes(out, page(title, entries).encode(), "choose another --out")
+        write_bytes(out, overview_page(title, entries).encode(), "choose another --out")
     rows = table_rows(entries)
     if json:
         print_json({"schema": 1, "entries": rows, "files": [str(target) for target in targets]})

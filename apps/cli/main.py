@@ -39,7 +39,7 @@ COMMANDS = {
     "tune": ("trilane.apps.cli.tune", "Find the fastest configuration within given limits, in few trials."),
     "quality": ("trilane.apps.cli.quality", "Compare runtimes on a scene, and with float on hard cases."),
     "inspect": ("trilane.apps.cli.inspect", "Say what a file is, and what to do if it is not usable."),
-    "init": ("trilane.apps.cli.init", "Write a first pipeline file that runs networks on a video."),
+    "init": ("trilane.apps.cli.check", "Write a first pipeline file that runs networks on a video."),
     "check": ("trilane.apps.cli.check", "Check a pipeline file: its graph, least period and memory."),
     "times": ("trilane.apps.cli.inspect", "Read what other tools measured: runs, layers, traces."),
     "avatar": ("trilane.apps.cli.avatar", "Look into avatars, export and quantise their networks."),

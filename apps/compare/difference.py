@@ -20,7 +20,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from trilane.arrays import F64, I64, Ints
-from trilane.student import student_quantile, student_tails
+from trilane.scheduler.stats import student_quantile, student_tails
 
 LEAST_FRAMES: Final = 50
 MOST_FRAMES: Final = 20_000

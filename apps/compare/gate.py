@@ -35,7 +35,7 @@ from trilane.apps.compare.rows import (
 from trilane.apps.compare.run_frames import CPU, INSTRUCTIONS
 from trilane.apps.compare.sides import Change, ComparedRun, Side
 from trilane.errors import BadInputError, did_you_mean
-from trilane.student import student_quantile, student_tails
+from trilane.scheduler.stats import student_quantile, student_tails
 
 #: Largest number of runs on each side for which is computed whether they would decide.
 MOST_RUNS: Final = 200

@@ -196,6 +196,7 @@ def _label(planned: PlannedFrame) -> str:
 
 #: Tensor shape of the reference application. Every plan is compared with it.
 FIXED: Shape = (512, 512)
+MOST_MEASURED = 24  # phases whose error is measured, at one frame each
 BOUND = "proved bound, in pixels of the picture"
 WHY = {
     FrameWork.NONE: "nobody is on the screen: nothing is drawn, packed or inferred",
@@ -222,11 +223,10 @@ class PlanExplanation:
     first_frames: Sequence[PlannedFrame]
 
 
-def explain(checked: Checked, profile: str, performance_profile: str, most_measured: int = 24) -> PlanExplanation:
+def explain(checked: Checked, profile: str, performance_profile: str) -> PlanExplanation:
     """Return the explained plan of a checked scene.
 
     `profile`, `performance_profile`: hardware profile and performance profile that the costs are computed with.
-    `most_measured`: number of phases whose error is measured, at one frame each.
     Raises BadInputError for an unknown profile.
     """
     scene, plan = checked.config.scene, ScenePlan(checked.config, checked.assets)
@@ -237,7 +237,7 @@ def explain(checked: Checked, profile: str, performance_profile: str, most_measu
     for frame in range(scene.frames):
         planned = plan.decide(frame)
         if len(phases([*frames[-1:], planned])) > len(frames[-1:]):
-            measured = len(rows) < most_measured
+            measured = len(rows) < MOST_MEASURED
             rows.append([plan.measured_px(frame, avatar) if measured else None for avatar in planned.plan.seen])
         frames.append(planned)
     groups, bodies = phases(frames), _Bodies(checked)

@@ -22,8 +22,8 @@ from trilane.pipeline.unit_starter import UnitStarter
 from trilane.stages import PRELOAD
 from trilane.stages.avatar_assets import networks_of, painting
 from trilane.stages.avatar_pipeline import one_shape
+from trilane.stages.blocks.network import calls_of
 from trilane.stages.configure import configure, requested_runtime
-from trilane.stages.dsp.bare_calls import calls_of
 from trilane.stages.machine_facts import gl_facts
 from trilane.stages.placing import rehearsed
 from trilane.stages.run_options import RunOptions

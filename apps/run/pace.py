@@ -49,7 +49,7 @@ class Pace:
     stage_ns: Mapping[str, int]
 
 
-def pace_of(config: RunConfig, profile: str, slow_motion: float = 1.0, performance_profile: str = SUSTAINED) -> Pace:
+def pace_of(config: RunConfig, profile: str, slow_motion: float = 1.0) -> Pace:
     """Return the pace of a chip for the run that `config` describes. Raises BadInputError.
 
     The times are for the largest tensor that the scene's size allows, with all avatars in view.
@@ -63,9 +63,9 @@ def pace_of(config: RunConfig, profile: str, slow_motion: float = 1.0, performan
     files = [load_bundle(folder).read_network() for folder in folders.values()]
     network = painting(files, shape, {"avatar": config.avatar_dirs[0].name})
     plan = Plan(network, "dsp", avatars=len(config.avatar_dirs))
-    times = stage_times_ms(chip, plan, corners_of(chip, performance_profile))
+    times = stage_times_ms(chip, plan, corners_of(chip, SUSTAINED))
     held = {stage: round(ms * slow_motion * 1e6) for (stage, _), ms in times.items()}
-    return Pace(chip.name, performance_profile, slow_motion, held)
+    return Pace(chip.name, SUSTAINED, slow_motion, held)
 
 
 def release_fps(pace: Pace, scene_fps: float) -> float:

@@ -237,15 +237,14 @@ def _add_cycles(found: Found, cycles: Mapping[str, Sequence[float]]) -> None:
         found.skipped["cycles of a run, whose clock is not known"] += len(of_runs)
 
 
-def _add_shares(found: Found, nodes: Mapping[str, float], counts: Mapping[str, int | None], hardware: str = "") -> None:
+def _add_shares(found: Found, nodes: Mapping[str, float], counts: Mapping[str, int | None]) -> None:
     whole = sum(nodes.values())
     for name, mean in nodes.items():
         share = mean / whole if whole else None
         what = "cycles: a share, no time"
         found.add(
             Measurement(
-                name, "layer", CYCLES, what, count=counts[name], share=share, service=False, more={"cycles": mean},
-                hardware=hardware,
+                name, "layer", CYCLES, what, count=counts[name], share=share, service=False, more={"cycles": mean}
             )
         )  # fmt: skip
 

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 from trilane.arrays import U8, Floats
 from trilane.errors import EGL_LINE, MissingPartError, TrilaneError, UnitLostError
 from trilane.pipeline.memory import ByteCounter
+from trilane.units import NS_PER_S
 
 REQUIRED_VERSION = 330
 CONTEXT = "OpenGL context"  # key of the context in `UnitContext.shared`
@@ -179,12 +180,12 @@ def fence() -> int:
     return int(function("glFenceSync")(SYNC_GPU_COMMANDS_COMPLETE, 0))
 
 
-def wait_fence(sync: int, timeout_ns: int = 1_000_000_000) -> None:
-    """Wait for the fence `sync` and delete it. Raises TrilaneError if the GPU does not reach it within `timeout_ns`."""
-    result = function("glClientWaitSync")(sync, SYNC_FLUSH_COMMANDS, timeout_ns)
+def wait_fence(sync: int) -> None:
+    """Wait for the fence `sync` and delete it. Raises TrilaneError if the GPU does not reach it within a second."""
+    result = function("glClientWaitSync")(sync, SYNC_FLUSH_COMMANDS, NS_PER_S)
     function("glDeleteSync")(sync)
     if result in (TIMEOUT_EXPIRED, WAIT_FAILED):
-        raise TrilaneError(f"the GPU did not finish within {timeout_ns / 1e9:g} s")
+        raise TrilaneError("the GPU did not finish within 1 s")
 
 
 @contextmanager

@@ -20,7 +20,6 @@ ROWS = (
         "files",
         "options",
         "signals",
-        "student",
         "unet_tables",
         "unexpected_value",
         "units",

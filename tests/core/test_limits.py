@@ -51,9 +51,6 @@ def written_value(module: str, constant: str) -> Any:
 
 
 def test_a_literal_is_read_as_it_is_imported() -> None:
-    assert (
-        written_value("apps.compare.overview_page", "MOST_STILLS")
-        == import_module("trilane.apps.compare.overview_page").MOST_STILLS
-    )
+    assert written_value("apps.compare.pages", "MOST_STILLS") == import_module("trilane.apps.compare.pages").MOST_STILLS
     with pytest.raises(AssertionError, match="NONE"):
-        written_value("apps.compare.overview_page", "NONE")
+        written_value("apps.compare.pages", "NONE")

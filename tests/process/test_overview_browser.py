@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from trilane import machine
-from trilane.apps.compare import overview_page as page_module
+from trilane.apps.compare import pages as page_module
 from trilane.apps.compare.overview import Entry, frontier
 
 playwright = pytest.importorskip("playwright.sync_api")
@@ -29,7 +29,7 @@ def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     pictures = iter([b"\xff\xd8a", b"\xff\xd8b", b"\xff\xd8c", b"\xff\xd8d"])
     monkeypatch.setattr(page_module, "still", lambda _: next(pictures))
     file = tmp_path / "page.html"
-    file.write_text(page_module.page("Told", entries(file)), encoding="utf-8")
+    file.write_text(page_module.overview_page("Told", entries(file)), encoding="utf-8")
     return file
 
 

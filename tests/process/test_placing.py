@@ -15,8 +15,8 @@ from trilane.hw_profiles.host import rule_placement, usable_cores
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.placement import Times
 from trilane.stages import PRELOAD, placing
+from trilane.stages.blocks.network import calls_of
 from trilane.stages.configure import Checked, configure
-from trilane.stages.dsp.bare_calls import calls_of
 from trilane.stages.run_options import RunOptions
 
 SEVERAL = pytest.mark.skipif(len(usable_cores()) < 2, reason="there is one core")

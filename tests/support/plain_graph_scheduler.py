@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import math
 import random
-from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
 
 from support import plain_scheduler
-from support.plain_scheduler import BACK_OFF_NS, LEAD_NS, NO_TIME, RESTART_NS
+from support.plain_scheduler import LEAD_NS, NO_TIME, PlainClock, PlainUnit
 from trilane.scheduler.events import Graph, Input, Settings, StageSpec
 
 SLOTS = {**plain_scheduler.SLOTS, "fifo:4": 4}
@@ -60,29 +59,11 @@ class Job:
     end_ns: int
 
 
-class PlainUnit:
-    def __init__(self, name: str, stages: list[int], duty: int) -> None:
-        self.name, self.stages, self.duty = name, stages, duty
-        self.queue: list[Job] = []
-        self.is_up, self.free_ns, self.head_since_ns, self.failures = True, 0, 0, 0
-        self.hold_until_ns: int | None = None
-        self.start_ns: int | None = None
-        self.ready_ns: int | None = None
-        self.account, self.times_ns = "starved", Counter[str]()
-        self.busy: list[tuple[int, int]] = []
-
-    def room(self) -> int:
-        if not self.is_up or self.hold_until_ns is not None:
-            return 0
-        return 2 if self.duty == 1000 else 1
-
-
-class PlainGraph:
+class PlainGraph(PlainClock):
     """One run of `graph` at one instant, and what can be said of it."""
 
     def __init__(self, graph: Graph, settings: Settings, service: Any, delay_ns: int, faults: Any, duties: Any) -> None:
-        self.graph, self.settings, self.service, self.delay_ns = graph, settings, service, delay_ns
-        self.faults = sorted(faults)
+        super().__init__(graph, settings, service, delay_ns, faults, duties)
         names = [stage.name for stage in graph.stages]
         self.inputs = [[(names.index(each.stage), each) for each in stage.inputs or ()] for stage in graph.stages]
         self.same = [[x for x, each in found if not each.latest] for found in self.inputs]
@@ -105,46 +86,22 @@ class PlainGraph:
         self.rule = dict(zip(streams, graph.edges, strict=True))
         self.slots: list[list[Slot]] = [[] for _ in places]
         self.newest: dict[tuple[int, int], Slot] = {}  # (reader, stage that is read)
-        self.units = [
-            PlainUnit(name, [i for i, s in enumerate(graph.stages) if s.unit == name], duties.get(name, 1000))
-            for name in graph.units
-        ]
-        self.unit_of = [next(u for u in self.units if i in u.stages) for i in places]
-        self.estimate = [0] * len(names)
         self.frames: list[Frame] = []
-        self.queue: list[tuple[int, int]] = []
-        self.next_frame = self.now_ns = self.ordinals = 0
-        self.has_begun = False
-        self.jobs: list[tuple[Any, ...]] = []
-        self.ended: list[tuple[Any, ...]] = []
+        self.ordinals = 0
         self.presented: list[tuple[int, int]] = []
         self.latencies: list[int] = []
-        self.dropped, self.lost = Counter[str](), Counter[str]()
 
     # what there is
 
-    @property
-    def is_paced(self) -> bool:
-        return bool(self.settings.period_ns or self.settings.arrivals_ns)
-
-    def release_ns(self, frame: int) -> int:
-        arrivals = self.settings.arrivals_ns
-        return arrivals[frame] if arrivals else frame * self.settings.period_ns
-
-    def flying(self) -> int:
+    def in_flight(self) -> int:
         return sum(not frame.is_over for frame in self.frames)
 
-    def is_full(self) -> bool:
-        limits = [self.settings.in_flight] if self.settings.in_flight else []
-        limits += [1] if self.settings.policy == "sequential" else []
-        return bool(limits) and self.flying() >= min(limits)
+    def in_all(self) -> bool:
+        return bool(self.frames)
 
     def line(self, stage: int) -> list[Frame]:
         """The frames that the stage could read, in order."""
         return [f for f in self.frames if stage in f.todo and all(x in f.done for x in self.same[stage])]
-
-    def has_source(self) -> bool:
-        return bool(self.queue) if self.is_paced else self.next_frame < self.settings.frames
 
     def head(self, stage: int) -> tuple[int, int] | None:
         """The frame that the stage would take, and its deadline."""
@@ -154,9 +111,6 @@ class PlainGraph:
             return None
         frame, released_ns = self.queue[0] if self.queue else (self.next_frame, self.now_ns)
         return frame, self.deadline(released_ns)
-
-    def deadline(self, released_ns: int) -> int:
-        return released_ns + self.settings.deadline_ns if self.settings.deadline_ns else NO_TIME
 
     def may_enter(self, stage: int) -> bool:
         return bool(self.line(stage)) or not self.is_full()
@@ -184,9 +138,6 @@ class PlainGraph:
         own = self.before[stage] | {stage}
         found = [s for s in found if all(self.is_side[r] for r in s.pending) or not self.is_kept(s.frame, own)]
         return sorted(found, key=lambda s: s.frame.number)
-
-    def expected_end_ns(self, unit: PlainUnit) -> int:
-        return unit.head_since_ns + self.estimate[unit.queue[0].stage]
 
 
 class PlainGraphScheduler(PlainGraph):
@@ -247,10 +198,6 @@ class PlainGraphScheduler(PlainGraph):
         if not frame.is_over:
             self.dropped[f"{edge}:{cause}"] += 1
         self.remove(frame)
-
-    def drop_from_queue(self, cause: str) -> None:
-        self.queue.pop(0)
-        self.dropped[f"source->{self.graph.stages[self.sources[0]].name}:{cause}"] += 1
 
     def evict(self, slot: Slot, stage: int) -> None:
         cause = "stale" if self.rule[stage] == "triple" else "pool"
@@ -370,18 +317,14 @@ class PlainGraphScheduler(PlainGraph):
         output = Slot(frame, is_written=True) if stage in self.rule else None
         if output:
             self.slots[stage].append(output)
-        begin_ns = max(self.now_ns + self.delay_ns, unit.free_ns)
-        name = self.graph.stages[stage].name
-        end_ns = unit.free_ns = begin_ns + self.service(name, unit.name, frame.number, begin_ns)
-        if not unit.queue:
-            unit.head_since_ns = self.now_ns
+        begin_ns, end_ns = self.timed(unit, stage, frame.number)
         job = Job(stage, frame, inputs, output, begin_ns, end_ns)
         for slot in inputs:
             slot.jobs.append(job)
         unit.queue.append(job)
         ready_ns = max((frame.done[x] for x in self.same[stage]), default=frame.released_ns)
         times = (ready_ns, self.now_ns, begin_ns, end_ns)
-        self.jobs.append((self.now_ns, name, unit.name, frame.number, tuple(read), times))
+        self.jobs.append((self.now_ns, self.graph.stages[stage].name, unit.name, frame.number, tuple(read), times))
 
     def slot_of(self, stage: int, frame: Frame) -> Slot:
         return next(slot for slot in self.slots[stage] if slot.frame is frame)
@@ -391,16 +334,9 @@ class PlainGraphScheduler(PlainGraph):
             slot.jobs.remove(job)
 
     def job_done(self, unit: PlainUnit) -> None:
-        job = unit.queue.pop(0)
-        stage, end_ns, frame = job.stage, job.end_ns, job.frame
-        took_ns = end_ns - job.begin_ns
-        unit.head_since_ns, unit.failures = self.now_ns, 0
-        unit.busy.append((job.begin_ns, end_ns))
-        self.ended.append((self.graph.stages[stage].name, frame.number, job.begin_ns, end_ns))
-        learnt = self.estimate[stage]
-        self.estimate[stage] = learnt + ((took_ns - learnt) >> 3) if learnt else took_ns
-        if unit.duty < 1000:
-            unit.hold_until_ns = end_ns + took_ns * (1000 - unit.duty) // unit.duty
+        job = self.finished(unit)
+        stage, frame = job.stage, job.frame
+        self.ended.append((self.graph.stages[stage].name, frame.number, job.begin_ns, job.end_ns))
         self.release_inputs(job)
         if stage in self.sources and not self.graph.from_release:
             frame.sampled_ns = min(frame.sampled_ns, job.begin_ns)
@@ -443,9 +379,7 @@ class PlainGraphScheduler(PlainGraph):
                 else:
                     self.wait_again(job)
         self.free_slots()
-        unit.is_up, unit.ready_ns = False, None
-        unit.start_ns = self.now_ns + BACK_OFF_NS[unit.failures]
-        unit.failures += 1
+        self.down(unit)
 
     def wait_again(self, job: Job) -> None:
         job.frame.begun.remove(job.stage)
@@ -473,52 +407,6 @@ class PlainGraphScheduler(PlainGraph):
 
     # the run
 
-    def run(self) -> None:
-        while True:
-            at_ns, event = self.next_event()
-            for unit in self.units:
-                unit.times_ns[unit.account] += at_ns - self.now_ns
-            self.now_ns = at_ns
-            first: list[PlainUnit] = event() if event is not None else []
-            self.clockwork()
-            self.assign([*first, *self.units])
-            for unit in self.units:
-                unit.account = self.account(unit)
-            if not self.frames and not self.queue and self.next_frame >= self.settings.frames:
-                return
-
-    def next_event(self) -> tuple[int, Any]:
-        """Faults come before other events at one time, events before the times that are only looked at."""
-        events: list[tuple[int, int, int, Any]] = []
-        if self.faults:
-            at_ns, name = self.faults[0]
-            events.append((at_ns, 0, 0, lambda: self.fault(name)))
-        for number, unit in enumerate(self.units):
-            if unit.queue:
-                events.append((unit.queue[0].end_ns + self.delay_ns, 1, number, lambda u=unit: self.done(u)))
-            if unit.ready_ns is not None:
-                events.append((unit.ready_ns, 1, number, lambda u=unit: self.ready(u)))
-        looks = [at for unit in self.units for at in (unit.hold_until_ns, unit.start_ns) if at is not None]
-        if self.is_paced and self.next_frame < self.settings.frames:
-            looks.append(self.release_ns(self.next_frame))
-        if self.settings.queue_timeout_ns and self.queue:
-            looks.append(self.queue[0][1] + self.settings.queue_timeout_ns)
-        if lead_ns := LEAD_NS[self.settings.policy]:
-            looks += [self.expected_end_ns(unit) - lead_ns for unit in self.units if len(unit.queue) == 1]
-        later = [(at, 2, 0, None) for at in looks if self.now_ns < at < NO_TIME]
-        if not self.has_begun:
-            self.has_begun = True
-            later.append((0, 2, 0, None))
-        at_ns, _, _, event = min([*events, *later], key=lambda row: row[:3])
-        return at_ns, event
-
-    def fault(self, name: str) -> list[PlainUnit]:
-        self.faults.pop(0)
-        unit = next(unit for unit in self.units if unit.name == name)
-        if unit.is_up or unit.ready_ns is not None:
-            self.die(unit)
-        return []
-
     def done(self, unit: PlainUnit) -> list[PlainUnit]:
         """The unit itself is served first, then those that it reads, then those that read it."""
         stage = unit.queue[0].stage
@@ -526,28 +414,8 @@ class PlainGraphScheduler(PlainGraph):
         near = [*(x for x, _ in self.inputs[stage]), *(self.all_readers(stage) or self.sources)]
         return [unit, *(self.unit_of[i] for i in near)]
 
-    def ready(self, unit: PlainUnit) -> list[PlainUnit]:
-        unit.is_up, unit.ready_ns = True, None
-        return [unit]
-
     def clockwork(self) -> None:
-        for unit in self.units:
-            if unit.hold_until_ns is not None and unit.hold_until_ns <= self.now_ns:
-                unit.hold_until_ns = None
-            if unit.start_ns is not None and unit.start_ns <= self.now_ns:
-                unit.start_ns, unit.ready_ns, unit.free_ns = None, self.now_ns + RESTART_NS, 0
-                unit.hold_until_ns = None
-        while self.is_paced and self.next_frame < self.settings.frames:
-            if self.release_ns(self.next_frame) > self.now_ns:
-                break
-            self.queue.append((self.next_frame, self.release_ns(self.next_frame)))
-            self.next_frame += 1
-            if self.settings.in_queue and len(self.queue) > self.settings.in_queue:
-                self.queue.pop()
-                self.dropped[f"source->{self.graph.stages[self.sources[0]].name}:queue_full"] += 1
-        timeout_ns = self.settings.queue_timeout_ns
-        while timeout_ns and self.queue and self.queue[0][1] + timeout_ns <= self.now_ns:
-            self.drop_from_queue("timeout")
+        super().clockwork()
         self.enter()
 
     def enter(self) -> bool:

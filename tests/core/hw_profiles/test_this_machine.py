@@ -28,7 +28,8 @@ from trilane.pipeline.rehearsal import Rehearsed
 from trilane.pipeline.stage import UnitContext
 from trilane.scheduler.placement import UnitWork
 from trilane.stages import machine_facts
-from trilane.stages.dsp import bare_calls, ort
+from trilane.stages.blocks import network as block
+from trilane.stages.dsp import ort
 from trilane.units import BURST
 
 ANY: Any = None
@@ -70,7 +71,7 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, ...]]:
         asked.append(what)
         return {threads: TOOK_NS[threads] for threads in what[3]}
 
-    monkeypatch.setattr(bare_calls, "_measured", calls)
+    monkeypatch.setattr(block, "_measured", calls)
     return asked
 
 
@@ -90,8 +91,8 @@ def float_network(path: Path, shape: tuple[int, ...] = (1, 2, 4, 4), kind: int =
     return path
 
 
-def calls(path: Path, say: Callable[[], None] = lambda: None, runtime: str = "ort") -> bare_calls.Calls:
-    return bare_calls.calls_of(path, {}, runtime, (1, 2), CORES, say)
+def calls(path: Path, say: Callable[[], None] = lambda: None, runtime: str = "ort") -> block.Calls:
+    return block.calls_of(path, {}, runtime, (1, 2), CORES, say)
 
 
 @pytest.mark.usefixtures("told")
@@ -144,14 +145,16 @@ def test_a_network_of_floats_runs_in_onnx_runtime(measured: list[Any], tmp_path:
 @pytest.mark.usefixtures("told")
 def test_a_stage_of_a_pipeline_file_is_measured_in_its_own_runtime(measured: list[Any], network: Path) -> None:
     """Also a network of integers, and the two measurements are kept apart."""
-    as_stage = lambda runtime: bare_calls.calls_of(network, {}, runtime, (1,), CORES, lambda: None, as_stage=True)  # noqa: E731
+    as_stage = lambda runtime: block.calls_of(network, {}, runtime, (1,), CORES, lambda: None, as_stage=True)  # noqa: E731
     assert [calls(network).runtime, as_stage("ort").runtime, as_stage("openvino").runtime] == ["ort", "ort", "openvino"]
     assert [(asked[2], asked[5]) for asked in measured] == [("ort", True), ("ort", False), ("openvino", False)]
 
 
 def built(path: Path, shapes: Any = None, is_avatar: bool = False) -> Any:
     unit = UnitContext("dsp", UnitSettings(cores=(0,), threads=1), {})
-    return bare_calls.build({"path": str(path), "shapes": shapes or {}, "runtime": "ort", "is_avatar": is_avatar}, unit)
+    return block.build_calls(
+        {"path": str(path), "shapes": shapes or {}, "runtime": "ort", "is_avatar": is_avatar}, unit
+    )
 
 
 @pytest.mark.parametrize("kind", [TensorProto.FLOAT, TensorProto.INT64, TensorProto.FLOAT16, TensorProto.UINT8])
@@ -182,7 +185,7 @@ def test_frames_are_calls_with_distinct_inputs_in_turn(
     monkeypatch.setattr(ort.OrtSession, "bound", bound)
     is_ours = kind == TensorProto.UINT8
     if is_ours:
-        monkeypatch.setattr(bare_calls, "load_runtime", lambda _: SimpleNamespace(load=lambda *_: Session()))
+        monkeypatch.setattr(block, "load_runtime", lambda _: SimpleNamespace(load=lambda *_: Session()))
     stage = built(network if is_ours else float_network(tmp_path / "net.onnx", kind=kind), is_avatar=is_ours)
     stage.bind([], [])
     for frame in range(5):

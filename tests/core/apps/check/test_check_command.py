@@ -14,7 +14,7 @@ import onnx
 import pytest
 
 from support.pipeline_files import BRANCHES, CUT, DEPTH, STREET, write_file
-from trilane.apps.check.checked_scene import check_scene
+from trilane.apps.check.checked import check_scene
 from trilane.apps.predict.asked_pipelines import asked, avatar
 from trilane.pipeline.description import (
     Pipeline,

@@ -50,6 +50,11 @@ def test_an_error_is_one_sentence(case: str, monkeypatch: pytest.MonkeyPatch, co
         cli.main()
 
 
+def test_an_interrupt_is_130(monkeypatch: pytest.MonkeyPatch, command: Command) -> None:
+    fail_with(monkeypatch, KeyboardInterrupt())
+    assert "Traceback" not in command("doctor", code=130)[1]
+
+
 def test_help_without_words_and_with_either_spelling(command: Command) -> None:
     (long, _), (short, _) = command("--help"), command("-h")
     assert long == short
@@ -66,6 +71,18 @@ def test_a_command_that_is_none_and_an_option_that_is_none(command: Command) -> 
     assert (out, "No such command 'fly'" in err) == ("", True)
     out, err = command("doctor", "--fly", code=2)
     assert (out, "Usage: trilane doctor" in err, "No such option: --fly" in err) == ("", True, True)
+
+
+WRONG_VALUES = {
+    ("--policy", "fly"): "--policy: found 'fly', expected one of sequential, pipelined, latest, deadline",
+    ("--frames", "x"): "--frames: found 'x', expected a whole number",
+}
+
+
+@pytest.mark.parametrize("words", WRONG_VALUES, ids=" ".join)
+def test_a_value_that_is_none(words: tuple[str, ...], command: Command) -> None:
+    out, err = command("run", *words, code=2)
+    assert (out, WRONG_VALUES[words] in err) == ("", True)
 
 
 @pytest.mark.parametrize(

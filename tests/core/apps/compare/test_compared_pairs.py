@@ -18,7 +18,7 @@ from support.run_report import make_report
 from trilane.apps.cli.compare import comparison_lines
 from trilane.apps.compare.comparison import NO_DIFFERENCE, Bounds, Comparison, bounds_text, compare
 from trilane.apps.compare.difference import Finding
-from trilane.apps.compare.page import page
+from trilane.apps.compare.pages import comparison_page
 from trilane.apps.compare.rows import Figure
 from trilane.apps.compare.run_frames import frames_of
 from trilane.apps.compare.sides import ComparedRun, RunKind, Side
@@ -147,7 +147,7 @@ def test_what_bounded_either_run_is_named_and_that_it_changed() -> None:
         word, unit, share, stage, *was = matched.groups()
         assert (word, unit, stage, *was) == said and int(share) > 90
         assert bounds_text(found.bounds) in [*comparison_lines(found, show_all=False)]
-        assert f"<p>{bounds_text(found.bounds)}</p>" in page([found])
+        assert f"<p>{bounds_text(found.bounds)}</p>" in comparison_page([found])
     several = one(Side("base", (base, alike)), Side("other", (slow, bounded(4))))
     assert bounds_text(several.bounds) == (
         "bound: gpu in 1 of 2 runs, dsp in 1 of 2 runs; was dsp in 2 of 2 runs: whether it changed cannot be told"

@@ -18,7 +18,7 @@ from trilane.apps.compare import run_frames
 from trilane.apps.compare.comparison import NO_DIFFERENCE, TOO_FEW, Comparison, compare, document
 from trilane.apps.compare.difference import Chance, Finding
 from trilane.apps.compare.gate import GatedPair, LimitOutcome, judge, read_gate, whole
-from trilane.apps.compare.page import page
+from trilane.apps.compare.pages import comparison_page
 from trilane.apps.compare.rows import Figure, noise_between, remarks
 from trilane.apps.compare.run_frames import Key, frames_of
 from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, changes, read_side, read_told
@@ -368,7 +368,7 @@ def test_the_page_asks_for_nothing_and_escapes_what_it_is_given() -> None:
     base = told(simulated(1), name)
     other = told(simulated(2, policy="sequential"), 'x" onload="y', idle_cores="<b>")
     found = pair(base, other)
-    text = page([found])
+    text = comparison_page([found])
     assert "<script" not in text and "<b>" not in text and 'x" onload' not in text
     assert "&lt;script&gt;" in text and "default-src &#x27;none&#x27;" in text
     assert not any(word in text for word in ("http:", "https:", "src=", "url(", "@import"))

@@ -22,7 +22,7 @@ from trilane.apps.compare.difference import (
     unsure,
 )
 from trilane.arrays import F64
-from trilane.student import student_quantile, student_tails
+from trilane.scheduler.stats import student_quantile, student_tails
 
 RUNS = 100
 

@@ -33,8 +33,8 @@ from trilane.apps.compare.sides import ComparedRun, RunKind, Side
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import Worked, journal_of
 from trilane.scheduler.events import Settings, chain
+from trilane.scheduler.stats import student_quantile
 from trilane.scheduler.virtual import simulate
-from trilane.student import student_quantile
 
 Command = Callable[..., tuple[str, str]]
 QUIET = 0.004

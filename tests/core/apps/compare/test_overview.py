@@ -21,7 +21,7 @@ from trilane.apps.compare.overview import (
     write_csv,
     write_parquet,
 )
-from trilane.apps.compare.overview_page import Dot, page, scatter
+from trilane.apps.compare.pages import Dot, overview_page, scatter
 from trilane.errors import BadInputError
 
 CPU = {"cpu": {"model": "<Chip>", "cores_allowed": [0, 1]}, "gl": {"renderer": "soft"}}
@@ -144,14 +144,14 @@ def test_what_is_no_number_is_no_figure(number: Any) -> None:
     entry = entry_of("r", document | {"check": {"psnr_db": number, "frames": 2}})
     assert (entry.frame_ms, entry.low_ms, entry.high_ms, entry.frames_per_s, entry.psnr_db) == (None,) * 4 + (30.0,)
     assert (entry.speed_source, entry.interval) == ("", "")
-    page("t", [entry])
+    overview_page("t", [entry])
 
 
 def test_half_a_surrogate_pair_is_written_as_a_question_mark(tmp_path: Path) -> None:
     """As of a file's name that is no UTF-8."""
     entry = entry_of("r", REPORT | {"made": {"command": ["trilane", "\udcff.toml"]}, "failure": "\ud800"})
     assert (entry.command, entry.failure) == (("trilane", "?.toml"), "?")
-    page("t", [entry]).encode()
+    overview_page("t", [entry]).encode()
     write_csv(tmp_path / "t.csv", [entry])
 
 
@@ -263,7 +263,7 @@ def test_a_folder_without_runs_is_refused(tmp_path: Path) -> None:
 
 def test_the_page_escapes_and_asks_nobody() -> None:
     document = REPORT | {"made": {"command": ["trilane", "<script>alert(1)</script>"]}}
-    text = page("<b>title</b>", [entry_of("<i>", document), entry_of("two", REPORT | {"accuracy": {}})])
+    text = overview_page("<b>title</b>", [entry_of("<i>", document), entry_of("two", REPORT | {"accuracy": {}})])
     assert text.count("<script>") == 1
     assert "<b>title" not in text
     assert "<i>" not in text
@@ -278,7 +278,7 @@ def test_the_page_names_the_knee_first() -> None:
         Entry(name, "host", "a machine", {}, frame_ms=ms, psnr_db=db, other_programs=0.0125)
         for name, (ms, db) in speeds.items()
     ]
-    text = page("t", entries)
+    text = overview_page("t", entries)
     said = (
         "Knee: bend has 12.0 ms a frame and 36.0 dB. The best picture, slow, takes 8.0 ms more for 0.25 dB. "
         "The quickest, quick, saves 2.0 ms and loses 6.0 dB."
@@ -287,11 +287,11 @@ def test_the_page_names_the_knee_first() -> None:
     assert text.count('class="ring"') == 1
     assert '<td class="number" data-value="0.0125">1.2 %</td>' in text
     no_knee = "No knee: the quickest, quick, has 10.0 ms a frame and 30.0 dB. The best picture, bend, takes 2.0 ms more"
-    assert f"{no_knee} for 6.00 dB." in page("t", entries[:2])
+    assert f"{no_knee} for 6.00 dB." in overview_page("t", entries[:2])
     worse = Entry("slow", "host", "a machine", {}, frame_ms=30.0, psnr_db=30.05)  # a difference that nobody sees
     best = "Best: quick has 10.0 ms a frame and 30.0 dB, the quickest and the best picture."
-    assert best in page("t", [entries[0], worse])
-    assert "Best:" not in page("t", entries[:1])
+    assert best in overview_page("t", [entries[0], worse])
+    assert "Best:" not in overview_page("t", entries[:1])
 
 
 def test_names_of_a_drawing_meet_no_other_name() -> None:

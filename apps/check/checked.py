@@ -1,6 +1,8 @@
 """The document of `trilane check` about a pipeline file: stages, streams, least period, memory. Also its drawing.
 
-Rule: nothing runs here, and no Python of the file is imported.
+Rule: nothing runs here, and no Python of the file is imported. A scene is checked as the pipeline of its run, written
+as a pipeline file. If a chip is given, the stages get times as in `trilane predict SCENE`. The modules of scenes and
+avatars take longer to import than the rest, so only the check of a scene imports them.
 
 The drawing has a lane for each unit, a box for each stage and a line for each input. A dashed line is an input that
 takes the newest frame. A dotted line is the bypass. The stages that determine the period have a thick border.
@@ -8,22 +10,39 @@ takes the newest frame. A dotted line is the bypass. The stages that determine t
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
 from html import escape
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from trilane.apps.check.port_types import PortTypes, port_types, read_networks
 from trilane.errors import BadInputError
+from trilane.files import read_bytes
 from trilane.hw_profiles.pipeline_prediction import StagePrice, bound_of, given_price
+from trilane.hw_profiles.profile_files import load_runnable
+from trilane.hw_profiles.schema import corners_of
+from trilane.hw_profiles.shared_chip import alone_ms
+from trilane.hw_profiles.tenants import SKIPS
+from trilane.pipeline.description import file_text, tables_of, unsaid
 from trilane.pipeline.file_graph import edge_rules, graph_of
 from trilane.pipeline.file_keys import PythonStage, StageKeys
-from trilane.pipeline.pipeline_file import PipelineFile, read_pipeline
+from trilane.pipeline.pipeline_file import (
+    FORM,
+    IF_EMPTY,
+    MOST_BYTES,
+    TABLES,
+    PipelineFile,
+    checked_tables,
+    read_pipeline,
+)
+from trilane.scheduler.policy import POLICIES
 from trilane.transport.slots import edge_rule
-from trilane.units import NS_PER_MS
+from trilane.units import HOST, NS_PER_MS, SUSTAINED
 
 #: Largest total size of one stream's slots. A run keeps them in shared memory.
 MOST_STREAM_BYTES: Final = 2 << 30
+DIGITS: Final = 6  # behind the point of a time in ms, because the scheduler counts nanoseconds
 
 
 def check_file(path: Path) -> dict[str, Any]:
@@ -31,10 +50,10 @@ def check_file(path: Path) -> dict[str, Any]:
 
     Raises BadInputError.
     """
-    return document_of(read_pipeline(path))
+    return _document_of(read_pipeline(path))
 
 
-def document_of(file: PipelineFile) -> dict[str, Any]:
+def _document_of(file: PipelineFile) -> dict[str, Any]:
     """Return the result of `check_file` for a file that is already read. Raises BadInputError."""
     types = port_types(file, read_networks(file))
     prices = {name: price for name in file.stages if (price := given_price(file, name)) is not None}
@@ -119,6 +138,87 @@ def _stream(file: PipelineFile, name: str, rule: str, types: PortTypes) -> dict[
         "ports": {port: str(kind) for port, kind in ports.items()},
         "memory_bytes": None if slot_bytes is None else slots * slot_bytes,
     }
+
+
+class CheckedScene(NamedTuple):
+    """The check of a scene. `document`: as from `check_file`, with `notes`. `text`: the scene's pipeline as a file."""
+
+    document: dict[str, Any]
+    text: str
+
+
+def is_scene(text: str) -> bool:
+    """Return whether `text` is the name of a bundled scene, or of a TOML file without the tables of a pipeline."""
+    from trilane.scene.schema import scene_names
+
+    path = Path(text)
+    if text in scene_names():
+        return True
+    if path.suffix != ".toml" or not path.is_file():
+        return False
+    try:
+        tables = tomllib.loads(read_bytes(path, MOST_BYTES, FORM, IF_EMPTY).decode())
+    except (ValueError, RecursionError):
+        return False
+    return bool(tables) and not {*tables} & {*TABLES}
+
+
+def check_scene(text: str, profile: str | None = None) -> CheckedScene:
+    """Check a scene and return its pipeline. Raises BadInputError, or MissingPartError for a part that a run needs.
+
+    `text`: name of a bundled scene, or a file.
+    `profile`: chip for which the times of the stages are computed; without a chip, the stages have no times.
+    """
+    from trilane.stages.avatar_pipeline import avatar_pipeline
+    from trilane.stages.configure import configure
+    from trilane.stages.run_options import RunOptions
+
+    options = RunOptions(scene=text, skinning="gpu")
+    checked = configure(options, Path.cwd())
+    pipeline, scene = avatar_pipeline(checked.config, checked.assets, options.edge), checked.config.scene
+    run: dict[str, Any] = {"policy": options.policy, "frames": scene.frames}
+    if POLICIES[options.policy].paced:
+        run["fps"] = scene.fps
+    times: Mapping[str, float] = {}
+    taken: Mapping[str, Any] = {}
+    if profile is not None:
+        times, taken = _priced(text, profile)
+    tables = tables_of(pipeline, run, times, taken)
+    document = _document_of(checked_tables(tables, Path(f"{scene.name}.toml")))
+    notes = [*unsaid(pipeline), *_said(profile, document["routes"][0]["share"])]
+    period = document["period_ms"]
+    head = [f"the pipeline of the scene {scene.name}, as `trilane run {text}` runs it"]
+    if period is not None:
+        head.append(f"period {period:.6g} ms or more, by {document['limit']}: {' -> '.join(document['cycle'])}")
+    answer = {**document, "file": text, "imports": [], "notes": notes}
+    return CheckedScene(answer, file_text(tables, [*head, *notes]))
+
+
+def _priced(text: str, profile: str) -> tuple[Mapping[str, float], Mapping[str, Any]]:
+    """Return two parts of the pipeline file: times of stages, and how many frames take the bypass.
+
+    The first part has the mean time of a job by stage, in ms, over the frames that need the network. The second part
+    has the key `pattern` or `share` of the bypass. Raises BadInputError.
+    """
+    from trilane.apps.predict.asked_pipelines import asked, avatar
+
+    chip = load_runnable(profile)
+    if chip.name == HOST:
+        remedy = f"`trilane predict {text} --profile {HOST}` measures this machine"
+        raise BadInputError("--profile", HOST, "a chip, as nothing runs for a check", remedy)
+    tenant = avatar(asked(text), text)
+    means = alone_ms(chip, tenant, corners_of(chip, SUSTAINED))
+    rounded = {stage: round(round(ms * NS_PER_MS) / NS_PER_MS, DIGITS) for stage, ms in means.items()}
+    pattern = "".join(str(int(place == SKIPS)) for place in tenant.frames)
+    return rounded, {"pattern": pattern} if "1" in pattern else {"share": 0}
+
+
+def _said(profile: str | None, share: float | None) -> list[str]:
+    """Return notes on the source of the stages' times, and on the share of frames that take the bypass."""
+    if profile is None or share is None:
+        return ["without times: --profile CHIP adds the times of a chip"]
+    said = f"times are means of {profile}, {SUSTAINED}, for frames that the network paints"
+    return [said, f"{share:.1%} of the scene's frames need no new picture and take the route"]
 
 
 COLUMN, LANE, BOX, HEIGHT, LEFT, TOP = 170, 84, 130, 44, 90, 20

@@ -1,7 +1,11 @@
-"""The overview as one self-contained HTML file: a drawing, the table, and stills of the videos.
+"""The overview and the comparison, each as one self-contained HTML file that loads nothing. All text is escaped.
 
-Rule: all text is escaped. The only script is a file of this folder, and the page's policy names its digest. An
-unreadable video gives no still. The drawing shows the table's numbers. No two things differ by colour alone.
+The overview has a drawing, the table, and stills of the videos. Its only script is a file of this folder, and the
+page's policy names the digest. An unreadable video gives no still. The drawing shows the table's numbers. No two things
+differ by colour alone.
+
+The comparison runs no script. Each change is also drawn: a dot with its 95 % interval, on one scale for figures of the
+same kind.
 """
 
 from __future__ import annotations
@@ -19,8 +23,20 @@ from typing import Any, NamedTuple
 
 import av
 
+from trilane.apps.compare.comparison import (
+    METHOD,
+    Comparison,
+    bounds_text,
+    change_of,
+    interval_of,
+    name_of,
+    setting,
+    value_of,
+)
+from trilane.apps.compare.difference import Difference
 from trilane.apps.compare.frontier import SAME_DB, frontier, knees
 from trilane.apps.compare.overview import Entry, columns, table_rows, told_choices
+from trilane.apps.compare.rows import Figure
 
 UNITS = {"frame_ms": "frame, ms", "low_ms": "from, ms", "high_ms": "to, ms", "latency_ms": "latency, ms"}
 UNITS |= {"psnr_db": "PSNR, dB", "worst_psnr_db": "worst frame, dB", "p1_psnr_db": "1st percentile, dB"}
@@ -45,22 +61,31 @@ TICKS = 5
 MOST_STILLS = 24
 STILL_QUALITY = 85
 STILL_WIDTH = 640
+BAR_WIDTH, BAR_HEIGHT, BAR_MARGIN = 160, 18, 6  # of the drawing of a change, pixels
 
 
-def page(title: str, entries: Sequence[Entry]) -> str:
-    """Return an HTML document. `entries`: one or more."""
-    script = (files("trilane.apps.compare") / "overview_page.js").read_text(encoding="utf-8")
+def overview_page(title: str, entries: Sequence[Entry]) -> str:
+    """Return the HTML document of an overview. `entries`: one or more."""
+    script = _beside("overview_page.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
-    style = (files("trilane.apps.compare") / "overview_page.css").read_text(encoding="utf-8")
-    body = "\n".join(_sections(title, entries))
+    body = "\n".join(_sections(title, entries)) + f"\n<script>{script}</script>"
+    return _document(title, "overview_page.css", policy, body)
+
+
+def _document(title: str, style: str, policy: str, body: str) -> str:
+    """Return an HTML document. `style`: file beside this module. `policy`: what the page may load and run."""
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{escape(policy)}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title><style>{style}</style></head>\n"
-        f"<body><h1>{escape(title)}</h1>\n{body}\n<script>{script}</script></body></html>\n"
+        f"<title>{escape(title)}</title><style>{_beside(style)}</style></head>\n"
+        f"<body><h1>{escape(title)}</h1>\n{body}</body></html>\n"
     )
+
+
+def _beside(name: str) -> str:
+    return (files("trilane.apps.compare") / name).read_text(encoding="utf-8")
 
 
 def _sections(title: str, entries: Sequence[Entry]) -> Iterator[str]:
@@ -329,3 +354,105 @@ def still(video: Path) -> bytes | None:
     file = io.BytesIO()
     image.save(file, "JPEG", quality=STILL_QUALITY)
     return file.getvalue()
+
+
+def comparison_page(comparisons: Sequence[Comparison]) -> str:
+    """Return the HTML document of a comparison. `comparisons`: one or more, with the same base."""
+    title = f"Compared with {comparisons[0].base.name}"
+    parts = "\n".join(part for comparison in comparisons for part in _section(comparison))
+    body = f'{parts}\n<p class="note">{escape(METHOD)}</p>'
+    return _document(title, "comparison_page.css", "default-src 'none'; style-src 'unsafe-inline'", body)
+
+
+def _section(comparison: Comparison) -> Iterator[str]:
+    yield f"<h2>{escape(comparison.other.name)}</h2>"
+    yield f'<p class="verdict">{escape(comparison.verdict)}</p>'
+    if said := bounds_text(comparison.bounds):
+        yield f"<p>{escape(said)}</p>"
+    if comparison.changes:
+        rows = (
+            _row("", _head(change.key), _long(setting(change.base)), _long(setting(change.other)))
+            for change in comparison.changes
+        )
+        yield _captioned("What changed in configuration and machine", ("key", "base", "other"), rows)
+    scales = _scales(comparison)
+    titles = ("figure", "statistic", "base", "other", "change", "95 % interval", "outcome", "drawn")
+    figures = sorted(comparison.rows, key=lambda figure: figure not in comparison.differing)
+    rows = (_figure(figure, comparison, scales) for figure in figures)
+    yield _captioned("Figures; those that differ stand first", titles, rows)
+    for note in comparison.notes:
+        yield f'<p class="note">{escape(note)}</p>'
+
+
+def _captioned(caption: str, titles: Sequence[str], rows: Iterable[str]) -> str:
+    head = "".join(f'<th scope="col">{escape(title)}</th>' for title in titles)
+    body = "\n".join(rows)
+    return (
+        f'<div class="wide"><table><caption>{escape(caption)}</caption>'
+        f"<thead><tr>{head}</tr></thead><tbody>\n{body}\n</tbody></table></div>"
+    )
+
+
+def _row(kind: str, *cells: str) -> str:
+    return f'<tr class="{kind}">{"".join(cells)}</tr>'
+
+
+def _head(text: str) -> str:
+    return f'<th scope="row">{escape(text)}</th>'
+
+
+def _long(text: str) -> str:
+    return f'<td class="long">{escape(text)}</td>'
+
+
+def _number(text: str) -> str:
+    return f'<td class="number">{escape(text)}</td>'
+
+
+def _figure(figure: Figure, comparison: Comparison, scales: dict[tuple[bool, str], float]) -> str:
+    row, unit = comparison.rows[figure], figure.unit
+    cells = (value_of(row.base, unit), value_of(row.other, unit), change_of(row, unit), interval_of(row, unit))
+    drawn = _bar(row, scales[_scale_of(row, unit)])
+    kind = "differs" if figure in comparison.differing else "same"
+    texts = (f"<td>{escape(text)}</td>" for text in (figure.statistic, comparison.outcome(figure)))
+    return _row(kind, _head(name_of(figure)), next(texts), *map(_number, cells), *texts, drawn)
+
+
+def _scale_of(row: Difference, unit: str) -> tuple[bool, str]:
+    return row.is_ratio, "" if row.is_ratio else unit
+
+
+def _scales(comparison: Comparison) -> dict[tuple[bool, str], float]:
+    """Return, by kind of change (`_scale_of`), the largest change to draw.
+
+    Every change fits in, and so do the intervals of figures that differ. Other intervals may be cut.
+    """
+    scales: dict[tuple[bool, str], float] = {}
+    for figure, row in comparison.rows.items():
+        reach = max(map(abs, (row.change, row.low or 0.0, row.high or 0.0))) if figure in comparison.differing else 0.0
+        kind = _scale_of(row, figure.unit)
+        scales[kind] = max(scales.get(kind, 0.0), reach, abs(row.change))
+    return scales
+
+
+def _bar(row: Difference, scale: float) -> str:
+    """Return a table cell with a drawing: a dot at the change, a line for its interval, and a line at no change.
+
+    `scale`: change at the right edge.
+    """
+
+    def place(value: float) -> float:
+        share = min(max(value / scale, -1.0), 1.0) if scale else 0.0
+        return round(BAR_WIDTH / 2 + share * (BAR_WIDTH / 2 - BAR_MARGIN), 1)
+
+    middle = BAR_HEIGHT / 2
+    interval = (
+        f'<line class="interval" x1="{place(row.low)}" x2="{place(row.high)}" y1="{middle}" y2="{middle}"/>'
+        if row.low is not None and row.high is not None
+        else ""
+    )
+    return (
+        f'<td><svg viewBox="0 0 {BAR_WIDTH} {BAR_HEIGHT}" aria-hidden="true">'
+        f'<line x1="{BAR_WIDTH / 2}" x2="{BAR_WIDTH / 2}" y1="0" y2="{BAR_HEIGHT}"/>'
+        f'{interval}<circle cx="{place(row.change)}" cy="{middle}" r="3.5"/></svg></td>'
+    )
