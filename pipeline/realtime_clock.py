@@ -351,7 +351,10 @@ class RealtimeClock:
         return events
 
     def _ping(self, now_ns: int) -> list[Event]:
-        """Ping the units without a job, and return an event for each. The job of a busy unit ends, or is too late."""
+        """Ping the units without a job, and return an event for each. A busy unit needs none: its job has a deadline.
+
+        Units that a signal has stopped, and a fork server that does not answer, are noticed here too.
+        """
         self._ping_ns = now_ns + PING_NS
         with contextlib.suppress(OSError):  # starting the next unit tries again
             if why := self._processes.renew_starter():

@@ -170,7 +170,7 @@ class Flow:
         self.dirty.append(unit)
 
     def admit(self, frame: int, release_ns: int, deadline_ns: int) -> None:
-        """Put the frame in flight. `release_ns`, `deadline_ns`: times in ns; NEVER: no deadline."""
+        """Put the frame in flight. `release_ns`: time of its release. `deadline_ns`: its deadline, or NEVER."""
         todo = self.next_todo() if self._every else self._all
         self.frames[frame] = FrameState(release_ns, deadline_ns, self.rung, self._admitted, todo, self._count)
         self._admitted += 1

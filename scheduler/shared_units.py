@@ -43,8 +43,8 @@ ROUND_ROBIN: Final = "round-robin"
 class Waiting(NamedTuple):
     """The first job of a pipeline that waits for a seat.
 
-    `behind`: number of pipelines whose turn comes before this one's; 0 for the pipeline after the one that had the seat
-    last, whose own number is the largest.
+    `behind`: number of pipelines whose turn comes before this pipeline's turn. The pipeline that had the seat last has
+    the largest number, and the pipeline after it has 0.
     `deadline_ns`: deadline of the job's frame, or NEVER.
     `order`: number that grows with each hand-over of a job to a unit.
     """
