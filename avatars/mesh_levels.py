@@ -77,7 +77,7 @@ class MeshLevel:
 
     @cached_property
     def has_blend(self) -> bool:
-        """Whether pose blend shapes move any vertex."""
+        """Whether the body has pose blend shapes that move a vertex."""
         return bool(self.blend.any())
 
     @cached_property

@@ -283,7 +283,7 @@ class RealtimeClock:
         return found
 
     def stopped(self) -> list[Stopped]:
-        """Return a record for each stop of a unit by a signal that was seen since the last call."""
+        """Return a record for each unit that a signal was seen to have stopped since the last call."""
         unnoted, self._unnoted = self._unnoted, []
         return unnoted
 

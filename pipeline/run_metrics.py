@@ -350,7 +350,7 @@ class PathShares(Record):
 
 
 class FramesBehind(Record):
-    """By how many frames the newest frame was older than the frame of the job that took it: `mean` and `max`."""
+    """Numbers of frames by which newest frames were older than the frames of the jobs that took them: `mean`, `max`."""
 
     mean: float
     max: int

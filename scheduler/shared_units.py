@@ -287,7 +287,7 @@ class BesideDriver:
             raise RuntimeError(f"{action} of pipeline {line.number}: its hang_ns is shorter than a job takes")
 
     def _end(self, running: _Running) -> None:
-        """End the job, which frees its seat, and tell its core."""
+        """End a job: free its seat, and give its `Core` a `JobDone`."""
         self._running.remove(running)
         self._is_changed = True
         line, job, now_ns = self.lines[running.runs.member], running.waited.job, self._now_ns
