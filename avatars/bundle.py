@@ -63,7 +63,7 @@ class Bundle:
         return self.folder / self.manifest.network.file
 
     def read_body(self) -> Body:
-        """Return the body with the offsets of the bundle, if any. Raises BadInputError."""
+        """Return the body; if the bundle has offsets, the body has them. Raises BadInputError."""
         body = load_body(self.body_path)
         if self.offsets_path is None:
             return body
@@ -146,7 +146,7 @@ def load_bundle(name: str | Path) -> Bundle:
 
 
 def _what_it_is(file: Path) -> tuple[str, str, str]:
-    """Return found, expected and remedy for the error about `file`, which should be an avatar's folder."""
+    """Return (found, expected, remedy) for the error about `file`, which should be an avatar's folder."""
     try:
         is_body = bool(read_npz(file, ("v_template",), "a body"))
     except BadInputError:
@@ -208,7 +208,7 @@ def write_bundle(
 
 
 def add_mesh_levels(bundle: Bundle, levels: Sequence[MeshLevel]) -> None:
-    """Write `levels` of the mesh into the folder of `bundle`, in place of earlier ones. Raises BadInputError."""
+    """Write `levels` of the mesh into the folder of `bundle`, and replace any levels there. Raises BadInputError."""
     shaped = bundle.shaped_body()
     with write_atomically(bundle.folder / MESH_LEVELS) as draft, draft.open("wb") as file:
         save_mesh_levels(file, shaped, levels)

@@ -340,7 +340,7 @@ def figures_digest(validation: Validation) -> str:
 
 
 def with_figures_digest(validation: Validation) -> Validation:
-    """Return the newly measured `validation` with its `figures_digest`."""
+    """Return `validation`, newly measured, with its digest of figures as `figures_digest`."""
     return validation.model_copy(update={"figures_digest": figures_digest(validation)})
 
 

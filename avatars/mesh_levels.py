@@ -77,7 +77,7 @@ class MeshLevel:
 
     @cached_property
     def has_blend(self) -> bool:
-        """Whether pose blend shapes move any vertex."""
+        """Whether the body has pose blend shapes that move a vertex."""
         return bool(self.blend.any())
 
     @cached_property
@@ -86,7 +86,7 @@ class MeshLevel:
         return float(self.rest.max())
 
     def reduced(self, shaped: ShapedBody) -> ShapedBody:
-        """Return `shaped` with the triangles of this level, and without the vertices that no triangle uses."""
+        """Return `shaped` with only the triangles of this level, and only the vertices that these triangles use."""
         used, corners = np.unique(self.faces, return_inverse=True)
         body = shaped.body
         smaller = replace(

@@ -47,7 +47,7 @@ class RunControls:
         self._ask(Stop())
 
     def kill(self, unit: str) -> None:
-        """End the unit's process at once; the scheduler starts it again."""
+        """End the process of `unit` at once; the scheduler starts the unit again."""
         with self._lock:
             if not self._closed:
                 self._kills.append(unit)

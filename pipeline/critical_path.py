@@ -83,7 +83,7 @@ class Sharing:
             self._count(self._waiting.popleft())
 
     def close(self) -> dict[str, Taken]:
-        """Return the sums of each stage, by its name; called after the last job."""
+        """Return the sums over the jobs of each stage, by the stage's name; called after the last job."""
         while self._waiting:
             self._count(self._waiting.popleft())
         return self._sums

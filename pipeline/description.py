@@ -47,7 +47,7 @@ FACTORY = r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"
 
 
 class Model(BaseModel):
-    """Strict base class: unknown keys are errors, and values never change."""
+    """Strict base class of data: unknown fields are errors, and values never change."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -201,7 +201,7 @@ class Pipeline(Described):
         return self
 
     def _check(self) -> None:
-        """Raise UnexpectedValue if stages, edges, units or the bypass do not fit each other."""
+        """Raise UnexpectedValue if stages, edges, units and the bypass do not agree with each other."""
         missing = {stage.unit for stage in self.stages} - set(self.units)
         if missing:
             raise UnexpectedValue(f"no settings of unit {', '.join(sorted(missing))}", "them in `units`")
@@ -261,12 +261,12 @@ class Pipeline(Described):
 
     @property
     def scheduler_cores(self) -> tuple[int, ...]:
-        """The cores of the scheduler, which are those of the first stage's unit."""
+        """The numbers of the scheduler's cores: the cores of the first stage's unit."""
         return self.units[self.stages[0].unit].cores
 
     @property
     def run_cores(self) -> tuple[int, ...]:
-        """The cores of all units."""
+        """The numbers of all units' cores, ascending."""
         return tuple(sorted({core for settings in self.units.values() for core in settings.cores}))
 
     def places(self) -> dict[str, Place]:
@@ -285,7 +285,7 @@ class Pipeline(Described):
         return tuple(stage for stage in self.stages if stage.unit == unit)
 
     def with_rule(self, rule: str) -> Pipeline:
-        """Return the same pipeline with `rule` for every edge. Raises BadInputError for a rule that does not fit."""
+        """Return this pipeline with `rule` for every edge. Raises BadInputError for an unknown or unsuitable rule."""
         changed = self.model_copy(update={"edges": tuple(e.model_copy(update={"rule": rule}) for e in self.edges)})
         try:
             edge_rule(rule)

@@ -45,7 +45,7 @@ def graph_of(file: PipelineFile, rules: Mapping[str, str]) -> Graph:
 
 
 def bypass_of(file: PipelineFile) -> tuple[str, str] | None:
-    """Return the names of the stages at which the bypass begins and ends; None without a bypass."""
+    """Return (name of the stage at which the bypass begins, name of the stage at its end); None without a bypass."""
     return None if file.bypass is None else (file.bypass[0], file.bypass[1].to)
 
 
@@ -74,7 +74,7 @@ def shares_of(file: PipelineFile) -> dict[str, Fraction]:
 
 
 def source_ns(file: PipelineFile) -> int:
-    """Return the period of the source in ns; for random arrivals, the mean. 0: the source has no rate."""
+    """Return the period of the source in ns; for random arrivals, the mean period. 0: the source has no rate."""
     rate = file.run.fps or (file.run.arrivals.poisson if file.run.arrivals else 0.0)
     return round(NS_PER_S / rate) if rate else 0
 

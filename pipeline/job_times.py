@@ -85,7 +85,7 @@ class CoreMeter:
         return len(self._files)
 
     def cpu_ns(self) -> int:
-        """Return the CPU time of all threads since the last call, in ns."""
+        """Return the CPU time in ns of all threads of the process since the last call."""
         cpu_ns = time.process_time_ns()
         passed_ns, self._cpu_ns = cpu_ns - self._cpu_ns, cpu_ns
         return passed_ns
@@ -261,7 +261,7 @@ class JobClock:
         self._begin_ns = begin_ns
 
     def end(self, works_asleep: bool) -> None:
-        """Note that the job has ended. `works_asleep`: whether a device worked for it while its threads slept."""
+        """Note that the job has ended. `works_asleep`: whether the sleep of its threads counts as busy."""
         cpu_ns = self._meter.cpu_ns()
         end_ns = self._end_ns = self._now_ns()
         wall_ns = end_ns - self._begin_ns
@@ -441,7 +441,7 @@ def availability() -> str:
 
 
 def _open(kind: CountedEvent) -> int:
-    """Open a counter and return its file. Raises OSError."""
+    """Open a counter of the event `kind`, and return its file descriptor. Raises OSError."""
     flags = INHERIT | EXCLUDE_KERNEL | EXCLUDE_HYPERVISOR
     attributes = ATTR.pack(kind.kind, ATTR.size, kind.config, 0, 0, ENABLED_TIME | RUNNING_TIME, flags, 0, 0, 0)
     return machine.here.open_counter(attributes, CLOSE_ON_EXEC)
@@ -459,7 +459,7 @@ def _reason(error: OSError) -> str:
 
 
 def paranoid_level() -> int | None:
-    """Return the kernel's setting kernel.perf_event_paranoid; None if it has none."""
+    """Return the kernel's setting kernel.perf_event_paranoid; None if the kernel lacks it."""
     try:
         return int((machine.here.proc / "sys/kernel/perf_event_paranoid").read_text())
     except (OSError, ValueError):

@@ -156,7 +156,7 @@ class RunValues:
         return value
 
     def unit(self, value: Any) -> str:
-        """Return the name of a unit of the graph."""
+        """Return `value`, which must be the name of a unit of the graph."""
         if type(value) is not str or value not in self._units:
             raise _unknown("unit", value, self._units)
         return value

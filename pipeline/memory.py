@@ -193,7 +193,7 @@ class ByteCounter:
         self.written += count
 
     def figures(self) -> dict[str, float]:
-        """Return the counts as metrics of the stage's job."""
+        """Return the counts as metrics of the stage's job, by the metrics' names in `NAMES`."""
         return {
             "bytes_read": self.read,
             "bytes_written": self.written,

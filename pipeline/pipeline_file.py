@@ -105,7 +105,7 @@ class PipelineFile:
 
     @property
     def readers(self) -> dict[str, list[str]]:
-        """The readers of each stage that has readers, by its name, in the order of the stages."""
+        """The names of the readers of each stage that has readers, by the stage's name, in the order of the stages."""
         found: dict[str, list[str]] = {name: [] for name in self.stages}
         for name, stage in self.stages.items():
             for source in dict.fromkeys(each.stage for each in stage.inputs):
@@ -387,7 +387,12 @@ def _is_input(value: Mapping[str, object]) -> bool:
 
 
 def _check_ports(stage: StageKeys, where: str) -> None:
-    """Check that a stage reads only ports that its kind has, and all ports that its kind needs."""
+    """Check the ports through which a stage reads. Raises BadInputError.
+
+    They must be ports of the stage's kind, and include all ports that the kind needs.
+
+    `where`: place of the stage, for errors.
+    """
     known = stage.in_ports
     if known is None:
         return
@@ -533,7 +538,7 @@ def _check_edges(file: PipelineFile) -> None:
 
 
 def _check_written(file: PipelineFile) -> None:
-    """Check that no video is written to the path of another video that the pipeline writes or reads."""
+    """Raise BadInputError if a video is written to the path of another video that the pipeline writes or reads."""
     taken = {normpath(stage.path): name for name, stage in file.stages.items() if isinstance(stage, VideoBlock)}
     for name, stage in file.stages.items():
         if isinstance(stage, EncodeBlock) and (other := taken.setdefault(normpath(stage.path), name)) != name:
@@ -594,7 +599,10 @@ def assignments(text: str) -> list[str]:
 
 
 def _assigned(tables: Mapping[str, Any], text: str) -> dict[str, Any]:
-    """Return `tables` with one value changed. `text`: KEY=VALUE; a VALUE that is no TOML counts as text."""
+    """Return `tables` with one value changed. Raises BadInputError.
+
+    `text`: KEY=VALUE; a VALUE that is no TOML counts as text.
+    """
     key, equals, value = text.partition("=")
     parts = [part.strip() for part in key.split(".")]
     if not equals or not all(parts) or parts[0] not in TABLES or len(parts) < 2:

@@ -283,7 +283,7 @@ class RealtimeClock:
         return found
 
     def stopped(self) -> list[Stopped]:
-        """Return a record for each stop of a unit by a signal that was seen since the last call."""
+        """Return a record for each unit that a signal was seen to have stopped since the last call."""
         unnoted, self._unnoted = self._unnoted, []
         return unnoted
 
@@ -351,7 +351,10 @@ class RealtimeClock:
         return events
 
     def _ping(self, now_ns: int) -> list[Event]:
-        """Ping the units without a job, and return an event for each. The job of a busy unit ends, or is too late."""
+        """Ping the units without a job, and return an event for each. A busy unit needs none: its job has a deadline.
+
+        Units that a signal has stopped, and a fork server that does not answer, are noticed here too.
+        """
         self._ping_ns = now_ns + PING_NS
         with contextlib.suppress(OSError):  # starting the next unit tries again
             if why := self._processes.renew_starter():

@@ -221,7 +221,7 @@ class RunRecord(Protocol):
         """
 
     def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
-        """Record a step of `core` whose actions were carried out. Raises `failure` if there is one."""
+        """Record a step of `core`, after its actions were carried out. If there is a `failure`, raise it."""
 
     def say(self, text: str) -> None:
         """Record a message of the run to its user."""

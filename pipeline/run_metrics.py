@@ -350,7 +350,7 @@ class PathShares(Record):
 
 
 class FramesBehind(Record):
-    """By how many frames the newest frame was older than the frame of the job that took it: `mean` and `max`."""
+    """Numbers of frames by which newest frames were older than the frames of the jobs that took them: `mean`, `max`."""
 
     mean: float
     max: int
@@ -459,7 +459,7 @@ class RunMetrics(PolicyMetrics):
     `percentiles`: text that says whether percentiles are exact or from a sketch, with its error; on the host clock.
     `xrbench`: XRBench's scores.
     `edge`: edge rule of the scheduler.
-    `idle_cores`: whether cores without work stayed awake; on the host clock.
+    `idle_cores`: text that says whether cores without work stayed awake, or why not; on the host clock.
     `other_programs`: share of other programs in the time of the run's cores; null if a unit died.
     `processor`: clock and throttling of the run's cores; null in virtual time and in older reports.
     `streams`: ages of the newest frames that jobs took from a stream, by the name of the stage that writes it.

@@ -78,7 +78,7 @@ class JoiningStage(Protocol):
 
 
 class SteppedStage(Stage, Protocol):
-    """The first stage of a pipeline whose frames may be given less work (`run_pipeline`'s `works`)."""
+    """The first stage of a pipeline with a ladder, whose frames may get less work (`works` of `run_pipeline`)."""
 
     def step_to(self, rung: int) -> None:
         """Give frames the work of `rung` from now on. The first rung is 0; called before `run` after each change."""
@@ -250,7 +250,7 @@ class PortedStage:
 
     @property
     def sampled_ns(self) -> int:
-        """The time in ns on CLOCK_MONOTONIC at which the present frame was sampled; 0 for a stage without inputs."""
+        """The time in ns, on CLOCK_MONOTONIC, at which the frame in work was sampled; 0 for a stage without inputs."""
         taken = [of[slot] for of, slot in zip(self._headers, self._slots, strict=True) if slot is not None]
         return min((int(header["t_sampled_ns"]) for header in taken), default=0)
 

@@ -192,7 +192,10 @@ class Timeline:
         }
 
     def add(self, record: Record) -> list[Fact]:
-        """Take the next record of the run, and return the facts that it adds. Leave out the first record, `Begun`."""
+        """Take the next record of the run, and return the facts that it adds.
+
+        The first record, `Begun`, must be left out: `graph` and `settings` come from it.
+        """
         if isinstance(record, Stepped):
             return self._step(record)
         if isinstance(record, Counted):

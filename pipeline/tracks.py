@@ -94,7 +94,7 @@ class Track(Protocol):
 
 
 class ChainTrack:
-    """The frames of a chain."""
+    """A `Track` of a chain, which follows the jobs in the journal."""
 
     def __init__(self, graph: Graph, settings: Settings) -> None:
         names = [stage.name for stage in graph.stages]
@@ -211,7 +211,7 @@ class ChainTrack:
 
 
 class GraphTrack:
-    """The frames of a graph, from a second scheduler that takes the run's events."""
+    """A `Track` of a graph, which asks a second scheduler that takes the run's events."""
 
     def __init__(self, graph: Graph, settings: Settings) -> None:
         self._core = Core(graph, settings)

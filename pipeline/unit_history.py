@@ -266,7 +266,10 @@ class IdleCutter:
         self._count = 0
 
     def settle(self) -> list[IdleSlice]:
-        """Note the state of each unit after the last step, and return all slices that no later slice can precede."""
+        """Note the state of each unit after the last step. Return the slices whose place in the order is now certain.
+
+        No slice that comes later can end before these.
+        """
         if self._now_ns is None:
             return []
         until_ns = NEVER

@@ -205,7 +205,7 @@ class Join:
 
     @property
     def is_source(self) -> bool:
-        """Whether all inputs take the newest frame, so that the stage's frames come from the source."""
+        """Whether all inputs take the newest frame, so that the source gives the stage's frames."""
         return not self._by_frame
 
     def slots(self, packed: int) -> tuple[int | None, ...]:

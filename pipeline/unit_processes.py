@@ -81,7 +81,7 @@ class _Process:
             signal.pidfd_send_signal(self.pidfd, signal.SIGKILL)
 
     def wait(self) -> None:
-        """Wait until the process has ended, and kill the processes that it started, by its process group."""
+        """Wait until the process has ended. Then kill the processes that it started (its process group)."""
         poller = select.poll()  # select(2) takes no descriptor above 1023
         poller.register(self.pidfd, select.POLLIN)
         poller.poll()
@@ -223,7 +223,7 @@ class UnitProcesses:
 
     @property
     def stopped(self) -> set[str]:
-        """The units whose processes are stopped by a signal now."""
+        """The names of the units whose processes a signal has stopped, as SIGSTOP does, and that have not gone on."""
         return {unit for unit, process in self._live.items() if is_stopped(process.pid)}
 
     def renew_starter(self) -> str:

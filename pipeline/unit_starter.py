@@ -79,7 +79,7 @@ class ForkedCall:
         return json.loads(answer) if answer else None
 
     def _answer(self) -> bytes:
-        """Return all bytes until the pipe is closed, the time limit is over, or the fork server has ended."""
+        """Return the bytes from the pipe, until it is closed, ANSWER_S is over, or the fork server is in trouble."""
         answer = b""
         poller = select.poll()  # select(2) takes no descriptor above 1023
         poller.register(self._reads, select.POLLIN)

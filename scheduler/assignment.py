@@ -74,7 +74,7 @@ def _done_of_running(now_ns: int, stage: StageState) -> int:
 
 
 class Choice:
-    """Answers questions about the present state of a core's stages, source and frames."""
+    """Answers questions about the present state of the stages, the source and the frames of a `Core`."""
 
     def __init__(self, settings: Settings, policy: Policy, source: Source, flow: Flow) -> None:
         """Keep the run's settings and policy, its source and its frames in flight (`flow`)."""
@@ -134,7 +134,7 @@ class Choice:
         return free_ns - first.estimate_ns - self._latch_ns
 
     def is_late(self, stage: StageState, now_ns: int) -> bool:
-        """Return whether the frame that the stage would do next must miss its deadline."""
+        """Return whether the frame that the stage would do next can no longer meet its deadline."""
         waiting = self._candidate(stage, now_ns)
         if waiting.deadline_ns == NEVER:
             return False

@@ -262,7 +262,7 @@ class Core:
         return None if frame is None else frame.ready_ns[self._stage_named[job.stage].position]
 
     def _on_skip(self, stage: StageState, frame: FrameState) -> None:
-        """Note that the frame takes the bypass. Raises ValueError if none begins at `stage`."""
+        """Note that the frame takes the bypass. Raises ValueError if no bypass begins at `stage`."""
         if self.bypass is None or stage is not self.bypass.begin:
             raise ValueError(f"stage {stage.name} skips, but no bypass begins there")
         frame.skips = True
@@ -341,7 +341,7 @@ class Core:
         self.flow.mark_dirty(unit)
 
     def _check_units(self) -> None:
-        """Carry out the verdict on each unit."""
+        """Carry out the `verdict` on each unit: kill or start its process, end its pause, or mark it dirty."""
         for unit in self.units.values():
             found = verdict(unit, self.now_ns, self._lead_ns)
             if found == KILL:
@@ -405,12 +405,12 @@ class Clock(Protocol):
         ...
 
     def perform(self, now_ns: int, actions: tuple[Action, ...]) -> None:
-        """Carry out the actions, at least one, that the core returned at `now_ns`."""
+        """Carry out the actions that the core returned at `now_ns`; there is at least one."""
         ...
 
 
 class Recorder(Protocol):
-    """Takes the steps of a run, such as `trilane.scheduler.recording.Recording`."""
+    """An object that takes the steps of a run, such as `trilane.scheduler.recording.Recording`."""
 
     def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
         """Add the step that `core` has just taken, after its actions were performed."""

@@ -186,7 +186,7 @@ class Pong(NamedTuple):
 
 
 class SchedulerStalled(NamedTuple):
-    """The driver did nothing for `ns` since the last step, so units get that much longer to answer."""
+    """The driver did nothing for `ns` since the last step; units get as much more time to answer."""
 
     ns: int
 

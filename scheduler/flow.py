@@ -76,7 +76,7 @@ def next_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
 
 
 def _is_older_before(stage: StageState, frame: int, frames: Mapping[int, FrameState]) -> bool:
-    """Return whether an older frame than `frame` has not come to `stage` yet."""
+    """Return whether a frame older than `frame` has yet to come to `stage`."""
     for number, state in frames.items():
         if number >= frame:
             return False
@@ -170,7 +170,7 @@ class Flow:
         self.dirty.append(unit)
 
     def admit(self, frame: int, release_ns: int, deadline_ns: int) -> None:
-        """Put the frame in flight. `release_ns`, `deadline_ns`: times in ns; NEVER: no deadline."""
+        """Put the frame in flight. `release_ns`: time of its release. `deadline_ns`: its deadline, or NEVER."""
         todo = self.next_todo() if self._every else self._all
         self.frames[frame] = FrameState(release_ns, deadline_ns, self.rung, self._admitted, todo, self._count)
         self._admitted += 1
@@ -255,7 +255,7 @@ class Flow:
         return any(waiting & reader.bit for reader in behind.readers)
 
     def is_held(self, before: StageState, frame: int) -> bool:
-        """Return whether another branch has begun a frame that waits for a stage, so that the frame is never stale."""
+        """Return whether another branch has begun a frame that waits for the stage `before`; it is not stale then."""
         return bool(self.frames[frame].begun & self.main & ~before.before)
 
     def pass_on(self, stage: StageState, job: Job, end_ns: int) -> None:
@@ -387,7 +387,7 @@ class Flow:
             self.mark_roots_dirty()
 
     def drop_waiting(self, stage: StageState, slot_in: int, cause: DropCause) -> None:
-        """Drop the frame that waits for the stage in `slot_in`."""
+        """Drop the frame that waits for the stage in `slot_in` (numbered as in `Job.slot_in`), and count the drop."""
         edge, slot = side_of(stage, slot_in)
         if self.is_chain:
             assert isinstance(edge, EdgeSlots)
@@ -526,7 +526,7 @@ class Flow:
         self._tell_bypass(state)
 
     def _forget(self, frame: int, state: FrameState) -> None:
-        """Remove a dropped or lost frame from all lines; in a chain, it has already left its only line."""
+        """Remove a dropped or lost frame from all lines; in a chain, do nothing: it has left its only line already."""
         if self.is_chain:
             return
         if state.jobs:

@@ -269,7 +269,7 @@ class Ledger:
 
     @property
     def busy_ns(self) -> dict[str, int]:
-        """How many ns each unit has worked so far, in jobs that have ended."""
+        """The busy time in ns of each unit so far, in jobs that have ended."""
         return {unit: book.busy_ns for unit, book in self._units.items()}
 
     def restart(self, unit: str) -> None:

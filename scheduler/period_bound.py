@@ -42,7 +42,7 @@ class PeriodBound:
     `stages`: stages of the cycle that sets the period, in the order of the graph.
     `limit`: cause of the period: `unit NAME`, `slots`, `in_flight` (limit of frames in flight), or `rate` (the
     source's); "" if no stage takes time.
-    `streams`: stages whose output slots are waited for in the cycle.
+    `streams`: stages of the cycle that wait for a free output slot.
     """
 
     period_ns: Fraction

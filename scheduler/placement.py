@@ -67,7 +67,7 @@ class UnitWork(NamedTuple):
 
 
 class Place(NamedTuple):
-    """The place of a unit.
+    """The cores and threads of a unit.
 
     `cores`: numbers of its cores, ascending.
     `threads`: number of its threads: one for each core, or one that floats between the cores.
@@ -84,7 +84,7 @@ Times = Mapping[str, Mapping[int, UnitWork]]
 
 
 def shared_cores(placement: Placement) -> set[int]:
-    """Return the cores that more than one unit has."""
+    """Return the numbers of the cores that several units have."""
     used = [core for place in placement.values() for core in place.cores]
     return {core for core in used if used.count(core) > 1}
 

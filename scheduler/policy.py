@@ -94,7 +94,7 @@ POLICIES = {
 
 
 def policy_named(name: str) -> Policy:
-    """Return the row of `POLICIES`. Raises UnexpectedValue for an unknown name."""
+    """Return the row of `POLICIES` with this name. Raises UnexpectedValue for an unknown name."""
     if name not in POLICIES:
         raise UnexpectedValue(f"policy {name!r}", f"one of {', '.join(POLICIES)}")
     return POLICIES[name]
@@ -168,7 +168,7 @@ class Source:
 
     @property
     def released(self) -> int:
-        """The number of frames released so far: those that have left, those that wait, and those that `stop` forgot."""
+        """The number of frames that were released so far, including waiting frames and those that `stop` forgot."""
         return self._next
 
     @property

@@ -43,8 +43,8 @@ ROUND_ROBIN: Final = "round-robin"
 class Waiting(NamedTuple):
     """The first job of a pipeline that waits for a seat.
 
-    `behind`: number of pipelines whose turn comes before this one's; 0 for the pipeline after the one that had the seat
-    last, whose own number is the largest.
+    `behind`: number of pipelines whose turn comes before this pipeline's turn. The pipeline that had the seat last has
+    the largest number, and the pipeline after it has 0.
     `deadline_ns`: deadline of the job's frame, or NEVER.
     `order`: number that grows with each hand-over of a job to a unit.
     """
@@ -287,7 +287,7 @@ class BesideDriver:
             raise RuntimeError(f"{action} of pipeline {line.number}: its hang_ns is shorter than a job takes")
 
     def _end(self, running: _Running) -> None:
-        """End the job, which frees its seat, and tell its core."""
+        """End a job: free its seat, and give its `Core` a `JobDone`."""
         self._running.remove(running)
         self._is_changed = True
         line, job, now_ns = self.lines[running.runs.member], running.waited.job, self._now_ns

@@ -478,7 +478,7 @@ def fates(jobs: Iterable[Job], sources: Container[str]) -> list[tuple[Job, bool]
 
 
 def back_off_ns(failures: int) -> int:
-    """Return how long in ns a unit stays down after `failures` failures in a row, at least 1."""
+    """Return the time in ns for which a unit stays down. `failures`: number of failures in a row, at least 1."""
     return BACK_OFF_NS[min(failures, len(BACK_OFF_NS)) - 1]
 
 

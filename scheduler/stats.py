@@ -184,8 +184,8 @@ class Sketch(Protocol):
 class Samples:
     """Values in ns. `count`, `total` and `largest` are exact.
 
-    `is_exact`: whether all values are in `kept`, in the order in which they came. If not, they move from `kept` to the
-    sketch, a few with each further value.
+    `kept`: values that are kept, in the order in which they came.
+    `is_exact`: whether `kept` has all values. If not, each further value moves a few kept values to the sketch.
     """
 
     def __init__(self, sketch: Callable[[], Sketch] | None = None) -> None:

@@ -171,7 +171,7 @@ class VirtualDriver:
         return deadline_ns, ()
 
     def perform(self, now_ns: int, actions: tuple[Action, ...]) -> None:
-        """Put the events that follow from the actions on the heap."""
+        """Put the events that result from the actions on the heap."""
         for action in actions:
             if type(action) is Dispatch:
                 self._dispatch(now_ns, action.job)

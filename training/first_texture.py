@@ -213,7 +213,10 @@ def lay_out(values: F64, faces: Ints, uv: F64, uv_faces: Ints, side: int) -> tup
 
 
 def fill_gaps(image: NDArray[Any], known: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return `image` (S,S,C) with every texel that is not `known` (S,S) filled from its surroundings (push-pull)."""
+    """Return `image` (S,S,C) with unknown texels filled by push-pull: from the mean of ever larger blocks around them.
+
+    `known`: (S,S), whether a texel is known.
+    """
     weight = known.astype(np.float64)[..., None]
     return _pulled(image * weight, weight)
 

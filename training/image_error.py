@@ -83,7 +83,7 @@ def image_error(picture: U8, truth: U8) -> ImageError | None:
 
 
 def over(image: U8, behind: NDArray[np.floating]) -> F64:
-    """Return `image` (h,w,4) uint8 composited over `behind` (h,w,3) in 0..1, as (h,w,3) in 0..1."""
+    """Return the colours (h,w,3), in 0..1, of `image` (h,w,4) uint8 in front of `behind` (h,w,3) in 0..1."""
     alpha = image[..., 3:] / OPAQUE
     return np.asarray(image[..., :3] / OPAQUE * alpha + behind * (1 - alpha))
 

@@ -377,7 +377,7 @@ class Discriminator(nn.Module):
 
 
 class Adversary:
-    """The discriminators and their optimiser."""
+    """The three discriminators and their optimiser."""
 
     def __init__(self, width: int, rate: float, seed: int, device: torch.device | str = "cpu") -> None:
         """Build the discriminators.

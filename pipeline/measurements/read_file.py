@@ -53,7 +53,10 @@ class Measurements:
 
 
 def read_measurements(path: Path) -> Measurements:
-    """Read a file of measurements. Raises BadInputError for a file of no known tool, or without any measurement."""
+    """Return the measurements in the file `path`.
+
+    Raises BadInputError for a file of no known tool, and for a file without a usable measurement.
+    """
     found = _found(path)
     measured = tuple(found.measurements)
     if not measured:

@@ -225,7 +225,7 @@ class _Benchmark:
         self._flush("")
 
     def _add(self, place: str, name: str, count: object, times: Mapping[str, object], unit: str) -> None:
-        """Add a measurement; refuse it if its figures contradict each other, or one is no number.
+        """Add a measurement. Refuse it if a figure is no number, or if figures contradict each other.
 
         `place`: place of the figures in the file.
         `count`: number of runs; None if the tool does not state it.

@@ -29,5 +29,5 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    """Return the names of the interface too, so that shells complete them."""
+    """Return the names of this module and of the interface, so that shells complete both."""
     return [*globals(), *__all__]

@@ -137,7 +137,7 @@ def _file_limit() -> int:
 
 
 class TrilaneError(Exception):
-    """A failure with a message for people. Exit code 1: the run failed.
+    """Base class of failures with a message for people. Exit code 1, if no subclass has another.
 
     `details`: further lines to print after the message.
     """

@@ -87,13 +87,13 @@ class Machine:
         return (frequency.max or frequency.current) / 1e3 if frequency else 0.0
 
     def core_clock_ghz(self, cores: Iterable[int]) -> float | None:
-        """Return the present clock of the fastest of `cores` in GHz; None where the kernel does not show it."""
+        """Return the present clock of the fastest of `cores` in GHz; None if the kernel does not show it."""
         folder = self.sys / "devices/system/cpu"
         texts = [_text_of(folder / f"cpu{core}/cpufreq/scaling_cur_freq") for core in cores]
         return max((int(text) / 1e6 for text in texts if text.isdecimal()), default=None)
 
     def throttles(self, cores: Iterable[int]) -> int | None:
-        """Return how often heat has slowed `cores` down since the system began; None where the kernel counts none."""
+        """Return how often heat has slowed `cores` since the system's start; None if the kernel does not count it."""
         folder = self.sys / "devices/system/cpu"
         texts = [_text_of(folder / f"cpu{core}/thermal_throttle/core_throttle_count") for core in cores]
         counts = [int(text) for text in texts if text.isdecimal()]
@@ -235,7 +235,7 @@ def _cache_bytes(caches: Path) -> int:
 
 
 def _bytes(text: str) -> int:
-    """Return the bytes of a size as the kernel writes it, such as 307200K."""
+    """Return the number of bytes in a size that the kernel wrote, such as 307200K."""
     return int(text[:-1]) * KERNEL_UNITS[text[-1]] if text[-1:] in KERNEL_UNITS else int(text)
 
 

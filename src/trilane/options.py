@@ -52,7 +52,7 @@ class Option:
     offered: tuple[str, ...] | None = None
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Make the field refuse a text outside `words`."""
+        """Make pydantic refuse, for the field, a text that is not among `words`."""
         return one_of(*self.words).__get_pydantic_core_schema__(source, handler) if self.words else handler(source)
 
 
@@ -121,7 +121,7 @@ def _not_empty(text: str) -> str:
 
 
 def one_of(*words: str) -> AfterValidator:
-    """Return a validator that refuses every text outside `words`; None passes."""
+    """Return a validator that refuses every text that is not among `words`; it accepts None."""
 
     def known(word: str | None) -> str | None:
         if word is not None and word not in words:
