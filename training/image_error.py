@@ -123,11 +123,6 @@ def _mean(values: NDArray[np.generic]) -> float:
     return float(values.mean()) if values.size else 0.0
 
 
-def _psnr_db(square: F64) -> float:
-    """Return the PSNR in dB of values in 0..1. `square`: squares of the values' differences from the truth."""
-    return -10 * float(np.log10(max(float(square.mean()), LEAST_SQUARE)))
-
-
 # Summary of the errors of many samples, as the manifest holds it.
 #
 # Rule: besides the means, the summary has seed and number of the worst sample, so that this sample can be drawn again.

@@ -120,7 +120,7 @@ def create_data(
         float, typer.Option(min=0, max=50, help="Noise of the masks: move outlines by up to this many pixels.")
     ] = 0.0,
     look: Annotated[
-        str, typer.Option(help="Person to draw: default, hiker or dancer; each has a build and clothes of its own.")
+        str, typer.Option(help="Person to draw: default, hiker or dancer. Each has its own build, clothes and hair.")
     ] = "default",
     json: JsonOption = False,
 ) -> None:

@@ -29,7 +29,7 @@ from trilane.apps.compare.run_frames import CPU, INSTRUCTION_TIME, INSTRUCTIONS,
 from trilane.apps.compare.sides import ComparedRun, RunKind, Side, changes
 from trilane.apps.run.verdict import MOST_OTHERS
 from trilane.hw_profiles.schema import NORMAL_80
-from trilane.student import student_quantile
+from trilane.scheduler.stats import student_quantile
 from trilane.units import HOST_CLOCK
 
 FRAME_TIME, LATENCY, WORK, SERVICE, WAIT, BUSY, IDLE = (
