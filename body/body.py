@@ -154,7 +154,7 @@ class Body:
     `uv` (T,2): texture coordinates, u right, v up. `uv_faces` (F,3): index into `uv` of each corner of a face.
     `hand_components`: left (C,45) and right (C,45), principal components of hand poses.
     `hand_mean` (90,): mean hand pose, axis-angle, left then right.
-    `offsets` (V,3): vectors from the rest shape to the drawn surface, such as clothes and hair; None without them.
+    `offsets` (V,3): vectors from the rest shape to the drawn surface, such as clothes and hair; None for a bare body.
     """
 
     source: str

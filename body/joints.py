@@ -1,6 +1,6 @@
 """The 55 joints of the SMPL-X layout, and their kinematics: from an axis-angle pose to skinning matrices, in float64.
 
-Rule: this file defines the joint numbers; other code looks joints up by name wherever it can.
+Rule: this file defines the joint numbers; other code looks up joints by name.
 
 Rotations are exact at every angle. A rotation by the angle t = |v| about v has the quaternion w = cos(t/2), u = v
 sin(t/2) / t. Then R - I = 2 (u u^T - (u.u) I + w [u]x) (O. Rodrigues, 1840). No digits cancel in this form near 0 or

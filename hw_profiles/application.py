@@ -352,7 +352,7 @@ def _shares(
 
 
 def reference_frame_ms(profile: Profile, plan: Plan, corners: Corners) -> float:
-    """Return the mean frame time in ms of the variant `REFERENCE` without the scheduler; fits need it often.
+    """Return the mean frame time in ms of the variant `REFERENCE`, computed without the scheduler, for fits.
 
     With one slot between stages, raster, network and composite follow each other. Therefore the frame time is the sum
     of their times, but at least the display's interval. A test compares the result with the scheduler in virtual time.

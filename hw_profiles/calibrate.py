@@ -24,8 +24,8 @@ divided by
     s = ((1 + sum of z^2) / (1 + n))^(1/2)
 
 has Student's t distribution with 1 + n degrees of freedom (Gelman et al., Bayesian Data Analysis, section 2.6). A
-unit's `error_scale` is s times the 80 % quantile of t, divided by the same quantile of a normal distribution. With it,
-80 % of new rows lie in their 80 % interval again.
+unit's `error_scale` is s times the 80 % quantile of t, divided by the same quantile of a normal distribution. With this
+scale, 80 % of new rows lie in their 80 % interval again.
 """
 
 from __future__ import annotations
@@ -271,7 +271,7 @@ def calibrate_tables(data: Mapping[str, Any], path: Path, rows: Sequence[OwnRow]
 def misses(left_out: Sequence[CheckedRow], of: CheckedRow | UnitName) -> list[float]:
     """Return the mean miss of each network: log(measured / predicted), in units of the stated error.
 
-    The rows of one network count as one miss, because they have their error in common. If the unit has rows of only one
+    All rows of one network count as one miss, because they share the same error. If the unit has rows of only one
     network, the result is empty, because no row was predicted by a fit to other rows.
 
     `left_out`: rows with a prediction by a fit to all other networks, and with the interval that the profile states.

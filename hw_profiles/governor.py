@@ -3,12 +3,12 @@
 The device's body warms in minutes, and each unit's junction warms above the body in seconds. Each is an RC element,
 T' = (T_below + R P - T) / tau, solved exactly over a step of constant power (lumped models of phones: Bhat, Gumussoy
 and Ogras, 2019). The rules are `step_wise` and `power_allocator` of the Linux thermal framework
-(Documentation/driver-api/thermal). They are functions of temperatures and power that move one unit by one corner per
-call. In a run on this machine a corner becomes a duty: its clock divided by the highest clock.
+(Documentation/driver-api/thermal). Each rule is a function of temperatures and power that moves one unit by one corner
+per call. In a run on this machine a corner becomes a duty: its clock divided by the highest clock.
 
 Between two polls of the governor the application stays in the settled state of its corners; nothing else changes the
-power. Reports and pictures only summarise the moments. Matplotlib is an optional dependency; if it is missing, the
-error names it.
+power. Reports and pictures only summarise the moments. Matplotlib is an optional dependency; an error names it if it is
+missing.
 """
 
 from __future__ import annotations

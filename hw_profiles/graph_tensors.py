@@ -6,8 +6,8 @@ reads it, and the operators must form no circle.
 
 A shape is inferred; for an operator that ONNX does not know, the file states it. A shape that stays unknown is an error
 that names the first operator whose result has it. Exporters compute sizes and axes by chains of operators, for a
-flattening, a repeat or an attention. ONNX's inference cannot follow them, so `fold` replaces such operators by their
-values. It checks the size of a value before it computes the value.
+flattening, a repeat or an attention. ONNX's inference cannot follow these chains, so `fold` replaces their operators by
+values. `fold` checks the size of a value before it computes the value.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def bytes_of(shape: tuple[int, ...], kind: int) -> int:
 
 
 def is_ordinary(shape: tuple[int, ...], kind: int) -> bool:
-    """Return whether a tensor passes `check_size`: its elements are numbers, and it is not too large."""
+    """Return whether a tensor of `shape` and element type `kind` passes `check_size`."""
     return prod(shape) * _BITS.get(kind, 8 * MAX_TENSOR_BYTES + 1) <= 8 * MAX_TENSOR_BYTES
 
 

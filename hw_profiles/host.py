@@ -225,7 +225,7 @@ def _unit(cores: int, ghz: float, flag: str, clock: str) -> dict[str, Any]:
 def fastest_runtime(profile: Profile, installed: Sequence[str]) -> tuple[str, str]:
     """Return (name of the fastest of the `installed` runtimes by the profile's DSP unit, reason for the choice).
 
-    Raises MissingPartError if the profile has the speed of none of them.
+    Raises MissingPartError if the profile has the speed of no installed runtime.
     """
     known = profile.units["dsp"].runtimes
     speeds = {name: known[name] for name in installed if name in known}

@@ -207,7 +207,8 @@ def graph_facts(model: Any) -> dict[str, Any]:
 def constant_tensors(graph: Any) -> set[str]:
     """Return the names of the tensors that do not depend on the network's input: weights, and results of weights.
 
-    In a graph without weights, inputs named `w<n>` count as weights, and every input of a layer after its first.
+    In a graph without weights, an input of the graph counts as a weight if its name is `w<n>`. It also counts as a
+    weight if it is not the first input of a layer with weights.
     """
     names = {i.name for i in graph.initializer} | _weight_inputs(graph) | {""}  # "" is an input that is left out
     for node in graph.node:

@@ -1,12 +1,12 @@
 """ONNX operators: the class of each, the counts of products, and the layers that a tensor engine makes from a graph.
 
-The time of an operator that no table names follows from the elements that it moves, and reports name it. The count of a
-product follows only from shapes and attributes; `network_work.py` counts convolutions.
+If no table names an operator, its time follows from the elements that it moves, and reports name the operator. The
+count of a product follows only from shapes and attributes; `network_work.py` counts convolutions.
 
 A term is a kind of work with its own cost (`TERMS`); this file knows no chip. Channels are rounded up to the
-blocks in which the Hexagon keeps them: a convolution's inputs to 16, its outputs to 32, all other activations to 8.
-The runtime folds a ReLU and a clip into the layer before them, a batch normalisation into the convolution before it,
-and a sum of two tensors into the convolution that makes one of them. A permutation between channels first and
+blocks in which the Hexagon keeps them: a convolution's inputs to 16, its outputs to 32, all other activations to 8. The
+runtime folds a ReLU and a clip into the layer before them, a batch normalisation into the convolution before it, and a
+sum of two tensors into the convolution that makes one of them. A permutation between channels first and
 channels last costs nothing, because the engine always has channels last.
 """
 
@@ -160,7 +160,7 @@ def _recurrent(shapes: list[Shape]) -> Product:
 def _einsum(node: Any, shapes: list[Shape]) -> Product | None:
     """Return the counts of an Einsum: one product for every combination of all indices.
 
-    Return None for an equation with an ellipsis, or one that does not fit the shapes.
+    Return None for an equation that has an ellipsis or does not fit the shapes.
     """
     equation = next((a.s.decode() for a in node.attribute if a.name == "equation"), "").replace(" ", "")
     sources, _, result = equation.partition("->")

@@ -124,9 +124,9 @@ NOTHING_MEASURED: Final = MeasuredStages({}, "", "")
 
 
 def measured_price(file: PipelineFile, name: str, measured: MeasuredStages) -> StagePrice | None:
-    """Return the time of a stage from a run on this machine; None if it was not measured, or has no scale.
+    """Return the time of the stage `name` from a run on this machine; None if the stage was not measured.
 
-    For another chip, the stage's `scale` multiplies the time.
+    For another chip, the stage's key `scale` multiplies the time; without this key, the result is None.
     """
     factor = 1.0 if measured.chip == HOST else file.stages[name].scale.get(measured.chip)
     if name not in measured.times or factor is None:

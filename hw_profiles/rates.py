@@ -110,8 +110,8 @@ class FrameLoad(NamedTuple):
     """A load, as functions of the corners of the units.
 
     `work_ms`: function that returns the busy time of each working unit for a frame.
-    `frame_ms`: function that returns the least time between frames. It may run a simulation, so it is called only if
-    the result depends on it.
+    `frame_ms`: function that returns the least time between frames. This function may run a simulation, so it is called
+    only where its result matters.
     """
 
     work_ms: Callable[[Corners], Mapping[UnitName, float]]

@@ -40,7 +40,7 @@ class Together:
     `runs`: simulated run of each tenant.
     `stages_ms`: for each tenant, the mean time of a job by stage if no other tenant ran.
     `busy`: share of the time in which each unit works for all tenants.
-    `by_tenant`: for each tenant, the share of the time in which each unit works for it.
+    `by_tenant`: for each tenant, the share of the time in which each unit works for this tenant.
     """
 
     runs: tuple[Simulation, ...]

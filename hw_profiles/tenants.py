@@ -99,7 +99,8 @@ class SharingPipeline(Protocol):
     `repeats`: number of frames after which its jobs are the same again.
     `graph`: its graph for the scheduler.
     `fed`: (graph, settings) for a run whose source is always ready and in which no frame is dropped.
-    `hardware`: for each unit of the pipeline, the chip's unit that does its jobs, or its own name without one.
+    `hardware`: for each unit of the pipeline, the chip's unit that does its jobs; a unit outside of the chip has its
+    own name there.
     """
 
     @property

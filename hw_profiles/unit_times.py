@@ -264,8 +264,8 @@ def assumes_peak(unit: Unit) -> bool:
 def stated_error(job: JobTime, unit: Unit) -> float:
     """Return the relative error that a profile states for the time of `job`; for a measured unit, the measured error.
 
-    For another unit, it combines the error of the numbers behind each part of the time and the error of the model. Both
-    are multiplied by the unit's `error_scale`, which comes from the user's own rows.
+    For any other unit, the error combines the errors of the numbers behind each part of the time with the model's
+    error. Both are multiplied by the unit's `error_scale`, which comes from the user's own rows.
     """
     if unit.measured is not None:
         return unit.measured.error
@@ -289,7 +289,7 @@ def stated_error(job: JobTime, unit: Unit) -> float:
 def layer_times(
     unit: Unit, memory: Memory, work: Work, clock_fraction: float = 1.0, *, contended: bool = False, batch: int = 1
 ) -> EngineTime:
-    """Return the time of each layer on the engine of `unit`; it is 0 for a layer that runs on the CPU instead.
+    """Return the time of each layer on the engine of `unit`, which is 0 for a layer that runs on the CPU instead.
 
     The parameters are those of `time_on`.
     """

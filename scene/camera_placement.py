@@ -13,7 +13,7 @@ because they would shake the camera.
 
 A person who steers turns the view about the vertical through a pivot, then about the level axis to the camera's right.
 The camera stays upright, above the floor and off the pole. If the scene's own camera is beyond these limits, steering
-turns it no further out. Zooming moves the camera along the line to the pivot; the lens stays the same.
+turns the camera no further out. Zooming moves the camera along the line to the pivot; the lens stays the same.
 """
 
 from __future__ import annotations
@@ -186,7 +186,7 @@ LEAST_GAIN = 0.02
 
 
 def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> PlacedCamera:
-    """Return the camera of `scene` at its place: a recorded one films the avatars, a built-in one goes along with them.
+    """Return the camera of `scene` at its place. A recorded camera films the avatars; a built-in camera goes along.
 
     A camera stays where it is if `scene.camera.place` is `none`.
 

@@ -153,7 +153,10 @@ def shortest_turn(source: ArrayLike, target: ArrayLike, fallback: ArrayLike = (1
 
 
 def _perpendicular_to(unit: F64, preferred: F64) -> F64:
-    """Return the part of `preferred` (3,) perpendicular to `unit` (3,), or any perpendicular direction if it is 0."""
+    """Return the part of `preferred` (3,) perpendicular to `unit` (3,).
+
+    If this part is 0, return any direction perpendicular to `unit`.
+    """
     side = preferred - (preferred @ unit) * unit
     if np.linalg.norm(side) > 1e-6:
         return np.asarray(side)

@@ -6,9 +6,9 @@ every mover and the camera sample to the same bits; notes are not transferred. A
 `camera.FIELD`; a field that is None has no array.
 
 `require_person` refuses a recorded camera that does not show the person. No file states for certain the axes of a
-robot's poses, the up direction of a map or its unit of length. If one is wrong, the camera looks past the person
-wherever it is placed. The refusal tries each likely value and names the one that shows the person most. Only the user
-knows whether this value is true.
+robot's poses, the up direction of a map or its unit of length. If one of these facts is wrong, the camera looks past
+the person at every place. The refusal tries each likely value and names the one that shows the person most. Only the
+user knows whether this value is true.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def stage_scene(scene: Scene, bodies: Sequence[ShapedBody], base: Path, footage:
 
     `bodies`: body of each avatar.
     `base`: folder at which relative paths start.
-    `footage`: facts of the background; None for a drawn one.
+    `footage`: facts of the background; None for a drawn background.
     Raises BadInputError when a file is unusable.
     """
     motions = [load_motion(spec, base, body.joints) for spec, body in zip(scene.avatars, bodies, strict=True)]

@@ -284,8 +284,8 @@ class PlaceMerits:
 class PlaceJudge:
     """Judges places for one `Filming`.
 
-    Each moment has ROWS rows. A row is a direction in the recording's world. The product of a row with a place gives a
-    number, such as the distance of the place from a side of the picture.
+    Each moment has ROWS rows, each a direction in the recording's world. The product of a row and a place is a number,
+    such as the distance of the place from a side of the picture.
     """
 
     def __init__(self, film: Filming) -> None:

@@ -88,7 +88,7 @@ def pack_assets(avatars: Sequence[AvatarData], staged: Staged) -> dict[str, NDAr
 
 
 def with_network(assets: Assets, network: NetworkFile) -> dict[str, NDArray[Any]]:
-    """Return `assets` in which `network` and the scale and zero point of its input replace those of all avatars.
+    """Return `assets` with `network` as the network of all avatars, and with the scale and zero point of its input.
 
     Raises BadInputError if the assets have several networks.
     """

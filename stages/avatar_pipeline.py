@@ -1,7 +1,7 @@
 """The avatar's pipeline for `trilane.pipeline`: its stages, the sizes of its edges, and its rehearsal.
 
 This module describes the avatar as data for the run; no module of `trilane.pipeline` knows an avatar. A rehearsal runs
-the stages one after the other, before they share the cores, and measures the work of each.
+the stages one after the other, before they share the cores, and measures the work of each stage.
 """
 
 from __future__ import annotations

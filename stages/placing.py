@@ -71,7 +71,7 @@ MEASURING = "measuring the stages for their placement on cores (once for this av
 def placed(
     checked: Checked, policy: str, starter: UnitStarter, driver: str = "", say: Callable[[str], None] = lambda _: None
 ) -> Checked:
-    """Return `checked` with its units on the cores that are best for it, and with a note that names them.
+    """Return `checked` with its units on the best cores, and with a note that names these cores.
 
     `checked`: run to place.
     `policy`: policy of the run.
@@ -116,8 +116,8 @@ def placed(
 def considered(cores: Sequence[CpuCore], asked: Placement) -> list[CpuCore]:
     """Return the cores on which units may be placed: all `cores`, or some of them if there are more than MOST_LOGICAL.
 
-    Placements on more cores would be too many to list. Only one logical core of each physical core then stays, and only
-    the first MOST_CORES of these. Cores of the `asked` placement always stay.
+    Placements on more cores would be too many to list. In this case one logical core of each physical core stays, up to
+    MOST_CORES of them. Cores of the `asked` placement always stay.
     """
     if len(cores) <= MOST_LOGICAL:
         return list(cores)

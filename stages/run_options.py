@@ -1,4 +1,4 @@
-"""The options of a run. Each is one field, with its help text, default, range, unit and words.
+"""The options of a run. Each option is one field, with its help text, default, range, unit and words.
 
 The command line, `trilane.run`, sweeps, the dashboard's controls and the report read their options from these fields.
 Rule: no other list of the options exists. The fields are plain data; `configure` looks whether files exist.

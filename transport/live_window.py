@@ -41,7 +41,7 @@ _HEAD: Final = np.dtype(
 
 
 class Steering(NamedTuple):
-    """How the camera is turned about its target, and how much nearer it is.
+    """How a viewer has turned the camera about its target, and how much nearer to the target the camera is.
 
     `azimuth_deg`, `elevation_deg`: turns about the target in degrees.
     `zoom`: number by which the camera's distance from the target is divided.

@@ -2,8 +2,8 @@
 
 There is a fixed list of messages with typed fields; anything else is refused. The first byte of a message tells its
 kind. The integer fields follow, with 64 bits each. A field of another type comes last, packed with msgpack; an empty
-field takes no bytes. Integers are not packed with msgpack, because reading them would then take twice the time in a
-process that has just been woken. Nothing is ever pickled.
+field takes no bytes. Integers are not packed with msgpack: a process that has just been woken would need twice the time
+to read them. Nothing is ever pickled.
 
 Jobs and their answers must keep their order, so they go over the job pipe. The job pipe is two pipes, one each way, in
 packet mode (O_DIRECT of pipe(2)): every read returns one whole message. A message wakes the other process directly,

@@ -405,15 +405,15 @@ def _is_of_device(times: F64) -> bool:
 
 
 def _require_one_order(path: Path, numbers: F64, names: tuple[str, ...], axes: F64) -> None:
-    """Raise BadInputError if the quaternion's parts may be in another order than `names` of the table's columns.
+    """Raise BadInputError if the quaternion's parts may be in another order than `names`, the order of the columns.
 
     `numbers` (N, columns): numbers of the table.
     `axes` (3, 3): columns are the directions of the camera's OpenGL axes, in the coordinates of a pose.
 
     Each of the 24 orders gives a camera. Four orders are equally level, as they only mirror the camera's heading.
-    Movement tells these apart: a camera looks where it goes, or at one point that it goes round, and not up. A SLAM map
-    that begins with the identity has its 1 where the scalar is. Of the six orders with that scalar, the most level one
-    counts.
+    Movement tells these apart: a camera looks where it goes, or at one point that it goes round, and not up. In a SLAM
+    map that begins with the identity, the 1 shows the place of the scalar. Of the six orders with the scalar there,
+    only the most level order counts.
     """
     at = names.index("qw"), names.index("qx"), names.index("qy"), names.index("qz")
     first_of = min(at)
@@ -461,7 +461,8 @@ def _has_digits(numbers: F64) -> bool:
 def _astray(turns: F64, places: F64) -> float:
     """Return how far cameras look away from where they go or from a point that they go round, the less of both.
 
-    A result below 1 means that they look there. The result is infinite if there are too few cameras.
+    A result below 1 means that the cameras look where they go, or at such a point. The result is infinite if there are
+    too few cameras.
     `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes.
     """
     if len(places) < LEAST_LED:

@@ -235,7 +235,7 @@ def _by_angle(
 
 
 def _number(where: str, value: Any, key: str) -> float | None:
-    """Return `value` if it is a positive number, or None if it is None. Raises BadInputError about `where` otherwise.
+    """Return `value`, a positive number or None. Raises BadInputError about `where` for any other value.
 
     `key`: key of the value; an angle must be below pi.
     """

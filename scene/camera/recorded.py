@@ -3,10 +3,10 @@
 The movement from pose to pose never changes. Three constants are applied. A rotation of the world makes +Y up. A
 rotation of the picture by a multiple of 90 degrees does what a phone does with its display. A scale converts to metres.
 
-**Unit.** The scene states the unit, or the format defines it as a metre. Otherwise, or if the camera would be faster
-than anything that carries a camera, the scale is guessed: a person fills the pictures where the cameras look. Files of
-NeRF have no unit, but many are in metres. Their scale is guessed only if the views circle a point at which no person
-fits.
+**Unit.** The scene states the unit, or the format defines a metre as its unit. If neither holds, or if the camera would
+be faster than anything that carries a camera, the scale is guessed: a person fills the pictures where the cameras look.
+Files of NeRF have no unit, but many are in metres. Their scale is guessed only if the views circle a point at which no
+person fits.
 
 **Up.** People hold a camera level. Each axis of the world is tried with each quarter turn of the picture. A guess costs
 more if the horizon is far from level, if the camera looks steeply down or up, or if this elevation changes. A guess
@@ -272,12 +272,15 @@ def _is_nadir(turns: F64, usual: str, most_deg: float) -> bool:
 
 
 def price_of(turns: F64, usual: str) -> float:
-    """Return the cost of the cheapest guess for camera axes `turns` (N, 3, 3): 0 if they are level about `usual`."""
+    """Return the cost of the cheapest guess at up for cameras `turns` (N, 3, 3); 0 if they are level about `usual`."""
     return min((guess.price for guess in _guesses(turns, usual, ANY_WORLD, AUTO)), default=math.inf)
 
 
 def price_of_horizons(turns: F64) -> float:
-    """Return the least cost of camera axes `turns` (N, 3, 3) over all axes and quarter turns, by horizons alone."""
+    """Return the cost of the cheapest guess at up for cameras `turns` (N, 3, 3), by their horizons alone.
+
+    The guesses are all axes of the world and all quarter turns of the picture.
+    """
     return min((guess.price for guess in _guesses(turns, "y", FREE, AUTO)), default=math.inf)
 
 

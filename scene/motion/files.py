@@ -2,7 +2,7 @@
 
 The suffix of a file decides which reader is used; the reader's errors name the file. A key that a format does not use
 is refused, not ignored. `start_s` and `end_s` are times of the motion itself, before `speed`. A part of a motion is
-placed like a whole motion: its first frame faces +Z, and the ground that it covers is centred.
+placed like a whole motion: its first frame faces +Z, and the middle of the ground that it covers is the origin.
 
 Files of NumPy hold poses, dicts of arrays, or only positions of joints. Positions, as in HumanML3D, are (T, 22, 3) in
 the order of SMPL's joints. Poses may have the same shape, so the content decides. An array holds positions if its
@@ -237,7 +237,7 @@ def _part(motion: Motion, start_s: float, end_s: float) -> Motion:
 
 
 def _standing_alone(motion: Motion) -> Motion:
-    """Return `motion`, turned to face +Z in its first frame, and centred on the ground that it covers."""
+    """Return `motion`, turned to face +Z in its first frame, with the middle of the covered ground at the origin."""
     roots = matrix_from_rotvec(motion.poses[:, 0])
     turn = facing(roots[0])
     poses = motion.poses.copy()

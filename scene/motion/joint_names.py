@@ -156,9 +156,9 @@ STATED = "joint_map"
 def match_names(path: Path, names: list[str], joint_map: Mapping[str, str] = NO_MAP) -> tuple[str, dict[str, int]]:
     """Return (family that fits best, index in `names` of each matched joint by SMPL-X name).
 
-    `joint_map`: name in the file by SMPL-X name, or "" for none. It overrides the tables, and the returned family
-    mentions it. Raises BadInputError about `path` when the file lacks a joint that the map names, or when a REQUIRED
-    joint is unmatched.
+    `joint_map`: name in the file by SMPL-X name, or "" for none. The map overrides the tables, and the returned family
+    mentions the map. Raises BadInputError about `path` when the file lacks a joint that the map names, or when a
+    REQUIRED joint is unmatched.
     """
     stated = {target: _stated(path, names, target, source) for target, source in joint_map.items()}
     index_of: dict[str, int] = {}

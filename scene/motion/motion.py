@@ -4,8 +4,8 @@ A motion of one frame can be sampled like a motion of a thousand; a `Motion` doe
 `motion_from_recording` makes a motion from a recording: bad frames are left out, Y is up, the first frame faces +Z, and
 the middle of the covered ground is the origin.
 
-**Up** is the axis that the scene states. Otherwise it is the axis along which the body's own up points on average. If
-there is no such axis, it is the usual axis of the format. A body that always lies or stands on its hands must not turn
+**Up** is the axis that the scene states. Otherwise up is the axis along which the body's own up points on average. If
+there is no such axis, up is the usual axis of the format. A body that always lies or stands on its hands must not turn
 the world over. In files that have a floor, the floor is at 0. Therefore, if the lowest joint stays near 0 along an
 axis, the body is on the floor along that axis. If this does not decide, a note says which other axis may be up.
 

@@ -191,9 +191,9 @@ class _RecordedFoot:
     def above(self, floor: float, steeper: float, flat_by: float, up: F64) -> F64:
         """Return the vector (T, 3) from ankle to toes, raised or lowered to keep toes and heel above the floor.
 
-        A foot that lies flat has the slope `ours` + `flat_by`. If its ankle is raised by r, the sine of its slope may
-        be larger by r / `length`: the toes are then as high as those of a flat foot. In the other direction, the heel
-        turns about the ankle.
+        A foot that lies flat has the slope `ours` + `flat_by`. This slope limits how far toes may point down. If the
+        ankle is higher by r, the limit's sine is larger by r / `length`, which puts the toes on the floor. A limit in
+        the other direction does the same for the heel, which turns about the ankle.
 
         `floor`: height of the ankle of a flat foot, metres.
         `steeper`, `flat_by`: results of `_steeper`, radians.

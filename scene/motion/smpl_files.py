@@ -1,7 +1,7 @@
 """Motions of the SMPL family from arrays in any file: AMASS, AIST++, GLAMR, smplx, ROMP, or one array.
 
 An `ArrayLayout`, which is data, states how a program names its arrays. Joints that a layout does not have are at rest;
-other keys are ignored. Of several persons, the one with the most frames is read, and a note says so.
+other keys are ignored. If a file has several persons, only the person with the most frames is read, and a note says so.
 
 An array alone has no frame rate. If neighbouring frames are similar, 30 frames a second are assumed. If they differ by
 more than POSE_SET_STEP_RAD, they are separate poses, one a second. ROMP saves a dict for each frame, with a row for
@@ -425,9 +425,9 @@ def _layout_of(tables: list[FoundTable]) -> tuple[ArrayLayout, list[FoundTable]]
 
 
 def _turns(layout: ArrayLayout, found: FoundTable) -> JointTurns:
-    """Return the sum of the rotations in all of the layout's arrays, no two of which have a joint in common.
+    """Return the rotations of all of the layout's arrays together. No two arrays have a joint in common.
 
-    Raises BadInputError when an array has another number of frames than the first one.
+    Raises BadInputError when an array has another number of frames than the first array.
     """
     parts, notes = [], []
     for array in layout.arrays:

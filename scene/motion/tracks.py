@@ -466,9 +466,9 @@ def turns_of_collars(tracks: Tracks, rest: Tracks, chest: F64, stands: NDArray[n
     `stands` (T,): frames in which the person stands straight.
     `own`: whether the recorded skeleton is built like the avatar's.
 
-    If not `own`, both collars are corrected by one constant, symmetric rotation. After it, they point on average, over
-    frames that stand, as the avatar's collars at rest. If no frame stands, the collars keep their rest pose in the
-    chest.
+    If not `own`, both collars are corrected by one constant, symmetric rotation. After this rotation, the collars
+    point, on average over `stands`, as the avatar's collars at rest. If no frame stands, the collars keep their rest
+    pose in the chest.
     """
     still = {f"{side}_collar": chest for side in SIDES}
     if not tracks.has(*still, "left_shoulder", "right_shoulder") or not (own or stands.any()):

@@ -10,8 +10,8 @@ The module runs networks of any number types, inputs and outputs, in each of the
     call = engine.bound({"image": pictures}, {"scores": scores})
     call()
 
-Rule: only the runtime `cuda` copies inputs and outputs. A runtime runs the whole network or refuses it, and none falls
-back to another. The number types are those of the file: a float network is computed in floats, unlike an avatar's
+Rule: only the runtime `cuda` copies inputs and outputs. A runtime runs the whole network or refuses it; no runtime
+falls back to another. The number types are those of the file: a float network is computed in floats, unlike an avatar's
 network.
 
 `calls_of` measures isolated calls of a network on this machine, on distinct inputs, in a process like a unit of a run.

@@ -355,7 +355,7 @@ class MeshBounds:
         return bool(len(touching) or len(cut))
 
     def rect(self, posed: Posed, clip: ArrayLike, vertices: NDArray[np.float32] | None = None) -> Rect | None:
-        """Return the mesh's rectangle, clipped to the screen; None if nothing is visible.
+        """Return the mesh's rectangle on the screen, clipped to the screen; None if nothing is visible.
 
         `posed`: a frame of `Skeleton.pose`.
         `clip`: projection @ view (4,4), of any lens.

@@ -1,9 +1,9 @@
 """The present stage: it encodes frames as a segment of video, and writes a digest of every frame to a text file.
 
 The stage computes a frame's digest from the bytes in the slot before it encodes the frame. Each process writes one
-segment with a name of its own; the parent joins the segments (`apps/run/run_files.py`). A segment is fragmented MP4: if
-its writer is killed, it is readable, and lacks at most the last frame. Frames that are compared after the run are kept
-as arrays in a folder beside the segment.
+segment with a name of its own; the parent joins the segments (`apps/run/run_files.py`). A segment is fragmented MP4:
+after its writer is killed, the segment is readable, and lacks at most the last frame. Frames that are compared after
+the run are kept as arrays in a folder beside the segment.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """The runtime `cuda`: ONNX Runtime on an NVIDIA GPU.
 
-Rule: every node of the graph runs on the GPU. If one cannot, loading fails; no node falls back to the CPU.
+Rule: every node of the graph runs on the GPU. If a node cannot run there, loading fails; no node falls back to the CPU.
 
 ONNX Runtime has no integer layers for CUDA: it computes a layer's sums in float, and only the layer's input and output
 are bytes. Slots are copied to the GPU and back in every run, because the GPU cannot read their memory directly.

@@ -133,7 +133,9 @@ class BoundPart:
 
 
 class InferStage:
-    """A `trilane.pipeline.stage.Stage` that runs networks, or a part of one. A network turns H·W·C bytes into H·W·4.
+    """A `trilane.pipeline.stage.Stage` that runs whole networks, or a part of a single network.
+
+    A network turns H·W·C bytes into H·W·4.
 
     A frame has one inference for each network that paints somebody in view. Avatars with the same network share its
     tensor, each in its `tensor_rect`.

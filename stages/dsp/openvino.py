@@ -93,7 +93,7 @@ def _with_digest(blob: bytes) -> bytes:
 def _without_digest(content: bytes) -> bytes:
     """Return the blob in `content`, a result of `_with_digest`.
 
-    Raises ValueError if it is damaged, because OpenVINO would not notice.
+    Raises ValueError if the blob is damaged, because OpenVINO would not notice.
     """
     size = hashlib.sha256().digest_size
     if hashlib.sha256(content[size:]).digest() != content[:size]:

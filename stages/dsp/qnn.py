@@ -1,6 +1,6 @@
 """The runtime `qnn`: Qualcomm's HTP through ONNX Runtime, on the Hexagon of a Snapdragon or its emulator on x86 Linux.
 
-Rule: every node of the graph runs on the HTP. If one cannot, loading fails; no node falls back to the CPU.
+Rule: every node of the graph runs on the HTP. If a node cannot run there, loading fails; no node falls back to the CPU.
 """
 
 from __future__ import annotations

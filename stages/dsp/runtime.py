@@ -115,7 +115,7 @@ def installed() -> Sequence[str]:
 
 
 def resolve(name: str) -> str:
-    """Return `name` itself. Raises BadInputError if it is no runtime, MissingPartError if it is not installed."""
+    """Return `name`. Raises BadInputError if it names no runtime, MissingPartError for a runtime not installed."""
     if name not in RUNTIMES:
         raise BadInputError("runtime", f"{name!r}", f"one of {', '.join(RUNTIMES)}", did_you_mean(name, RUNTIMES))
     entry = RUNTIMES[name]

@@ -5,8 +5,8 @@ frame, the new frame is copied instead of drawn. Only this stage writes to its o
 it writes there again.
 
 While the camera stands still, everything under the avatars is drawn for two frames, and copied for all further ones.
-The first frame of a view is only drawn, because most views of a moving camera never come again. The second one is also
-kept in host memory. From there a software driver copies it in a tenth of a millisecond; a copy between framebuffers
+The first frame of a view is only drawn, because most views of a moving camera never come again. The second frame is
+also kept in host memory. A software driver copies from there in a tenth of a millisecond; a copy between framebuffers
 takes twenty times as long.
 
 The text display shows frame number and time of the picture, and the rate and the age of frames, which this stage
@@ -199,7 +199,7 @@ class CompositeStage:
     `shapes`: tensor shapes (height, width) that may come.
     `rest`: rest joints (55,3) of each avatar of the scene, metres.
     `background`: background from files; None for the built-in room.
-    `eyes`: camera positions (3,) that the room contains from the first frame on, so that it never grows during a run.
+    `eyes`: camera positions (3,) that the room contains from the first frame on, so that the room never grows.
     `planes`: planes of the scene to draw.
     `hud`: whether to draw the text display.
     `painters`: number of the network that paints each avatar; empty if one network paints all.

@@ -1,8 +1,8 @@
 """OpenGL for the GPU unit: the context, calls that moderngl lacks, programs, copies and camera matrices.
 
-There is one off-screen EGL context per process, on hardware or in software. Only this file creates a context, and it
-must be current on the calling thread. Each shader is a file of `trilane.shaders`; Python only adds `#define NAME VALUE`
-lines after its `#version`.
+There is one off-screen EGL context per process, on hardware or in software. Only this file creates a context. The
+context must be current on the calling thread. Each shader is a file of `trilane.shaders`; Python only adds `#define
+NAME VALUE` lines after its `#version`.
 
 Functions of this file make all copies of a frame's data between the CPU's memory and the GPU's, and count their bytes.
 A context has one counter, because the stages that draw with it do one job at a time. A software driver copies within
@@ -86,7 +86,7 @@ def check(ctx: Any) -> None:
 
 @contextmanager
 def checked(ctx: Any) -> Iterator[None]:
-    """Call `check` after the `with` block. An exception in it without a current context becomes UnitLostError."""
+    """Call `check` after the `with` block. If the block raises without a current context, raise UnitLostError."""
     try:
         yield
     except Exception as error:

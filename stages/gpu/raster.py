@@ -432,8 +432,8 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> RasterStage:
 def _meshes(ctx: Any, bodies: Sequence[ShapedBody], config: RunConfig) -> list[Mesh]:
     """Return the meshes of `bodies`: a whole body, then the body of each level of its mesh.
 
-    If the whole mesh encloses a volume, each level counts as closed. A level may fold over itself, but its triangles
-    that face away are behind others, so it is drawn without them.
+    If the whole mesh encloses a volume, each level counts as closed. A level may fold over itself. Its triangles that
+    face away are behind other triangles, so they are not drawn.
     """
     whole, *coarser = (avatar_mesh(body) for body in bodies)
     arrays = [whole, *(replace(level, closed=whole.closed) for level in coarser)]

@@ -4,9 +4,9 @@ There is one vertex for each distinct pair of a position and a UV. Triangles are
 together. There are two kinds of `Mesh`: the vertex shader skins the vertices of a `SkinnedMesh`; the CPU unit has
 already skinned the vertices of a `PosedMesh`.
 
-A triangle whose corners have at most four weights is skinned with four, one with at most eight with eight, any other
-with twelve. This changes no bit of a position, because a weight of 0 adds nothing. The arrays of a body's mesh are
-computed once and then cached.
+A triangle is skinned with four weights per corner if no corner has more, else with eight, else with twelve. This
+changes no bit of a position, because a weight of 0 adds nothing. The arrays of a body's mesh are computed once and then
+cached.
 """
 
 from __future__ import annotations
@@ -134,9 +134,9 @@ def split_corners(faces: Ints, uv_faces: Ints) -> tuple[NDArray[np.int64], NDArr
 def patch_order(centres: NDArray[np.float64], patch: int = PATCH_TRIANGLES) -> NDArray[np.int64]:
     """Return an order of the triangles, (F,), in which compact patches follow each other.
 
-    The triangles are halved along their longest side, again and again, until a patch has at most `patch` of them.
-    Software drivers shade a vertex again for each batch of about a thousand indices that uses it, and compact patches
-    have few vertices in common.
+    The triangles are halved along their longest side, again and again, until a patch has at most `patch` of them. A
+    software driver shades a vertex once for each batch of about a thousand indices that contains the vertex. Compact
+    patches have few vertices in common.
 
     `centres`: centres of the triangles, (F,3).
     `patch`: most triangles of a patch.
@@ -254,7 +254,7 @@ class Mesh(Protocol):
         """Return a vertex array with which `program` draws the triangles of index buffer `indices`."""
 
     def upload_pose(self, pose: BodyPose) -> None:
-        """Write a frame's pose to the GPU. Raises ValueError if it lacks an array that the mesh needs."""
+        """Write a frame's pose to the GPU. Raises ValueError if `pose` lacks an array that the mesh needs."""
 
     def bind_pose(self, program: Any) -> None:
         """Make `program` read the uploaded pose."""
