@@ -299,9 +299,10 @@ def against_peers(times: dict[tuple[str, int], list[Times]]) -> dict[str, Any]:
 def _slower(
     times: dict[tuple[str, int], list[Times]], ours: str, until: int
 ) -> dict[str, dict[int, tuple[float, float]]]:
-    """Return, by peer and size, the interval of the median of the peer's p50 minus that of the variant `ours`.
+    """Return by how much each peer's p50 is above that of the variant `ours`: by peer and size in KiB.
 
-    `until`: 0 for the time until readable, 1 for the time until read.
+    Each value is the interval (low, high) of the median over the rounds, in microseconds.
+    `times`: times of each round, by variant and size. `until`: index into `Times`.
     """
     p50 = {key: np.array([np.percentile(of_round[until], 50) for of_round in of]) for key, of in times.items()}
     sizes = sorted({size for _, size in times})

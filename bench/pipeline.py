@@ -234,7 +234,7 @@ def _figures(result: RunResult) -> dict[str, Any]:
 
 
 def _units_ms(result: RunResult) -> dict[str, float]:
-    """Return the time of each unit's jobs for a frame, ms, without the time in which the unit had no core."""
+    """Return, by unit, the mean service time of its jobs for a frame, ms, without preempted time."""
     times = dict.fromkeys(result.report.units, 0.0)
     for name, stage in result.report.stages.items():
         preempted = [job.preempted_ns for job in result.jobs if job.stage == name]

@@ -208,7 +208,7 @@ class EventLog:
             self._writer.add_scalar(f"terms/{name}", value, step)
 
     def close(self) -> None:
-        """Write the remaining entries."""
+        """Write the entries that are still in TensorBoard's buffer."""
         if self._writer is not None:
             self._writer.close()
 

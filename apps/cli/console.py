@@ -135,7 +135,7 @@ def shown_messages(messages: Sequence[str], failure: str | None) -> list[str]:
 
 
 def print_kept(parts: Iterable[Any]) -> None:
-    """Print texts and tables on stdout, without wrapping texts. If the reader of a pipe leaves, nothing fails."""
+    """Print texts and tables on stdout, without wrapping texts. A pipe that its reader has closed is no error."""
     console = stdout_console()
     with console.capture() as written:
         for part in parts:

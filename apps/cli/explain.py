@@ -408,7 +408,7 @@ def _modelled(rows: list[dict[str, Any]]) -> str:
 
 
 def _model(row: dict[str, Any]) -> str:
-    """Return the name of an avatar's level of detail. If its mesh is a coarser level, the triangles stand before it."""
+    """Return an avatar's level of detail in words. For a coarser mesh, the number of triangles comes first."""
     mesh = row["mesh"]
     coarser = f"{mesh['triangles']} of {mesh['of']} triangles, " if mesh["level"] else ""
     return f"{coarser}{row['modelled']}"

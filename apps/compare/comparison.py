@@ -388,14 +388,14 @@ def _plain(figure: Figure, row: Difference) -> str:
 
 
 def longer(row: Difference, unit: str) -> str:
-    """Return a change in words, such as `5 % longer (4.2 to 5.8)`."""
+    """Return a change in words, such as `5 % longer (4.2 to 5.8)`. `unit`: unit of the figure."""
     word = "longer" if row.change > 0 else "shorter"
     sign = 1 if row.change > 0 else -1
     return f"{_amount(sign * row.change, row, unit)} {word}{_between(row, sign)}"
 
 
 def signed(row: Difference, unit: str) -> str:
-    """Return a change with its sign, such as `+48 % (44 to 52)`."""
+    """Return a change with its sign, such as `+48 % (44 to 52)`. `unit`: unit of the figure."""
     return f"{_amount(row.change, row, unit, '+')}{_between(row, 1)}"
 
 

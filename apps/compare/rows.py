@@ -106,10 +106,10 @@ def rows_of(base: Side, other: Side) -> Rows:
 
 
 def named(rows: Rows) -> list[Figure]:
-    """Return the figures that a verdict rests on; the other figures explain these.
+    """Return the figures that decide a verdict, without those that only explain it.
 
-    For a stage these are its counted instructions and the time of one. Without counts, its time on the core is used; if
-    this time is unknown too, its service time.
+    For a stage, its number of instructions and the time of one instruction decide. Without counted instructions, its
+    time on the core decides; if this time is unknown too, its service time.
     """
     counted, worked = ({figure.of for figure in rows if figure.measure == each} for each in (INSTRUCTION_TIME, WORK))
 

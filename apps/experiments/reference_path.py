@@ -309,7 +309,7 @@ class ReferenceMoment:
         return [(self.seen[int(row["avatar"])], Rect(*map(float, row["rect"])), _cell(row)) for row in visible]
 
     def _painted(self, causes: Causes) -> dict[int, F32]:
-        """Return, by number of the network, the picture (h,w,4) of the run's tensor with all avatars of the network."""
+        """Return, by network number, the network's output (h,w,4) for the run's tensor, computed with `causes`."""
         avatars = {self._path.network_of(seen): self._path.avatars[seen.folder] for seen, _, _ in self._cells()}
         return {
             network: self._paint(avatar, self._tensor(network, avatar, causes), causes)

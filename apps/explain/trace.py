@@ -199,7 +199,7 @@ def write_predicted(runs: Mapping[str, Simulation], facts: Mapping[str, Any], ta
 class _FrameTracks:
     """Tracks of a run's frames, below the track `parent`: expected, presented, and lost or dropped frames.
 
-    `rank`: rank of the first track.
+    `rank`: place of the first track among the tracks below `parent`.
     """
 
     def __init__(self, sink: Sink, begun: Begun, parent: int, rank: int) -> None:
@@ -254,8 +254,9 @@ class _FrameTracks:
 class _UnitTracks:
     """Tracks of a run's units, below the track `parent`: jobs, idle time by cause, and the unit's stages.
 
-    A job that was dispatched ahead is shown from its begin on. `rank`: rank of the first track. `flows_from`: number of
-    frame 0's arrow; frame n is part of arrow `flows_from` + n.
+    A job that was dispatched ahead is shown from its begin on.
+    `rank`: place of the first track among the tracks below `parent`.
+    `flows_from`: number of the arrow that connects the jobs of frame 0; frame n has arrow `flows_from` + n.
     """
 
     def __init__(self, sink: Sink, graph: Graph, parent: int, rank: int, flows_from: int = 1) -> None:

@@ -448,7 +448,7 @@ def _video_facts(stream: Any) -> dict[str, Any]:
 
 
 def _rotation(stream: Any) -> int:
-    """Return the clockwise turn of the first frame that the file asks for, degrees; 0 without a frame."""
+    """Return by how many degrees the file has its first frame turned clockwise; 0 without a frame."""
     for frame in stream.container.decode(stream):
         return 90 * quarters_of(frame)
     return 0

@@ -258,12 +258,12 @@ class PredictOptions(Options):
 
     @property
     def numbers(self) -> str | None:
-        """Return `precision` as a hardware profile names it; None if it is not given."""
+        """Return the number format of `precision`, as hardware profiles name it; None without `precision`."""
         return None if self.precision is None else PRECISIONS[self.precision]
 
     @property
     def engine(self) -> EngineRuntime | None:
-        """Return the runtime of a tensor engine; None if it is not given."""
+        """Return `runtime` if it is the runtime of a tensor engine, otherwise None."""
         from trilane.hw_profiles.schema import ENGINE_RUNTIMES
 
         return next((runtime for runtime in ENGINE_RUNTIMES if runtime == self.runtime), None)

@@ -205,7 +205,7 @@ class Space:
 
     @cached_property
     def ordered(self) -> set[str]:
-        """The axes with rising numbers as values: there, neighbours can be expected to give similar results."""
+        """The axes whose values are rising numbers, so that neighbouring values should give similar results."""
         return {name for name, values in self.axes.items() if _rises(values)}
 
 

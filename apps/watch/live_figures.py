@@ -375,7 +375,7 @@ class _UnitTime:
     def add_job(self, job: JobDone) -> None:
         """Count a job that has ended.
 
-        The time before it counts as preempted only if the unit had this job and ran no other.
+        The time before the job's begin counts as preempted only if the unit had this job and ran no other job.
         """
         begin_ns, end_ns = job.t_begin_ns, job.t_end_ns
         held_from_ns = max(self._last_end_ns, self._since_ns)
@@ -389,7 +389,10 @@ class _UnitTime:
             self._keep(begin_ns, end_ns, PREEMPTED, min(job.preempted_ns, ran_ns))
 
     def shares(self, now_ns: int, running_since_ns: int | None) -> tuple[Shares, Shares]:
-        """Return the shares of the window and of the run. `running_since_ns`: hand-over of the present job, or None."""
+        """Return the shares of the newest `window_ns`, and those of the whole run, both up to `now_ns`.
+
+        `running_since_ns`: time at which the unit got its present job; None without a job.
+        """
         opened = [_Span(self._since_ns, now_ns, self._state, now_ns - self._since_ns)]
         if running_since_ns is not None:
             begin_ns = min(max(running_since_ns, self._last_end_ns, self._since_ns), now_ns)
