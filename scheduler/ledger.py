@@ -23,7 +23,7 @@ PREEMPTED: Final = "preempted"
 OVERHEAD: Final = "overhead"
 
 
-class Cause(NamedTuple):
+class IdleCause(NamedTuple):
     """A cause of a unit's idle time.
 
     `name`: its key in reports and traces.
@@ -41,17 +41,19 @@ class Cause(NamedTuple):
 
 
 CAUSES: Final = (
-    Cause("starved", STARVED, "no input", "is starved"),
-    Cause("blocked", BLOCKED, "no free slot behind, or as many frames in flight as may be", "is blocked"),
-    Cause("throttled", THROTTLED, "held by its duty", "is held by its cap"),
-    Cause(PREEMPTED, ASSIGNED, "it has a job, but another thread has its core", "has no core"),
-    Cause(
+    IdleCause("starved", STARVED, "no input", "is starved"),
+    IdleCause("blocked", BLOCKED, "no free slot behind, or as many frames in flight as may be", "is blocked"),
+    IdleCause("throttled", THROTTLED, "held by its duty", "is held by its cap"),
+    IdleCause(PREEMPTED, ASSIGNED, "it has a job, but another thread has its core", "has no core"),
+    IdleCause(
         OVERHEAD,
         ASSIGNED,
         "a job is assigned but does not run yet, or the process is down",
         "waits for messages or its process",
     ),
-    Cause("join", JOIN, "some inputs of a frame are there, others not", "waits for the other inputs of a frame", True),
+    IdleCause(
+        "join", JOIN, "some inputs of a frame are there, others not", "waits for the other inputs of a frame", True
+    ),
 )
 #: The name of the cause of a unit's time without a job, by its account.
 NAMES: Final = {cause.account: cause.name for cause in CAUSES if cause.account != ASSIGNED}
