@@ -94,7 +94,8 @@ class PlainClock:
         return released_ns + self.settings.deadline_ns if self.settings.deadline_ns else NO_TIME
 
     def expected_end_ns(self, unit: PlainUnit) -> int:
-        return unit.head_since_ns + self.estimate[unit.queue[0].stage]
+        stage: int = unit.queue[0].stage
+        return unit.head_since_ns + self.estimate[stage]
 
     def drop_from_queue(self, cause: str) -> None:
         self.queue.pop(0)
@@ -249,7 +250,7 @@ class PlainState(PlainClock):
 
     def used(self, edge: int) -> int:
         """Slots of the edge that are written, waited in or read."""
-        jobs = [job for unit in self.units for job in unit.queue]
+        jobs: list[Job] = [job for unit in self.units for job in unit.queue]
         reads = [edge + 1 if job.stage != self.end or not self.skips(job.frame) else -1 for job in jobs]
         count = sum(edge == job.stage or job.stage == at for job, at in zip(jobs, reads, strict=True))
         if edge == self.begin:
@@ -282,8 +283,9 @@ class PlainState(PlainClock):
         if waits or any(job.stage == 0 for job in self.unit_of[0].queue):
             return NO_TIME
         second = self.unit_of[1]
-        free_ns = second.head_since_ns if second.queue else self.now_ns
-        free_ns += sum(self.estimate[job.stage] for job in second.queue)
+        jobs: list[Job] = second.queue
+        free_ns = second.head_since_ns if jobs else self.now_ns
+        free_ns += sum(self.estimate[job.stage] for job in jobs)
         return free_ns - self.estimate[0] - self.settings.latch_ns
 
     def has_input(self, stage: int) -> bool:
