@@ -90,9 +90,14 @@ class Throttle:
         """Return the index into CORNERS at which `unit` runs. `requested`: index of its requested corner."""
         return min(requested + self.steps[unit], len(CORNERS) - 1)
 
-    def lower(self, unit: UnitName, requested: int) -> None:
-        """Move `unit` one corner down, but not below the last corner."""
-        self.steps[unit] = min(self.steps[unit] + 1, len(CORNERS) - 1 - requested)
+    def lower(self, requested: Mapping[UnitName, int], power_w: Mapping[UnitName, float]) -> None:
+        """Move the unit with the most power one corner down, of those that are above the last corner.
+
+        `requested`: index into CORNERS of the requested corner, by unit. `power_w`: present power by unit, watts.
+        """
+        lowerable = [unit for unit in UNITS if self.corner_index(unit, requested[unit]) < len(CORNERS) - 1]
+        if lowerable:
+            self.steps[max(lowerable, key=lambda unit: power_w[unit])] += 1
 
     def raise_(self, unit: UnitName) -> None:
         """Move `unit` one corner up, but not above the requested corner."""
@@ -119,10 +124,7 @@ def step_wise(
     """
     headroom = headroom_k(profile, thermal_state)
     if headroom < 0 and thermal_state.rising:
-        lowerable = [u for u in UNITS if throttle.corner_index(u, requested[u]) < len(CORNERS) - 1]
-        if lowerable:
-            highest_power = max(lowerable, key=lambda u: power_w[u])
-            throttle.lower(highest_power, requested[highest_power])
+        throttle.lower(requested, power_w)
     elif headroom > profile.thermal.hysteresis_k.or_else(2.0):
         throttle.raise_(max(UNITS, key=lambda u: throttle.steps[u]))
 
@@ -151,10 +153,7 @@ def power_allocator(
     granted = shed - thermal.base_power_w.or_else(0.0) + headroom_k(profile, thermal_state) / resistance
     wanted = sum(power_w.values())
     if wanted > granted:
-        lowerable = [u for u in UNITS if throttle.corner_index(u, requested[u]) < len(CORNERS) - 1]
-        if lowerable:
-            highest_power = max(lowerable, key=lambda u: power_w[u])
-            throttle.lower(highest_power, requested[highest_power])
+        throttle.lower(requested, power_w)
         return
     lowest = max(UNITS, key=lambda u: throttle.steps[u])
     if throttle.steps[lowest]:

@@ -407,7 +407,7 @@ def test_heat_follows_the_power_from_poll_to_poll(monkeypatch: pytest.MonkeyPatc
     def govern(profile: Profile, state: ThermalState, throttle: Throttle, requested: Any, power: Any) -> None:
         seen.append((profile.name, state.device_c, dict(requested), dict(power)))
         if len(seen) == 2:
-            throttle.lower("dsp", requested["dsp"])
+            throttle.lower(requested, {"cpu": 0.0, "gpu": 0.0, "dsp": 1.0})
 
     monkeypatch.setitem(GOVERNORS, profile.thermal.governor, govern)
     found = over_time(profile, Plan(NETWORK, "dsp"), "burst", 0.13)
