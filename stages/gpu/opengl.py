@@ -182,7 +182,7 @@ def fence() -> int:
 
 def wait_fence(sync: int) -> None:
     """Wait for the fence `sync` and delete it. Raises TrilaneError if the GPU does not reach it within a second."""
-    result = function("glClientWaitSync")(sync, SYNC_FLUSH_COMMANDS, NS_PER_S)
+    result = function("glClientWaitSync")(sync, SYNC_FLUSH_COMMANDS, int(NS_PER_S))
     function("glDeleteSync")(sync)
     if result in (TIMEOUT_EXPIRED, WAIT_FAILED):
         raise TrilaneError("the GPU did not finish within 1 s")

@@ -65,7 +65,7 @@ def groups(tmp_path: Path) -> list[ShapeGroup]:
 def painted(grey: float) -> Any:
     """A state whose average paints one `grey`."""
 
-    def paint(_: Any, covered: Any) -> Any:
+    def paint(_: Any, covered: Any, __: int) -> Any:
         return torch.full((len(covered), 4, *covered.shape[1:]), grey)
 
     objective = Objective({"composite": 2.0, "adversarial": 5.0}, None, Refused())  # type: ignore[arg-type]
