@@ -542,8 +542,8 @@ def _require_camera(path: Path, raw: RawCamera, kind: str, spec: CameraSpec) -> 
     """
     if spec.axes != AUTO or spec.up_axis != AUTO or kind in OPENGL_KINDS:
         return
-    sound = are_rotations(np.nan_to_num(raw.turns))
-    turns = raw.turns[sound]
+    turns = raw.turns[np.isfinite(raw.turns).all(axis=(1, 2))]
+    turns = turns[are_rotations(turns)]
     if len(turns) and is_of_body(turns @ _axes(kind, AUTO), turns @ _axes(kind, BODY_AXES), raw.usual_up):
         found = "poses which, as a camera's, are turned by 90 degrees and look up steeply"
         remedy = f"set camera.axes to \"{BODY_AXES}\" if the poses are those of a drone's or robot's body (x forward), "

@@ -560,6 +560,16 @@ def test_matrices_of_somebody_who_walks_are_refused_in_another_order(tmp_path: P
         load(tmp_path / "a.txt")
 
 
+def test_a_pose_of_kitti_with_one_number_that_is_none_is_left_out(tmp_path: Path) -> None:
+    """The number is off the diagonal: with 0 in its place, the matrix would be a rotation."""
+    table = TRUTHS["kitti"].table.copy()
+    row, column = next(map(tuple, np.argwhere(np.abs(table[:, [1, 2, 4, 6, 8, 9]]) < 1e-3)))
+    table[row, [1, 2, 4, 6, 8, 9][column]] = np.nan
+    path = tmp_path / "poses.txt"
+    path.write_text(lines_of(table))
+    assert len(load(path, format="kitti", place="none").times_s) == COUNT - 1
+
+
 def test_kitti_matrices_that_fit_as_well_transposed_are_a_question(tmp_path: Path) -> None:
     """A car looks where it goes, and transposed it does not; of a camera that goes round a point nothing tells."""
     car = TRUTHS["kitti"].table.reshape(-1, 3, 4)
