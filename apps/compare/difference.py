@@ -297,7 +297,10 @@ def _left_out(series: Series, reduce: Reduce, is_ratio: bool) -> F64:
 
 
 def _jackknife(values: F64) -> float:
-    """Return the variance of a statistic by the jackknife. `values`: the statistic without each stretch in turn."""
+    """Return the variance of a statistic, or of its change between two sides, by the jackknife.
+
+    `values[i]`: the statistic or change without the frames of stretch i. `values` has shape (`STRETCHES`,).
+    """
     return float((len(values) - 1) / len(values) * ((values - values.mean()) ** 2).sum())
 
 

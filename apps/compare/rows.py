@@ -176,7 +176,11 @@ def _chance(measure: str, of: str, statistic: str, noise: Noise) -> Chance:
 
 
 def _of_summaries(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figure, Difference]]:
-    """Yield figures from the summaries of reports and predictions, each as uncertain as the mean frame time."""
+    """Yield each figure that the summaries of all runs have, with its difference.
+
+    Means, medians and shares scatter within a run like the mean frame time. If this scatter is unknown, the figures
+    have an unknown uncertainty. All other statistics always have an unknown uncertainty.
+    """
     sides = [[_summaries(told.document) for told in side.runs] for side in (base, other)]
     within = _relative_variance(base, other)
     for figure in sides[0][0]:
@@ -344,7 +348,7 @@ class Noise(NamedTuple):
         return self._chance(tail * WORK_DEVIATION, explained=max(self.others[1], self.slower.get(stage, 0.0)))
 
     def of_count(self) -> Chance:
-        """Return the `Chance` of counted instructions."""
+        """Return the `Chance` of a stage's number of instructions. No change is explained."""
         return self._chance(COUNT_DEVIATION)
 
     def _chance(self, relative: float, absolute: float = 0.0, explained: float = 0.0) -> Chance:

@@ -196,10 +196,11 @@ class RunExplanation:
         }
 
     def _of_cores(self, frame_ms: float | None, efficiency: float | None) -> dict[str, Any] | None:
-        """Return the run's cores, their time together in a mean frame (`had_ms`), and the CPU time of all jobs in it.
+        """Return figures of the run's cores: `numbers` of the cores, and two times of a mean frame, ms.
 
-        `frame_ms`: mean frame time. `efficiency`: machine efficiency. The result is None if one of them is None, or if
-        the cores of a unit are unknown.
+        `had_ms`: frame time multiplied by the number of cores. `cpu_ms`: CPU time of all jobs.
+        `frame_ms`: mean frame time. `efficiency`: machine efficiency. If `frame_ms`, `efficiency` or the cores of a
+        unit are unknown, return None.
         """
         cores = sorted({core for place in self._places.values() for core in place.cores})
         if frame_ms is None or efficiency is None or not cores or len(self._places) < len(self._begun.graph.units):

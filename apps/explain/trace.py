@@ -92,7 +92,7 @@ class RunTracks:
                 self._end_ns = record.now_ns
 
     def close(self) -> None:
-        """Write the remaining slices, after the last record."""
+        """Write the last idle slices, the slices that still wait, and the last counters; end the run's slice."""
         for piece in self._timeline.end():
             self._units.idle(piece)
         self._units.close()
@@ -305,7 +305,7 @@ class _UnitTracks:
             self._sink.count(counter, at_ns, frames)
 
     def close(self) -> None:
-        """Write the waiting slices."""
+        """Write the slices that still wait for an earlier slice."""
         for unit in self._units:
             self._write(unit, rest=True)
 

@@ -149,12 +149,16 @@ def _measured(folder: Path, chip: str) -> MeasuredStages:
 
 
 def _trust_in(folder: Path) -> Trust:
-    """Return the judgement of a run's machine. A run without a report gets the judgement of unknown figures."""
+    """Return whether the run in `folder` can be trusted, with reasons. A run without a report is not trusted."""
     return trust_of(read_report(folder).as_json() if (folder / "report.json").exists() else {})
 
 
 def _with_share(file: PipelineFile, measured: MeasuredStages) -> PipelineFile:
-    """Return `file` with the measured share of frames that took the bypass, unless the file has a share or pattern."""
+    """Return `file` with the measured share of frames that took the bypass.
+
+    A file without a bypass, or with a share or pattern of its own, is returned unchanged. This also holds if the stage
+    before the bypass has no measured jobs.
+    """
     if file.bypass is None or file.bypass[1].taken is not None:
         return file
     (begin, way), names = file.bypass, list(file.stages)

@@ -41,8 +41,8 @@ FORM = "SCENE, SCENE@RATE or NETWORK.onnx@RATE, with :gpu or :dsp behind the rat
 class AskedPipeline(NamedTuple):
     """A pipeline as typed on the command line.
 
-    `text`: the whole text. `what`: scene or file in it. `fps`: rate, None for the pipeline's own rate.
-    `unit`: unit of the network, None if not given.
+    `text`: the text as typed, such as `face.onnx@30:gpu`. `what`: part before the @: a scene, network or pipeline file.
+    `fps`: frames a second; None for the pipeline's own rate. `unit`: unit of the network; None if not given.
     """
 
     text: str

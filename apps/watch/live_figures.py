@@ -339,7 +339,10 @@ def looks(run: FollowedRun, pause: Callable[[], None]) -> Generator[RunLook]:
 
 
 def _as_reported(figures: MomentFigures, folder: Path) -> MomentFigures:
-    """Return `figures` with the verdict of the report in `folder`, if it has one: it knows more than the journal."""
+    """Return `figures` with the verdict of the report in `folder`, because a report has more facts than a journal.
+
+    Without a report, return `figures` unchanged.
+    """
     if not (folder / "report.json").is_file():
         return figures
     return replace(figures, verdict=verdict_of(read_report(folder), str(folder)).shown())
