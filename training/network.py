@@ -368,7 +368,7 @@ def add_activation_noise(network: nn.Module, steps: float) -> None:
         return torch.addcmul(output, torch.where(shown > 0, noise_for(shown), 0), size)
 
     for module in network.modules():
-        if isinstance(module, nn.ReLU):
+        if isinstance(module, nn.ReLU) and steps:
             module.register_forward_hook(hook)
 
 

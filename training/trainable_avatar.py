@@ -468,8 +468,26 @@ class ByteGrid:
         low, high = map(float, self.ends[place])
         step = (high - low) / BYTE
         zero = round(-low / step)
-        inside = x.clamp(-zero * step, (BYTE - zero) * step)
-        return inside + (torch.round(inside.detach() / step) * step - inside.detach())
+        rounded: Tensor = _Rounded.apply(x, -zero * step, (BYTE - zero) * step, step)  # type: ignore[no-untyped-call]
+        return rounded
+
+
+class _Rounded(torch.autograd.Function):
+    """Rounds values to multiples of a step, between two ends. Gradients pass inside the ends and are 0 outside.
+
+    As one operator with one kept tensor, this takes about half the time of its steps one by one with autograd.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, low: float, high: float, step: float) -> Tensor:
+        ctx.save_for_backward(x)
+        ctx.ends = low, high
+        return x.clamp(low, high).div_(step).round_().mul_(step)
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None, None]:
+        (x,) = ctx.saved_tensors
+        return torch.ops.aten.hardtanh_backward(gradient, x, *ctx.ends), None, None, None
 
 
 def rounded_weights(folded: Tensor, alike: bool) -> Tensor:
