@@ -23,13 +23,12 @@ from trilane.avatars.network_file import MAX_SIDE, Affine, NetworkFile, read_net
 from trilane.body.body import Body, ShapedBody, load_body
 from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_npz, read_text, require_file
+from trilane.units import AVATARS
 from trilane.writing import require_writable, write_atomically, write_bytes, write_folder
 
 MANIFEST, OFFSETS = "manifest.json", "offsets.npz"
 DEFAULT = "default"
-#: Avatars that are part of the package, by name.
-BUILT_IN = (DEFAULT, "hiker")
-EXPECTED = f"the folder of an avatar, or one of {', '.join(BUILT_IN)}"
+EXPECTED = f"the folder of an avatar, or one of {', '.join(AVATARS)}"
 CAPTURE = "capture.toml"
 HOW_TO_TRAIN = "docs/own-avatar.md says how `trilane avatar train` makes one from frames of a person"
 HOW_TO_CREATE = "`trilane avatar create --body` puts a body of the same UV layout into an avatar"
@@ -123,8 +122,8 @@ def read_texture(path: Path, channels: int) -> NDArray[np.float32]:
 
 
 def bundle_folder(name: str | Path) -> Path:
-    """Return the folder of a bundle. `name`: a name of `BUILT_IN`, for a folder of the package, or else a path."""
-    return Path(__file__).parent / name if str(name) in BUILT_IN else Path(name)
+    """Return the folder of a bundle. `name`: a name of `AVATARS`, for a folder of the package, or else a path."""
+    return Path(__file__).parent / name if str(name) in AVATARS else Path(name)
 
 
 def load_bundle(name: str | Path) -> Bundle:
@@ -132,7 +131,7 @@ def load_bundle(name: str | Path) -> Bundle:
     folder = bundle_folder(name)
     path = folder / MANIFEST
     if not folder.exists():
-        raise BadInputError(folder, "no such folder", EXPECTED, did_you_mean(folder.name, BUILT_IN) or HOW_TO_TRAIN)
+        raise BadInputError(folder, "no such folder", EXPECTED, did_you_mean(folder.name, AVATARS) or HOW_TO_TRAIN)
     if folder.is_file():
         raise BadInputError(folder, *_what_it_is(folder))
     if (folder / CAPTURE).is_file() and not path.exists():

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from trilane.arrays import parse_shape
-from trilane.avatars.bundle import BUILT_IN, Bundle, bundle_folder
+from trilane.avatars.bundle import Bundle, bundle_folder
 from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation, digests_of, figures_digest
-from trilane.units import NO_FIGURES
+from trilane.units import AVATARS, NO_FIGURES
 
 #: Name of each part of an avatar in a sentence.
 PARTS = {
@@ -170,8 +170,8 @@ def _no_figures(bundle: Bundle, changed: Sequence[str], why: str, how: str = "",
 
 
 def name_of(folder: Path) -> str:
-    """Return the word by which a command names the avatar in `folder`: a name of BUILT_IN, or the path."""
-    known = (name for name in BUILT_IN if folder.absolute() == bundle_folder(name).absolute())
+    """Return the word by which a command names the avatar in `folder`: a name of AVATARS, or the path."""
+    known = (name for name in AVATARS if folder.absolute() == bundle_folder(name).absolute())
     return next(known, str(folder))
 
 

@@ -30,6 +30,7 @@ from trilane.body.joints import JOINT_INDEX
 from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_text
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
+from trilane.units import AVATARS, AVATARS_HELP
 
 MAX_DEPTH_RATIO = 1e6  # largest ratio of far to near clip plane; beyond it a depth buffer of 24 bits is too coarse
 AUTO = "auto"  # value of a key that Trilane decides
@@ -81,7 +82,7 @@ class AvatarSpec(Table):
         pattern=NAME,
         description="Name of the avatar, different from all others; `avatar1`, `avatar2`, ... if not given.",
     )
-    bundle: str = Field(default="default", description="`default`, `hiker`, or the folder of an avatar.")
+    bundle: str = Field(default="default", description=AVATARS_HELP)
     motion: str = Field(default="builtin:walk-wave-turn", description="`builtin:NAME`, or a motion file.")
     position: Annotated[tuple[Metres, Metres, Metres], LISTED] = Field(
         default=(0.0, 0.0, 0.0), description="Place of the avatar in the world: x, y, z in metres."
@@ -407,7 +408,7 @@ EXPECTED = {
 IN_STEPS = ("multiple_of", "greater_than_equal", "less_than_equal")
 #: Reason why a key cannot have its value, where the range alone does not explain it.
 REASONS = {"error_budget_px": "numbers are rounded, so nothing is drawn without an error"}
-BUILT_IN = ("room", "default", "hiker")  # names of a background and of two avatars
+BUILT_IN = ("room", *AVATARS)  # names of a background and of avatars
 
 
 def bad_input(where: str | Path, error: ValidationError) -> BadInputError:

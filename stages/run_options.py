@@ -16,9 +16,8 @@ from trilane.options import NOTHING, Finite, Name, OnePath, Option, Options, Tex
 from trilane.scheduler.policy import POLICIES
 from trilane.transport.slots import DEFAULT_EDGE, EDGES, RULES, edge_rule
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import PERFORMANCE_PROFILES
+from trilane.units import AVATARS_HELP, PERFORMANCE_PROFILES
 
-AVATARS_HELP: Final = "`default`, `hiker`, or the folder of an avatar."
 PROFILE_HELP: Final = "Hardware profile: a name or a TOML file."
 RUNTIME_HELP: Final = "auto, ort, openvino, qnn or cuda; auto is the fastest installed one."
 SIZE_HELP: Final = "Tensor size in pixels: HEIGHTxWIDTH, or a side S for areas up to SxS."

@@ -20,7 +20,7 @@ import torch
 from PIL import Image
 
 from trilane.arrays import F32
-from trilane.avatars.bundle import BUILT_IN, OFFSETS, Bundle, bundle_folder, load_bundle, write_manifest
+from trilane.avatars.bundle import OFFSETS, Bundle, bundle_folder, load_bundle, write_manifest
 from trilane.avatars.manifest import sha256_of
 from trilane.errors import BadInputError
 from trilane.files import read_text
@@ -72,6 +72,7 @@ from trilane.training.trainable_avatar import (
 )
 from trilane.training.training_settings import NAME, TrainingSettings, read_settings, settings_text
 from trilane.training.validate import integer_painter, side_by_side
+from trilane.units import AVATARS
 from trilane.writing import write_atomically, write_bytes
 
 CHANNELS = 16
@@ -316,7 +317,7 @@ def _first_avatar(people: Sequence[Trained], places: TrainingPlaces, settings: T
 def _first_image(person: Trained, number: int, settings: TrainingSettings) -> F32:
     """Return the texture (S,S,C) from which the training of `person`, whose number is `number`, starts."""
     name = person.subject.facts.get(KEY) if settings.texture == "look" else settings.texture
-    if name in BUILT_IN:
+    if name in AVATARS:
         return load_bundle(str(name)).read_texture()
     groups = open_groups(person.places.work / SAMPLES, number)
     return first_texture(body_arrays(person.subject.shaped), groups, SIDES[0], CHANNELS)

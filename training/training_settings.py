@@ -18,13 +18,14 @@ from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_text
 from trilane.scene.schema import LISTED, Table
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
+from trilane.units import AvatarName
 
 # Options of a training, in tables of `training.toml`: the optimiser, the batches, and regularisation.
 #
 # Rule: this module needs no PyTorch, so that settings can be checked without PyTorch.
 
 #: Name of a bundled avatar, or `new`.
-BundledName = Literal["default", "hiker", "new"]
+BundledName = AvatarName | Literal["new"]
 Repeats = Annotated[int, Field(ge=1, le=100)]
 
 

@@ -19,6 +19,7 @@ from trilane.apps.cli.console import print_facts, stderr_console, stdout_console
 from trilane.avatars.manifest import BANDS, CAPTURED
 from trilane.errors import BadInputError, MissingPartError, install_line, package_line
 from trilane.stages.run_options import SIZE_HELP
+from trilane.units import AVATARS
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -43,7 +44,7 @@ CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 NEWEST, LINE_S = 0.05, 30.0
 #: Name of TensorBoard's folder in the work folder; seconds after which logged values are on the disk.
 LOG, FLUSH_S = "tensorboard", 10
-#: Width of the networks of the avatars `default` and `hiker`.
+#: Width of the networks of the avatars of the package.
 DEFAULT_WIDTH = 16
 EPILOG_VALIDATE = """\b
 Examples:
@@ -80,7 +81,7 @@ def train(
     ] = 1,
     device: Annotated[str, typer.Option(help="auto, cpu or cuda; auto is an NVIDIA GPU if there is one.")] = "auto",
     start: Annotated[
-        str, typer.Option(help="Network to train further, of avatar default or hiker; new: random weights.")
+        str, typer.Option(help=f"Network to train further: {', '.join(AVATARS)}; new: random weights.")
     ] = "default",
     network: Annotated[
         str | None,

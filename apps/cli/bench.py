@@ -20,6 +20,7 @@ from trilane.apps.cli.console import print_json, stderr_console, stdout_console,
 from trilane.apps.cli.main import lazy_group
 from trilane.apps.predict.predict_options import ENCODER_HELP, NORM_HELP
 from trilane.stages.run_options import RUNTIME_HELP, SIZE_HELP, WIDTH_HELP
+from trilane.units import AVATARS_HELP
 
 #: Bench -> its module, and its line in `trilane bench --help`.
 BENCHES = {
@@ -65,7 +66,7 @@ NAMED_RUNTIME = "ort, openvino, qnn or cuda."
 DRIVER_THREADS = "Threads of the software OpenGL driver."
 #: Option, or bench and option -> its line in `--help`.
 MEANINGS = {
-    "avatar": "`default`, `hiker`, the folder of an avatar, or `resnet18`: the full-width network, untrained.",
+    "avatar": f"{AVATARS_HELP[:-1]}, or `resnet18`: the full-width network, untrained.",
     "avatars": "How many avatars share the tensor.",
     "beside": "A second avatar, which runs at the same time; both runs are compared with virtual time.",
     "beside_size": "Tensor size of the second avatar in pixels: HEIGHTxWIDTH, or a side.",
@@ -77,7 +78,7 @@ MEANINGS = {
     "encoder": ENCODER_HELP,
     "events": "Folder of a run, or its events.jsonl, to be replayed.",
     "frames": "Frames of each run.",
-    "predict avatar": "`default`, `hiker`, or the folder of an avatar.",
+    "predict avatar": AVATARS_HELP,
     "predict frames": "Frames of each run, at least 100.",
     "predict seconds": "How long each network is called by itself.",
     "predict width": "Width of a further network, untrained; 64 is full.",

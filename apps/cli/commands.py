@@ -21,7 +21,8 @@ from typer.core import TyperCommand, TyperOption
 from trilane.apps.predict.predict_options import ENCODER_HELP, FIXED_SIZE_HELP, NORM_HELP
 from trilane.errors import BadInputError, did_you_mean
 from trilane.options import EMPTY_PATH, Options, element_of, expected, kind_of, limits_of, option_of
-from trilane.stages.run_options import AVATARS_HELP, PROFILE_HELP, WIDTH_HELP, RunOptions
+from trilane.stages.run_options import PROFILE_HELP, WIDTH_HELP, RunOptions
+from trilane.units import AVATARS_HELP
 
 #: Attribute of a command's function, with the class of the command's options.
 OPTIONS = "options_model"

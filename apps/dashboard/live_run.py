@@ -36,7 +36,7 @@ from trilane.apps.dashboard.run_facts import (
 from trilane.apps.run.asked_run import early_processes, prepare, run_prepared
 from trilane.apps.run.run_job import ENDLESS, Hooks, Prepared, RunOutcome, Watched
 from trilane.apps.watch.followed_run import run_name
-from trilane.avatars.bundle import BUILT_IN, MANIFEST
+from trilane.avatars.bundle import MANIFEST
 from trilane.errors import TrilaneError
 from trilane.options import option_of
 from trilane.pipeline.controls import ALL, RunControls
@@ -44,7 +44,7 @@ from trilane.pipeline.description import Pipeline
 from trilane.stages.configure import Checked, GlFacts, required_machine
 from trilane.stages.dsp.runtime import installed
 from trilane.stages.run_options import RunOptions
-from trilane.units import UNITS
+from trilane.units import AVATARS, UNITS
 
 OpenHooks = Callable[[], AbstractContextManager[Hooks]]
 RUNNING, PAUSED, RESTARTING, ENDED, FAILED = "running", "paused", "restarting", "ended", "failed"
@@ -214,7 +214,7 @@ class Director:
 
 def choices_of(config: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
     """Return the choices of each control in OF_A_NEW_RUN, by name. `config`: present values, which are choices too."""
-    found = {"runtime": installed(), "avatar": (*BUILT_IN, *_neighbours(str(config["avatar"])))}
+    found = {"runtime": installed(), "avatar": (*AVATARS, *_neighbours(str(config["avatar"])))}
     choices = {}
     for name in OF_A_NEW_RUN:
         offered = option_of(RunOptions.model_fields[name]).offered or ()
@@ -232,7 +232,7 @@ def reasons_against(options: RunOptions) -> dict[str, str]:
 def _neighbours(avatar: str) -> Iterator[str]:
     """Yield the avatars' folders beside `avatar`, if `avatar` is a folder and not a built-in name."""
     folder = Path(avatar)
-    if avatar not in BUILT_IN and folder.is_dir():
+    if avatar not in AVATARS and folder.is_dir():
         yield from [str(manifest.parent) for manifest in sorted(folder.parent.glob(f"*/{MANIFEST}"))[:MOST_AVATARS]]
 
 

@@ -16,10 +16,10 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from trilane.errors import BadInputError
 from trilane.options import Finite, Name, OnePath, Option, Options, Text, Texts, one_of, paths_of
 from trilane.scheduler.policy import MOST_FRAMES, POLICIES
-from trilane.stages.run_options import AVATARS_HELP, PROFILE_HELP
+from trilane.stages.run_options import PROFILE_HELP
 from trilane.transport.slots import DEFAULT_EDGE
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import BURST, HOST, MAX_MINUTES, PERFORMANCE_PROFILES, SUSTAINED, UNITS, UnitName
+from trilane.units import AVATARS_HELP, BURST, HOST, MAX_MINUTES, PERFORMANCE_PROFILES, SUSTAINED, UNITS, UnitName
 
 if TYPE_CHECKING:
     from trilane.hw_profiles.application import Variant

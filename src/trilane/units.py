@@ -15,6 +15,12 @@ TARGET_FPS = 30.0
 #: Longest virtual time of a prediction, minutes.
 MAX_MINUTES = 24 * 60
 
+#: Names of the avatars that are part of the package.
+AvatarName = Literal["default", "hiker"]
+AVATARS: tuple[AvatarName, ...] = get_args(AvatarName)
+#: Help text for an option that names an avatar.
+AVATARS_HELP = f"{', '.join(f'`{name}`' for name in AVATARS)}, or the folder of an avatar."
+
 UnitName = Literal["cpu", "gpu", "dsp"]
 UNITS: tuple[UnitName, ...] = get_args(UnitName)
 

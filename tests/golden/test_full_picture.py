@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from trilane.arrays import F32, F64
-from trilane.avatars.bundle import BUILT_IN, CLOTHES_STANDOFF_M
+from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.bench.lib import full_picture
 from trilane.bench.lib.cast import Box, Cast, RasterLayer, blended, premultiplied, to_light
 from trilane.bench.lib.full_picture import SAMPLES, FullPictures, true_pictures
@@ -25,6 +25,7 @@ from trilane.stages.run_options import RunOptions
 from trilane.training.clothing import LOOKS, clothing_layers, find_landmarks
 from trilane.training.sample_renderer import ClothedBody
 from trilane.training.surface import body_arrays
+from trilane.units import AVATARS
 
 SCENE = """
 frames = 12
@@ -108,7 +109,7 @@ def test_the_body_is_in_one_place_at_every_density(checked: Checked, monkeypatch
         assert np.abs(np.subtract(other, found[0])).max() < 0.25
 
 
-@pytest.mark.parametrize("name", BUILT_IN)
+@pytest.mark.parametrize("name", AVATARS)
 def test_the_truth_is_what_the_training_draws(name: str, tmp_path: Path, gl: Any) -> None:
     """The clothes of the avatar's look on the skin; on the offsets, which are these clothes, they would stand off."""
     file = tmp_path / "own.toml"

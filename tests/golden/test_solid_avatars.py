@@ -17,11 +17,12 @@ pytest.importorskip("onnxruntime")
 pytest.importorskip("skimage")
 
 from trilane.arrays import U8
-from trilane.avatars.bundle import BUILT_IN, Bundle, load_bundle
+from trilane.avatars.bundle import Bundle, load_bundle
 from trilane.avatars.manifest import Validation
 from trilane.training import clothing, validate
 from trilane.training.sample_renderer import SampleRenderer
 from trilane.training.validate import Evaluated, ValidationPlan, integer_painter, open_renderer
+from trilane.units import AVATARS
 
 PLAN = ValidationPlan(seeds=(90_210,), per_band=2)
 #: Share of the inside that may let more than a tenth of the background through.
@@ -48,7 +49,7 @@ def opened(gl: Any) -> dict[str, tuple[Bundle, SampleRenderer]]:  # noqa: ARG001
     """Each avatar with its renderer, whose obscurance is coarse: a third of the time, and a few bytes of shade."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(clothing, "EMITTERS", 600)
-        bundles = [load_bundle(name) for name in BUILT_IN]
+        bundles = [load_bundle(name) for name in AVATARS]
         return {bundle.manifest.name: (bundle, open_renderer(bundle, 1)) for bundle in bundles}
 
 
@@ -109,7 +110,7 @@ def tinted(picture: U8) -> U8:
     return changed
 
 
-@pytest.mark.parametrize("name", BUILT_IN)
+@pytest.mark.parametrize("name", AVATARS)
 def test_an_avatar_of_the_package_is_solid(validated: Any, name: str) -> None:
     integer = validated(name).figures.integer
     assert integer.samples == 8
@@ -117,7 +118,7 @@ def test_an_avatar_of_the_package_is_solid(validated: Any, name: str) -> None:
     assert integer.alpha_inside < 0.01 and integer.alpha_outside < 0.001
 
 
-@pytest.mark.parametrize("name", BUILT_IN)
+@pytest.mark.parametrize("name", AVATARS)
 def test_a_transparent_avatar_is_found(validated: Any, name: str) -> None:
     """Inside, where alpha should be 1, 1 - alpha becomes 0.3 + 0.7 (1 - alpha), to half a step of 255.
 

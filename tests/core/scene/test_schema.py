@@ -7,7 +7,6 @@ from typing import Any
 
 import pytest
 
-from trilane.avatars.bundle import BUILT_IN
 from trilane.errors import BadInputError
 from trilane.scene.schema import (
     Scene,
@@ -17,6 +16,7 @@ from trilane.scene.schema import (
     scene_from,
     scene_names,
 )
+from trilane.units import AVATARS
 
 WRONG = {
     "size = '100'": ("size", "found side 100", "a multiple of 32"),
@@ -199,7 +199,7 @@ def test_avatars_are_named_by_their_places_and_keep_their_names() -> None:
 
 def test_places_of_files_and_names_that_are_built_in(tmp_path: Path) -> None:
     base = Path("/base")
-    for name in ("room", *BUILT_IN, "builtin:orbit"):
+    for name in ("room", *AVATARS, "builtin:orbit"):
         assert located(name, base) == name
     assert (located("a.png", base), located("/x/a.png", base)) == ("/base/a.png", "/x/a.png")
     with pytest.raises(BadInputError) as raised:
