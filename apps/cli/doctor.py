@@ -117,7 +117,7 @@ def _dev_shm() -> PartCheck:
 
 
 def _wakeup() -> PartCheck:
-    """Check whether a run can keep idle cores awake. This is optional: a message to a sleeping core takes 50 us more."""
+    """Check whether a run can keep idle cores awake. It is optional: a message to a sleeping core takes 50 us more."""
     from trilane.machine import AWAKE, LATENCY_FILE, awake
 
     install = f'apt-get install acl; setfacl -m "u:$USER:w" {LATENCY_FILE}'
