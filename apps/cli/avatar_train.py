@@ -327,7 +327,7 @@ def _band_table(validation: Validation) -> Table:
 
 
 def _size_table(by_size: BySize) -> Table:
-    """Return a table of PSNR in dB: a row for each size of the body, a column for each tensor size, in pixels."""
+    """Return a table of PSNR in dB: a row for each size of the body, a column for each tensor size."""
     from rich.table import Table
 
     from trilane.avatars.validation import from_validation
@@ -373,7 +373,8 @@ def _validate(bundle: Bundle, plan: ValidationPlan, float_network: Path | None, 
 def _add_sizes(bundle: Bundle, plan: ValidationPlan) -> Bundle:
     """Measure `bundle` at several tensor sizes, add the figures to its manifest, and return the new bundle.
 
-    `plan`: views and runtime to measure with. Raises BadInputError if the bundle has no validation of its present files.
+    `plan`: views and runtime to measure with. Raises BadInputError if the present files of the bundle were not
+    validated.
     """
     from rich.progress import Progress
 

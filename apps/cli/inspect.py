@@ -87,7 +87,7 @@ def _draw(found: Any, out: Path | None) -> Path | None:
 
 
 def lines(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines that `trilane inspect` prints without `--json`. `document`: document of `trilane inspect --json`."""
+    """Yield the lines that `trilane inspect` prints without `--json`. `document`: what it prints with `--json`."""
     yield f"{document['file']}: {document['what']}"
     rows = {
         "not usable": document["problem"],
