@@ -56,7 +56,10 @@ def check_file(path: Path) -> dict[str, Any]:
 
 
 def _document_of(file: PipelineFile) -> dict[str, Any]:
-    """Return the result of `check_file` for a pipeline file that is already read. Raises BadInputError as it does."""
+    """Return the result of `check_file` for the pipeline file `file`, which was read before.
+
+    Raises BadInputError for the first fault in its networks and ports.
+    """
     types = port_types(file, read_networks(file))
     prices = {name: price for name in file.stages if (price := given_price(file, name)) is not None}
     known = prices if len(prices) == len(file.stages) else None
@@ -106,7 +109,8 @@ def _routes(file: PipelineFile, rules: Mapping[str, str]) -> list[dict[str, Any]
 
     The keys are `from` and `to`: stages where the bypass begins and ends; `past`: names of the stages between the two;
     `share`: share of the frames that take the bypass, None if the file does not state it.
-    `rules`: rule of each edge, by the stage that writes to the edge.
+
+    `file`: pipeline file. `rules`: rule of each edge, by the stage that writes to the edge.
     """
     if file.bypass is None:
         return []
@@ -285,7 +289,8 @@ def _columns(document: Mapping[str, Any]) -> dict[str, int]:
 def _rows(document: Mapping[str, Any], columns: Mapping[str, int]) -> dict[str, tuple[str, int]]:
     """Return a pair for each stage, by its name: its unit, and its row in the lane of the unit, from 0 at the top.
 
-    Stages in one lane and column get different rows. `columns`: result of `_columns`.
+    Stages in one lane and column get different rows. `document`: result of `check_file`. `columns`: result of
+    `_columns`.
     """
     used: dict[tuple[str, int], int] = {}
     found = {}
@@ -297,9 +302,9 @@ def _rows(document: Mapping[str, Any], columns: Mapping[str, int]) -> dict[str, 
 
 
 def _lanes(document: Mapping[str, Any], rows: Mapping[str, tuple[str, int]]) -> tuple[dict[str, int], int]:
-    """Return the top of each unit's lane (y coordinate, by unit), and the height of the drawing, all in pixels.
+    """Return the y coordinate of the top of each unit's lane, by unit, and the height of the drawing, in pixels.
 
-    `rows`: result of `_rows`.
+    `document`: result of `check_file`. `rows`: result of `_rows`.
     """
     tops, top = {}, TOP
     for unit in document["units"]:

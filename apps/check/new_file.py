@@ -108,7 +108,8 @@ def _free_name(stem: str, endings: Sequence[str], names: set[str]) -> str:
     """Return a free name for the stage of a network, and add the names of its branch to `names`.
 
     The name is `stem`, with a number if a name of the branch is taken. `stem`: name of the network file without ending.
-    `endings`: texts that follow the name in the names of the branch's stages. `names`: names that are taken.
+    `endings`: one text for each stage of the branch; the stage is called by the returned name and this text.
+    `names`: names that are taken.
     """
     head = re.sub(r"[^\w-]", "-", stem, flags=re.ASCII) or "network"
     for number in count(1):

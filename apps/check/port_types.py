@@ -68,7 +68,7 @@ def read_networks(file: PipelineFile) -> dict[str, GraphFile]:
 def require_weights(graph: GraphFile, where: str | Path) -> None:
     """Raise BadInputError if a weight of the network has no values, because no runtime can run such a network.
 
-    `where`: place that the message names: a key of the pipeline file, or the network file.
+    `graph`: network. `where`: place that the message names: a key of the pipeline file, or the network file.
     """
     held = {each.name for each in graph.model.graph.initializer} | {each.name for each in fed_inputs(graph)}
     if bare := [value.name for value in graph.model.graph.input if value.name not in held]:
@@ -94,8 +94,8 @@ def _read(file: PipelineFile, name: str, stage: OnnxStage) -> GraphFile:
 def _check_names(file: PipelineFile, name: str, stage: OnnxStage, graph: GraphFile) -> None:
     """Raise BadInputError if an input of the network of stage `name` gets no stream, or if a key names no input.
 
-    The keys are `in` and `shapes`. A stream may also feed an input that stands for a weight. `stage`: keys of the
-    stage. `graph`: its network.
+    The keys are `in` and `shapes`. A stream may also feed an input that stands for a weight. `file`: pipeline file.
+    `stage`: keys of the stage. `graph`: network of the stage.
     """
     where, inputs = f"{file.path}: stages.{name}", [value.name for value in graph.model.graph.input]
     wanted = [value.name for value in fed_inputs(graph)]
@@ -123,9 +123,10 @@ def _check_names(file: PipelineFile, name: str, stage: OnnxStage, graph: GraphFi
 
 
 def _check_fixed(where: str, stage: OnnxStage, graph: onnx.GraphProto) -> None:
-    """Raise BadInputError if `shapes` of the stage changes a size that the network fixes, as no runtime accepts that.
+    """Raise BadInputError if the key `shapes` changes a size that the network fixes. No runtime accepts such a change.
 
-    `where`: stage in the pipeline file, for the message. `graph`: network of the stage as in its file.
+    `where`: place of the stage in the pipeline file, for the message. `stage`: keys of the stage. `graph`: network of
+    the stage, without the changes of `shapes`.
     """
     for value in graph.input:
         own = [size.dim_value for size in value.type.tensor_type.shape.dim]
@@ -139,7 +140,8 @@ def _check_fixed(where: str, stage: OnnxStage, graph: onnx.GraphProto) -> None:
 def _check_output(file: PipelineFile, name: str, each: PortInput, outputs: list[str]) -> None:
     """Raise BadInputError if an input of stage `name` reads a port that is no output of a network.
 
-    `each`: input that reads the output of a network's stage. `outputs`: names of the outputs of this network.
+    `file`: pipeline file. `each`: input that reads from the stage of a network. `outputs`: names of the outputs of this
+    network.
     """
     where = f"{file.path}: stages.{name}.in" + (f".{each.port}" if each.port else "")
     if each.from_port and each.from_port not in outputs:
@@ -149,7 +151,9 @@ def _check_output(file: PipelineFile, name: str, each: PortInput, outputs: list[
 
 
 def port_types(file: PipelineFile, networks: Mapping[str, GraphFile]) -> PortTypes:
-    """Return the types of all ports whose type is known, by port, by stage. `networks`: result of `read_networks`.
+    """Return the types of all ports whose type is known: name of the stage -> name of the port -> type.
+
+    `file`: pipeline file. `networks`: result of `read_networks`.
 
     Raises BadInputError if a stage cannot read the type of a port that it reads.
     """
@@ -167,7 +171,7 @@ def _check_bypass(file: PipelineFile, types: PortTypes) -> None:
     """Raise BadInputError if the first stage of the bypass lacks a port that the last stage of the bypass reads.
 
     A port of the right name and another type counts as lacking. No port is needed if the last stage is Python code, a
-    stage with a set time, or a block `busy` or `discard`. `types`: types of all known ports.
+    stage with a set time, or a block `busy` or `discard`. `file`: pipeline file. `types`: types of all known ports.
     """
     if file.bypass is None:
         return
@@ -191,7 +195,8 @@ def _written(
 ) -> dict[str, PortType]:
     """Return the types of the ports that a stage writes, by port; empty if they are unknown.
 
-    `known`: types of the earlier stages' ports. `network`: network of this stage; None for a stage without a network.
+    `stage`: keys of the stage. `known`: types of the earlier stages' ports. `network`: network of the stage; None for a
+    stage without a network.
     `networks`: networks of all stages, by stage.
     """
     if stage.out is not None:
@@ -242,7 +247,8 @@ def _check_inputs(
 ) -> None:
     """Raise BadInputError if stage `name` cannot read a port, because of the type of this port.
 
-    `known`: types of the known ports of earlier stages. `networks`: networks of all stages, by stage.
+    `file`: pipeline file. `stage`: keys of the stage. `known`: types of the known ports of earlier stages.
+    `networks`: networks of all stages, by stage.
     """
     for each in stage.inputs:
         found = source_type(each, known)
@@ -267,7 +273,7 @@ def _check_network(where: str, found: PortType, each: PortInput, network: GraphF
 
     A network takes a port with numbers of the same kind and count, whatever their shape. An input for pictures takes
     other pictures too, if they can be prepared. `where`: place in the pipeline file, for the message. `each`: input of
-    the stage, which reads the port.
+    the stage that reads the port. `network`: network of this stage.
     """
     inputs = network.model.graph.input if each.port else fed_inputs(network)
     value = next(one for one in inputs if each.port in ("", one.name))

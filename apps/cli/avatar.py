@@ -184,7 +184,8 @@ app.command(epilog=avatar_network.EPILOG_EXPORT)(avatar_network.export)
 def _checked(capture: Capture, picture: Path) -> dict[str, Any]:
     """Check `capture`, write a sheet of fits to the file `picture`, and return the facts that the command prints.
 
-    The sheet shows the fits of a few frames over these frames. Raises BadInputError if the fits do not match the masks.
+    The sheet shows the fits of some frames, each over the picture of its frame.
+    Raises BadInputError if the fits do not match the masks.
     """
     from trilane.training.capture.capture_samples import BodyRaster
     from trilane.training.capture.check import (

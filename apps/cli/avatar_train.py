@@ -207,7 +207,10 @@ class EventLog:
         self._writer: Any = None
 
     def write(self, step: int, terms: Mapping[str, float], loss: float) -> None:
-        """Log the loss of one training step. `terms`: unweighted terms of the loss, by name. `loss`: weighted sum."""
+        """Log the loss of the training step `step`.
+
+        `terms`: unweighted terms of the loss, by name. `loss`: their weighted sum.
+        """
         if self._writer is None:
             self._writer = _writer(self._folder, step)
         self._writer.add_scalar("loss", loss, step)
@@ -327,7 +330,10 @@ def _band_table(validation: Validation) -> Table:
 
 
 def _size_table(by_size: BySize) -> Table:
-    """Return a table of PSNR in dB: a row for each size of the body, a column for each tensor size."""
+    """Return a table of PSNR in dB: a row for each size of the body in the picture, a column for each tensor size.
+
+    Both sizes are squares, given by their sides in pixels.
+    """
     from rich.table import Table
 
     from trilane.avatars.validation import from_validation

@@ -179,9 +179,10 @@ def _help(name: str, module: ModuleType) -> str:
 
 
 def _option(bench: str, parameter: inspect.Parameter) -> Any:
-    """Return Typer's option for a parameter of `measure`. The option has the type of the parameter's default.
+    """Return Typer's option for `parameter`, which is a parameter of `measure` in the module of bench `bench`.
 
-    If the default is a tuple, the option may be given several times, once for each value. `bench`: name of the bench.
+    The option has the type of the parameter's default. If the default is a tuple, the option may be given several
+    times, once for each value.
     """
     default = parameter.default
     several = isinstance(default, tuple)

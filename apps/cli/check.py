@@ -73,9 +73,9 @@ def check(file: FileArgument, svg: SvgOption = None, profile: ProfileOption = No
 
 
 def _checked(file: str, profile: str | None) -> tuple[dict[str, Any], str]:
-    """Return the document for `--json`, and the text of a pipeline file that describes the scene's pipeline.
+    """Return the document for `--json`, and the text of a pipeline file that describes the pipeline of a scene.
 
-    The text is empty if `file` is a pipeline file itself. `file`: pipeline file, or name or file of a scene.
+    If `file` is a pipeline file, this text is empty. `file`: pipeline file, or name or file of a scene.
     `profile`: chip whose times the stages of a scene get; None for stages without times.
 
     Raises BadInputError for a faulty file, and for a `profile` beside a pipeline file. Raises MissingPartError for a

@@ -176,7 +176,7 @@ def _gates(asked: Sequence[str], slower: str | None) -> list[Gate]:
 
 
 def _say(judged: Sequence[JudgedLimit]) -> None:
-    """Print a line for each limit on stderr: the outcome and its reason, after the run's name if there are several."""
+    """Print a line for each limit on stderr: its outcome and the reason. With several runs, the line names the run."""
     several = len({each.name for each in judged}) > 1
     for each in judged:
         said = without_controls(f"{each.name}: {each.said}" if several else each.said)
@@ -247,7 +247,7 @@ LEFT_OUT = {
 
 
 def sweep_lines(comparison: SweepComparison, show_all: bool) -> Iterator[str | Table]:
-    """Yield the texts and tables that compare two sweeps.
+    """Yield the texts and tables that show `comparison`, the comparison of two sweeps.
 
     `show_all`: whether to show all pairs of trials. If False, only pairs that surely differ are shown.
     """
@@ -309,7 +309,7 @@ def _table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
 def _left_out(comparison: Comparison, shown: Sequence[Figure]) -> Iterator[str]:
     """Yield sentences that count the figures left out of the table: figures without difference, and undecided figures.
 
-    `shown`: figures in the table.
+    `comparison`: comparison of two runs. `shown`: figures in the table.
     """
     from trilane.apps.compare.difference import Finding
 

@@ -254,9 +254,9 @@ def _show(read: Measurements) -> None:
 
 
 def _table(kind: str, measurements: Sequence[Measurement]) -> Table:
-    """Return a table with a row for each measurement, without empty columns.
+    """Return a table with a row for each of the `measurements`, without empty columns.
 
-    `kind`: kind of all these measurements, which heads the first column: run, wall or layer.
+    `kind`: kind of all these measurements, as title of the first column: run, wall or layer.
     """
     from rich.markup import escape
     from rich.table import Table

@@ -181,7 +181,7 @@ def _is_of_stdout(error: OSError) -> bool:
 
 
 def _call(arguments: list[str]) -> None:
-    """Run the command line `arguments`, and flush stdout before the SystemExit that ends the command goes on.
+    """Run the command line `arguments`, and flush stdout when the command ends. Ends with the command's SystemExit.
 
     Raises OSError if the flush fails, such as on a full disk. A pipe whose reader has left is no error.
     """
@@ -209,7 +209,7 @@ def _in_new_names(arguments: list[str]) -> list[str]:
 
 
 def main() -> None:
-    """Run the command line of `sys.argv`. Ends with SystemExit and an exit code of the list in `EPILOG`.
+    """Run the command line of `sys.argv`. Ends with SystemExit and one of the exit codes in `EPILOG`.
 
     With `--debug`, an error of the command is raised instead, so that Python prints its traceback.
     """

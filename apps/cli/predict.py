@@ -189,7 +189,7 @@ def _write_beside(
 ) -> None:
     """Simulate the pipelines `found` on the shared `chip`, and write their runs as one trace to the file `target`.
 
-    `answer`: document of the prediction, from which the trace takes `machine` and `config`.
+    `options`: options of the prediction. `answer`: its document, from which the trace takes `machine` and `config`.
     """
     from trilane.apps.explain.trace import write_predicted
     from trilane.hw_profiles.schema import corners_of
@@ -363,7 +363,8 @@ def predict(options: PredictOptions, *, json: JsonOption = False) -> None:
 def _write_trace(chip: Profile, plan: Plan, options: PredictOptions, answer: dict[str, Any], target: Path) -> None:
     """Simulate the run behind the predicted busy and idle shares again, and write its trace to the file `target`.
 
-    `answer`: document of the prediction, from which the trace takes `machine` and `config`.
+    `chip`: hardware profile. `plan`: application on the chip. `options`: options of the prediction. `answer`: document
+    of the prediction, from which the trace takes `machine` and `config`.
     """
     from trilane.apps.explain.trace import write_predicted
     from trilane.hw_profiles.predict import predicted_run

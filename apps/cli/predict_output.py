@@ -209,7 +209,10 @@ def _operator_table(answer: dict[str, Any]) -> Table:
 
 
 def show_answer(answer: dict[str, Any], as_json: bool) -> None:
-    """Print one prediction of the avatar's pipeline. `answer`: document of `trilane predict --json`."""
+    """Print one prediction of the avatar's pipeline.
+
+    `answer`: document of `trilane predict --json`. `as_json`: whether to print this document, or text and tables.
+    """
     if as_json:
         print_json(answer)
         return

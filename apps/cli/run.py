@@ -140,7 +140,8 @@ def _run_live(options: RunOptions, command: tuple[str, ...], port: int | None) -
 def _print_outcome(outcome: RunOutcome, as_json: bool, with_table: bool) -> None:
     """Print the report as JSON, or its verdict, on stdout. Print folder, messages and cause of a failure on stderr.
 
-    `as_json`: whether to print JSON. `with_table`: whether to print the table of all figures below the verdict.
+    `outcome`: end of the run, with its report. `as_json`: whether to print JSON. `with_table`: whether to print the
+    table of all figures below the verdict.
     """
     from trilane.apps.run.verdict_facts import verdict_of
 
@@ -304,9 +305,9 @@ def _service_and_wait(times: StageTimes | None) -> str:
 
 
 def _byte_rows(runs: Sequence[PolicyMetrics]) -> Rows:
-    """Yield a row with the bytes that each stage moves for a frame, and a row with the bytes of all stages.
+    """Yield two rows: the MB that each stage moves for a frame, and the MB that all stages move for a frame.
 
-    The second row also has the ratio to the least bytes, and GB/s. Yields nothing if no run counts bytes.
+    The second row also has the ratio to the least bytes, and the rate in GB/s. Yields nothing if no run counts bytes.
     """
     if not any(run.bytes for run in runs):
         return

@@ -257,7 +257,7 @@ def heading(look: RunLook) -> str:
 
 
 def ending(look: RunLook) -> str:
-    """Return a sentence that says how a run has ended that went on at the last look."""
+    """Return a sentence that says how a run has ended. The run went on at the look before `look`."""
     return f"run {look.name}: {ENDINGS[look.state]}"
 
 
@@ -343,9 +343,9 @@ def _three(times: Mapping[str, float]) -> str:
 
 
 def _time(times: Mapping[str, float], key: str) -> str:
-    """Return a statistic in ms as a text: a dash without samples, and a mark TOO_FEW if it needs more samples.
+    """Return a statistic in ms as a text. Without samples, the text is a dash. With too few samples, TOO_FEW follows.
 
-    `times`: values in ms by the name of the statistic, with the number of `samples`. `key`: name, such as `p95`.
+    `times`: values in ms by the name of the statistic, and the number of `samples`. `key`: name, such as `p95`.
     """
     if not times["samples"]:
         return DASH
@@ -361,9 +361,9 @@ def _stages(figures: MomentFigures) -> Table:
 
 
 def _moved(kinds: Mapping[str, Moved]) -> tuple[str, str]:
-    """Return two texts: the MiB that a job moves, in all and by kind, and the least MiB. An unknown number is a dash.
+    """Return two texts: the MiB that a job moves, in all and by kind, and the least bytes of a job in MiB.
 
-    `kinds`: kind of the moved bytes -> their number. The kind LEAST has the least bytes.
+    An unknown number is a dash. `kinds`: moved bytes of a stage, by kind; the least bytes have the key LEAST.
     """
     from trilane.apps.watch.live_figures import LEAST
 

@@ -1,6 +1,6 @@
 """The description of one file as plain data for people and JSON, and its contact sheet.
 
-Rule: a file is usable if the reader that a run uses accepts it. A problem is the error that this reader raises.
+Rule: a file is usable if the other commands can read it. A problem is the error of their reader, in its words.
 
 A contact sheet shows skeletons, a path or points. All skeletons of a row have the same scale, and so have all views of
 a path. Therefore lengths can be compared. Y is up. In the view from the front, a person who faces +Z looks at the
@@ -46,8 +46,8 @@ FRUSTUM = np.array([[-0.8, -0.6, -1.0], [0.8, -0.6, -1.0], [0.8, 0.6, -1.0], [-0
 class Length:
     """The length of a recording.
 
-    `samples`: number of usable frames or poses. `seconds`: length in time. `rate_hz`: samples a second; None if
-    unknown, as for a single sample.
+    `samples`: number of usable frames or poses. `seconds`: duration. `rate_hz`: samples a second; None if unknown, as
+    for a single sample.
     """
 
     samples: int
@@ -139,8 +139,8 @@ def refused(kind: str, what: str, error: BadInputError, file: Path) -> Inspectio
 class _Tile:
     """A square picture that shows points given in metres.
 
-    `draw`: Pillow's drawing of the picture. `side`: its side in pixels. `middle` (2,): point at its centre, in metres.
-    `scale`: pixels per metre.
+    `draw`: Pillow's tool that draws on the picture. `side`: side of the picture in pixels. `middle` (2,): point at the
+    centre, in metres. `scale`: pixels per metre.
     """
 
     draw: ImageDraw.ImageDraw
@@ -244,8 +244,8 @@ def _path_tile(
 
     `path` (T, 2): points of the path, in metres. `name`: title of the tile. `side`: side of the tile in pixels.
     `extent`: metres that the tile shows along a side. `every` (N, 2): points whose bounding box is centred in the tile;
-    None for the points of `path`. `seen`: cameras to draw, as the arguments of `_frustums` after the tile; None for no
-    cameras.
+    None for the points of `path`. `seen`: cameras to draw, None for no cameras: their places (K, 3), the corners of
+    their frustums (K, 4, 3), both in metres, and the axes of the view (2, 3).
     """
     room = path if every is None else every
     low, high = room.min(axis=0), room.max(axis=0)

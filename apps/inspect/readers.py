@@ -82,7 +82,7 @@ def _drawn_body(vertices: F32) -> Image.Image:
 
 
 def inspect_avatar(path: Path) -> Inspection:
-    """Describe an avatar. `path`: its folder or manifest. Raises BadInputError if the bundle is not usable."""
+    """Describe an avatar. `path`: its bundle's folder or manifest. Raises BadInputError if the bundle is not usable."""
     folder = path if path.is_dir() else path.parent
     bundle = load_bundle(folder)
     found = bundle_facts(bundle)
