@@ -132,7 +132,7 @@ def train(
 
 
 def _require_torch() -> None:
-    """Raise MissingPartError with commands that install the missing packages, if training lacks a package."""
+    """Raise MissingPartError if a package that training needs is missing. The error says how to install it."""
     missing = [name for name in ("torch", "scipy", "skimage") if not machine.here.has_package(name)]
     if "torch" in missing:
         lines = f"{package_line('torch')} --index-url {CPU_INDEX} (CPU) or {package_line('torch')} (NVIDIA GPU)"

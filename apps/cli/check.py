@@ -78,7 +78,7 @@ def _checked(file: str, profile: str | None) -> tuple[dict[str, Any], str]:
     If `file` is a pipeline file, this text is empty. `file`: pipeline file, or name or file of a scene.
     `profile`: chip whose times the stages of a scene get; None for stages without times.
 
-    Raises BadInputError for a faulty file, and for a `profile` beside a pipeline file. Raises MissingPartError for a
+    Raises BadInputError for a faulty file, and for a `profile` with a pipeline file. Raises MissingPartError for a
     scene whose run needs a part that is not installed.
     """
     from trilane.apps.check.checked import check_file, check_scene, is_scene

@@ -99,7 +99,7 @@ def show_networks(chip: Profile, options: PredictOptions, answers: list[dict[str
 
 
 def _compared_units(answers: list[dict[str, Any]]) -> Table:
-    """Return a table with a row for each network on each unit. `answers`: answers of `predict_network`."""
+    """Return a table with a row for each network on each unit. `answers`: predictions of `predict_network`."""
     from rich.table import Table
 
     table = Table("network", "unit", "numbers", "ms", "80 %, ms", "a second", "W", "rate")

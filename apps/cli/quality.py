@@ -115,7 +115,7 @@ def _refuse_without_by_cause(options: dict[str, Path | None]) -> None:
 
 
 def _refuse_other_comparisons(hard_cases: bool, runtimes: list[str]) -> None:
-    """Raise BadInputError if --hard-cases or several runtimes stand beside --by-cause, which examines one run."""
+    """Raise BadInputError if --hard-cases or several runtimes are given with --by-cause, which examines one run."""
     if hard_cases:
         raise BadInputError("--by-cause", "--hard-cases beside it", "one of them")
     if len(runtimes) > 1:
@@ -124,7 +124,10 @@ def _refuse_other_comparisons(hard_cases: bool, runtimes: list[str]) -> None:
 
 
 def _refuse_a_scene(scene: str, options: dict[str, object]) -> None:
-    """Raise BadInputError for a scene or its options beside --hard-cases, because hard cases have their own inputs."""
+    """Raise BadInputError if a scene or an option of a scene is given with --hard-cases, which has its own inputs.
+
+    `scene`: value of the argument. `options`: values by spelling; None for an option that is not given.
+    """
     asked = [name for name, value in options.items() if value is not None]
     if scene != SCENE or asked:
         found = ", ".join(asked) or scene

@@ -248,7 +248,10 @@ def _pace(pace: PaceComparison) -> str:
 
 
 def _check(check: Check) -> list[str]:
-    """Return a line for each comparison in `check`: two lines if truth and float path were compared, else one line."""
+    """Return a line with the image errors that `check` measured against the truth or, if unknown, the float path.
+
+    If `check` compared with both, a second line has the errors against the float path.
+    """
     errors = [check, *([check.float_path] if check.float_path else [])]
     return [f"of this run, {check.frames} frames against {_errors(each)} ({MEASURED})" for each in errors]
 

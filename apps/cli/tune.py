@@ -165,7 +165,7 @@ def _space(words: Sequence[str], axes: Sequence[str], chip: str | None) -> tuple
     `words`: sweep file, or command with its options; if empty, the command is `run`, or `predict` with a chip.
     `axes`: values of --axis, as typed. `chip`: value of --on; None if not given.
 
-    Raises BadInputError for a wrong or repeated --axis, and for a chip beside another command than `predict`.
+    Raises BadInputError for a wrong or repeated --axis, and for a chip with another command than `predict`.
     """
     from trilane.apps.sweep.tuner import Space
     from trilane.hw_profiles.profile_files import load_runnable

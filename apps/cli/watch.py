@@ -257,7 +257,7 @@ def heading(look: RunLook) -> str:
 
 
 def ending(look: RunLook) -> str:
-    """Return a sentence that says how a run has ended. The run went on at the look before `look`."""
+    """Return a sentence that says how a run has ended. `look`: first figures since the end of the run."""
     return f"run {look.name}: {ENDINGS[look.state]}"
 
 
