@@ -87,7 +87,10 @@ def _draw(found: Any, out: Path | None) -> Path | None:
 
 
 def lines(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines that `trilane inspect` prints without `--json`. `document`: what it prints with `--json`."""
+    """Yield the lines that `trilane inspect` prints without `--json`.
+
+    `document`: document of `trilane inspect --json`.
+    """
     yield f"{document['file']}: {document['what']}"
     rows = {
         "not usable": document["problem"],

@@ -1,7 +1,7 @@
 """`trilane predict`: predictions for a configuration, a table of configurations, a pipeline file or several pipelines.
 
-`trilane predict FILE.toml` predicts a pipeline file, and `trilane predict SCENE --beside …` several pipelines on one
-chip.
+`trilane predict FILE.toml` predicts a pipeline file. `trilane predict SCENE --beside …` predicts several pipelines that
+share one chip.
 
 Rule: this module reads options and shows results; every figure comes from `trilane.hw_profiles`. `predict_output.py`
 shows the predictions for a configuration or a table.

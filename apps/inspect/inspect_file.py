@@ -131,9 +131,9 @@ def inspect_file(path: Path) -> Inspection:
 
 
 def _other(path: Path) -> Inspection:
-    """Return the inspection of an unknown file.
+    """Return UNKNOWN. For a JSON file that does not parse, return an inspection that says so.
 
-    A broken JSON file is called a broken JSON file, because it may be a damaged file of a known kind.
+    Such a file may be a damaged file of a known kind.
     """
     if path.suffix.lower() != ".json":
         return UNKNOWN
