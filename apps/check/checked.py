@@ -1,8 +1,10 @@
-"""The document of `trilane check` about a pipeline file: stages, streams, least period, memory. Also its drawing.
+"""Checks a pipeline file or a scene: the document of `trilane check`, and the drawing of the graph.
 
-Rule: nothing runs here, and no Python of the file is imported. A scene is checked as the pipeline of its run, written
-as a pipeline file. If a chip is given, the stages get times as in `trilane predict SCENE`. The modules of scenes and
-avatars take longer to import than the rest, so only the check of a scene imports them.
+The document states stages, streams, least period and memory. A scene is checked as the pipeline of its run, written as
+a pipeline file. If a chip is given, the stages get times as in `trilane predict SCENE`.
+
+Rule: nothing runs here, and no Python of the file is imported. The modules of scenes and avatars take longer to import
+than all other modules. Therefore only the check of a scene imports them.
 
 The drawing has a lane for each unit, a box for each stage and a line for each input. A dashed line is an input that
 takes the newest frame. A dotted line is the bypass. The stages that determine the period have a thick border.
@@ -48,13 +50,16 @@ DIGITS: Final = 6  # behind the point of a time in ms, because the scheduler cou
 def check_file(path: Path) -> dict[str, Any]:
     """Check a pipeline file, its networks and its ports, and return what `trilane check --json` prints.
 
-    Raises BadInputError.
+    Raises BadInputError for the first fault in these files.
     """
     return _document_of(read_pipeline(path))
 
 
 def _document_of(file: PipelineFile) -> dict[str, Any]:
-    """Return the result of `check_file` for a file that is already read. Raises BadInputError."""
+    """Return the result of `check_file` for the pipeline file `file`, which was read before.
+
+    Raises BadInputError for the first fault in its networks and ports.
+    """
     types = port_types(file, read_networks(file))
     prices = {name: price for name in file.stages if (price := given_price(file, name)) is not None}
     known = prices if len(prices) == len(file.stages) else None
@@ -100,9 +105,12 @@ def _stage(file: PipelineFile, name: str, price: StagePrice | None) -> dict[str,
 
 
 def _routes(file: PipelineFile, rules: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return the bypass, if any: its ends, the stages between them, and the share of frames that take the bypass.
+    """Return a list with the bypass as a mapping; an empty list if the file has no bypass.
 
-    `rules`: rule of each edge, by the stage that writes to it.
+    The keys are `from` and `to`: stages where the bypass begins and ends; `past`: names of the stages between the two;
+    `share`: share of the frames that take the bypass, None if the file does not state it.
+
+    `file`: pipeline file. `rules`: rule of each edge, by the stage that writes to the edge.
     """
     if file.bypass is None:
         return []
@@ -141,14 +149,18 @@ def _stream(file: PipelineFile, name: str, rule: str, types: PortTypes) -> dict[
 
 
 class CheckedScene(NamedTuple):
-    """The check of a scene. `document`: as from `check_file`, with `notes`. `text`: the scene's pipeline as a file."""
+    """The check of a scene.
+
+    `document`: result of `check_file` for the scene's pipeline, with the further key `notes`: list of sentences.
+    `text`: pipeline file that describes this pipeline.
+    """
 
     document: dict[str, Any]
     text: str
 
 
 def is_scene(text: str) -> bool:
-    """Return whether `text` is the name of a bundled scene, or of a TOML file without the tables of a pipeline."""
+    """Return whether `text` is the name of a bundled scene, or a TOML file without any table of a pipeline file."""
     from trilane.scene.schema import scene_names
 
     path = Path(text)
@@ -164,10 +176,12 @@ def is_scene(text: str) -> bool:
 
 
 def check_scene(text: str, profile: str | None = None) -> CheckedScene:
-    """Check a scene and return its pipeline. Raises BadInputError, or MissingPartError for a part that a run needs.
+    """Check a scene, and return the document of the check with the scene's pipeline.
 
     `text`: name of a bundled scene, or a file.
-    `profile`: chip for which the times of the stages are computed; without a chip, the stages have no times.
+    `profile`: chip for which the times of the stages are computed; None for stages without times.
+
+    Raises BadInputError for a faulty scene or chip, and MissingPartError if a part that a run needs is not installed.
     """
     from trilane.stages.avatar_pipeline import avatar_pipeline
     from trilane.stages.configure import configure
@@ -195,10 +209,13 @@ def check_scene(text: str, profile: str | None = None) -> CheckedScene:
 
 
 def _priced(text: str, profile: str) -> tuple[Mapping[str, float], Mapping[str, Any]]:
-    """Return two parts of the pipeline file: times of stages, and how many frames take the bypass.
+    """Return what a chip adds to the pipeline file of a scene: the stages' times, and a key of the bypass.
 
-    The first part has the mean time of a job by stage, in ms, over the frames that need the network. The second part
-    has the key `pattern` or `share` of the bypass. Raises BadInputError.
+    The times map each stage to the mean time of its jobs in ms, over the frames that need the network. The key of the
+    bypass is `pattern`: a text with `1` for each frame that takes the bypass, and `0` for each other frame. If no frame
+    takes the bypass, the key is `share` with the value 0.
+
+    `text`: name or file of the scene. `profile`: chip. Raises BadInputError for an unknown chip, and for this machine.
     """
     from trilane.apps.predict.asked_pipelines import asked, avatar
 
@@ -214,7 +231,11 @@ def _priced(text: str, profile: str) -> tuple[Mapping[str, float], Mapping[str, 
 
 
 def _said(profile: str | None, share: float | None) -> list[str]:
-    """Return notes on the source of the stages' times, and on the share of frames that take the bypass."""
+    """Return notes on the source of the stages' times, and on the frames that take the bypass.
+
+    `profile`: chip of the times; None for stages without times. `share`: share of the frames that take the bypass; None
+    if unknown.
+    """
     if profile is None or share is None:
         return ["without times: --profile CHIP adds the times of a chip"]
     said = f"times are means of {profile}, {SUSTAINED}, for frames that the network paints"
@@ -230,7 +251,7 @@ STYLE: Final = "font-family='sans-serif' font-size='12'"
 
 
 def draw_graph(document: Mapping[str, Any]) -> str:
-    """Return the drawing of a pipeline as an SVG. `document`: result of `check_file`."""
+    """Return the drawing of a pipeline as the text of an SVG file. `document`: result of `check_file`."""
     columns = _columns(document)
     rows = _rows(document, columns)
     tops, height = _lanes(document, rows)
@@ -254,7 +275,10 @@ def draw_graph(document: Mapping[str, Any]) -> str:
 
 
 def _columns(document: Mapping[str, Any]) -> dict[str, int]:
-    """Return the column of each stage: to the right of every stage that it reads."""
+    """Return the number of each stage's column, by the stage's name. Column 0 is on the left.
+
+    A stage stands to the right of every stage that it reads.
+    """
     found: dict[str, int] = {}
     for stage in document["stages"]:
         before = [found[each["from"].partition(".")[0]] for each in stage["in"]]
@@ -263,7 +287,11 @@ def _columns(document: Mapping[str, Any]) -> dict[str, int]:
 
 
 def _rows(document: Mapping[str, Any], columns: Mapping[str, int]) -> dict[str, tuple[str, int]]:
-    """Return each stage's unit, and its row in the unit's lane. Stages in one lane and column get different rows."""
+    """Return a pair for each stage, by its name: its unit, and its row in the lane of the unit, from 0 at the top.
+
+    Stages in one lane and column get different rows. `document`: result of `check_file`. `columns`: result of
+    `_columns`.
+    """
     used: dict[tuple[str, int], int] = {}
     found = {}
     for stage in document["stages"]:
@@ -274,7 +302,10 @@ def _rows(document: Mapping[str, Any], columns: Mapping[str, int]) -> dict[str, 
 
 
 def _lanes(document: Mapping[str, Any], rows: Mapping[str, tuple[str, int]]) -> tuple[dict[str, int], int]:
-    """Return the y coordinate of the top of each unit's lane, and the height of the drawing, both in pixels."""
+    """Return the y coordinate of the top of each unit's lane, by unit, and the height of the drawing, in pixels.
+
+    `document`: result of `check_file`. `rows`: result of `_rows`.
+    """
     tops, top = {}, TOP
     for unit in document["units"]:
         tops[unit] = top

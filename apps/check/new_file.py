@@ -1,7 +1,8 @@
 """Writes a runnable pipeline file for networks on a video. Sizes and rate are read from the video and the networks.
 
 Each network has its own branch, which gets every frame of the video. A stage `prepare` makes the network's input, and a
-stage `discard` takes the output. Stages in comments write a video of the output. The user can then join the branches.
+stage `discard` takes the output. Further stages, in comments, would write a video of the output. The user can edit the
+file to join the branches.
 """
 
 from __future__ import annotations
@@ -35,13 +36,14 @@ def write_new_file(
     unit: str = "dsp",
     shapes: Mapping[str, tuple[int, ...]] | None = None,
 ) -> str:
-    """Write the file `out`, and return its text.
+    """Write the pipeline file `out`, and return its text.
 
-    `networks`: ONNX files. `video`: video file. All must lie in the folder of `out` or below it.
-    `unit`: unit of all networks, cpu, gpu or dsp.
-    `shapes`: shapes of inputs whose sizes the networks leave open, by the input's name.
-    Raises BadInputError if `out` exists, if another file cannot be read or lies elsewhere, or if a network takes no
-    picture or has no weights. After an error, `out` does not exist.
+    `networks`: ONNX files. `video`: video file. Networks and video must lie in the folder of `out`, or below it.
+    `unit`: unit of all networks: cpu, gpu or dsp.
+    `shapes`: shapes of inputs whose sizes the networks leave open, by the input's name; None for no such inputs.
+
+    Raises BadInputError if `out` exists, if a network or the video cannot be read, or if one of them lies elsewhere.
+    Raises it also for a network that takes no picture or has no weights. After an error, no new file is left.
     """
     if out.exists():
         raise BadInputError(out, "a file that exists", "another name, as nothing is overwritten")
@@ -72,9 +74,12 @@ def write_new_file(
 def _branch(
     network: Path, folder: Path, unit: str, names: set[str], shapes: Mapping[str, tuple[int, ...]]
 ) -> list[str]:
-    """Return the lines of a network's branch. `names`: names of all stages so far; the branch's names are added.
+    """Return the lines of a network's branch in the pipeline file.
 
-    `folder`: folder of the pipeline file. `shapes`: as in `write_new_file`. Raises BadInputError.
+    `network`: ONNX file. `folder`: folder of the pipeline file. `unit`: unit of the network. `names`: names of all
+    stages so far, to which the names of this branch are added. `shapes`: as in `write_new_file`.
+
+    Raises BadInputError for a network that `write_new_file` refuses.
     """
     graph = read_graph(network, dict(shapes))
     require_weights(graph, network)
@@ -100,9 +105,11 @@ def _branch(
 
 
 def _free_name(stem: str, endings: Sequence[str], names: set[str]) -> str:
-    """Return a name for the stage of the network file `stem`, with a number if the name is taken.
+    """Return a free name for the stage of a network, and add the names of its branch to `names`.
 
-    With each of `endings`, the name is one of a stage of the branch. Those are added to `names`.
+    The name is `stem`, with a number if a name of the branch is taken. `stem`: name of the network file without ending.
+    `endings`: one text for each stage of the branch; the stage is called by the returned name and this text.
+    `names`: names that are taken.
     """
     head = re.sub(r"[^\w-]", "-", stem, flags=re.ASCII) or "network"
     for number in count(1):
@@ -116,10 +123,10 @@ def _free_name(stem: str, endings: Sequence[str], names: set[str]) -> str:
 
 
 def _video_of(name: str, found: str, of: PortType | None) -> list[str]:
-    """Return lines of stages that write a video of a network's output, after a line that explains their use.
+    """Return a line of explanation, and the lines of two stages that write a video of a network's output.
 
-    `name`: stage of the network. `found`: `STAGE.OUTPUT`, quoted. `of`: type of this output. If `overlay` cannot draw
-    this type, the result is one line that says so.
+    If the block `overlay` cannot draw the output, the result is one line with advice instead. `name`: stage of the
+    network. `found`: `STAGE.OUTPUT`, quoted. `of`: type of this output; None if no port can carry it.
     """
     shape = of.shape if of is not None else ()
     is_plane = len(shape) == 4 and sum(size > 1 for size in shape) in (2, 3)
@@ -137,7 +144,10 @@ def _video_of(name: str, found: str, of: PortType | None) -> list[str]:
 
 
 def _picture_input(network: Path, name: str, of: PortType | None) -> str:
-    """Return `name` if this input of `network` is a picture. `of`: type of the input. Raises BadInputError."""
+    """Return `name`, the name of an input of `network`. Raises BadInputError if this input takes no picture.
+
+    `of`: type of the input; None if no port can carry it.
+    """
     shape = of.shape if of is not None else ()
     if len(shape) != 4 or not {shape[1], shape[3]} & set(NETWORK_CHANNELS):
         expected = "a picture, 1xCxHxW or 1xHxWxC with 1 or 3 channels"
@@ -156,7 +166,10 @@ def _inside(path: Path, folder: Path) -> str:
 
 
 def _video(path: Path) -> tuple[int, int, float]:
-    """Return width and height of a video in pixels, and its rate in frames a second. Raises BadInputError."""
+    """Return the width and height of a video in pixels, and its rate in frames a second (30 if unknown).
+
+    Raises BadInputError for a file that PyAV cannot read.
+    """
     require_file(path, A_VIDEO)
     try:
         with av.open(str(path), metadata_errors="replace") as container:

@@ -1,9 +1,10 @@
-"""The types of a pipeline file's ports: as the file states them, as its networks define them, or as blocks imply.
+"""The types of a pipeline file's ports: stated by the file, defined by its networks, or implied by its blocks.
 
     types = port_types(file, read_networks(file))
     types["camera"][""].shape  # (480, 640, 3)
 
-Rule: a port of the user's own code may have no known type. Types that are known must fit together.
+Rule: the type of a port of the user's own code may be unknown. If the types at both ends of a connection are known,
+they must fit each other.
 """
 
 from __future__ import annotations
@@ -47,9 +48,10 @@ BARE_REMEDY = "export it with its weights; `trilane check` and `trilane predict`
 
 
 def read_networks(file: PipelineFile) -> dict[str, GraphFile]:
-    """Return the network of each stage that has one, by the stage's name.
+    """Return the network of each stage with an ONNX file, by the stage's name.
 
-    Raises BadInputError, also if a network's input gets no stream, or if the file names a port that a network lacks.
+    Raises BadInputError if a network cannot be read, or if an input of a network gets no stream. Raises it also if the
+    file names a port that a network lacks.
     """
     found = {}
     for name, stage in file.stages.items():
@@ -64,9 +66,9 @@ def read_networks(file: PipelineFile) -> dict[str, GraphFile]:
 
 
 def require_weights(graph: GraphFile, where: str | Path) -> None:
-    """Raise BadInputError if weights of the network have no values, because no runtime can run it then.
+    """Raise BadInputError if a weight of the network has no values, because no runtime can run such a network.
 
-    `where`: place in the pipeline file, or network file, that the message names.
+    `graph`: network. `where`: place that the message names: a key of the pipeline file, or the network file.
     """
     held = {each.name for each in graph.model.graph.initializer} | {each.name for each in fed_inputs(graph)}
     if bare := [value.name for value in graph.model.graph.input if value.name not in held]:
@@ -90,9 +92,10 @@ def _read(file: PipelineFile, name: str, stage: OnnxStage) -> GraphFile:
 
 
 def _check_names(file: PipelineFile, name: str, stage: OnnxStage, graph: GraphFile) -> None:
-    """Raise BadInputError unless stage `name` feeds all inputs of its network, and nothing that the network lacks.
+    """Raise BadInputError if an input of the network of stage `name` gets no stream, or if a key names no input.
 
-    A stream may also feed a weight that has no values.
+    The keys are `in` and `shapes`. A stream may also feed an input that stands for a weight. `file`: pipeline file.
+    `stage`: keys of the stage. `graph`: network of the stage.
     """
     where, inputs = f"{file.path}: stages.{name}", [value.name for value in graph.model.graph.input]
     wanted = [value.name for value in fed_inputs(graph)]
@@ -120,7 +123,11 @@ def _check_names(file: PipelineFile, name: str, stage: OnnxStage, graph: GraphFi
 
 
 def _check_fixed(where: str, stage: OnnxStage, graph: onnx.GraphProto) -> None:
-    """Raise BadInputError if `shapes` of the stage changes a size that the network fixes. No runtime accepts that."""
+    """Raise BadInputError if the key `shapes` changes a size that the network fixes. No runtime accepts such a change.
+
+    `where`: place of the stage in the pipeline file, for the message. `stage`: keys of the stage. `graph`: network of
+    the stage, without the changes of `shapes`.
+    """
     for value in graph.input:
         own = [size.dim_value for size in value.type.tensor_type.shape.dim]
         given = stage.shapes.get(value.name, ())
@@ -131,7 +138,11 @@ def _check_fixed(where: str, stage: OnnxStage, graph: onnx.GraphProto) -> None:
 
 
 def _check_output(file: PipelineFile, name: str, each: PortInput, outputs: list[str]) -> None:
-    """Raise BadInputError if stage `name` reads a port that is none of a network's `outputs`. `each`: this input."""
+    """Raise BadInputError if an input of stage `name` reads a port that is no output of a network.
+
+    `file`: pipeline file. `each`: input that reads from the stage of a network. `outputs`: names of the outputs of this
+    network.
+    """
     where = f"{file.path}: stages.{name}.in" + (f".{each.port}" if each.port else "")
     if each.from_port and each.from_port not in outputs:
         found = f"the unknown port {each.from_port!r} of {each.stage}"
@@ -140,9 +151,11 @@ def _check_output(file: PipelineFile, name: str, each: PortInput, outputs: list[
 
 
 def port_types(file: PipelineFile, networks: Mapping[str, GraphFile]) -> PortTypes:
-    """Return the types of all ports whose type is known. `networks`: result of `read_networks`.
+    """Return the types of all ports whose type is known: name of the stage -> name of the port -> type.
 
-    Raises BadInputError if a stage cannot read what it gets.
+    `file`: pipeline file. `networks`: result of `read_networks`.
+
+    Raises BadInputError if a stage cannot read the type of a port that it reads.
     """
     found: PortTypes = {}
     for name, stage in file.stages.items():
@@ -155,9 +168,10 @@ def port_types(file: PipelineFile, networks: Mapping[str, GraphFile]) -> PortTyp
 
 
 def _check_bypass(file: PipelineFile, types: PortTypes) -> None:
-    """Raise BadInputError if the stage where the bypass begins lacks a port that the stage where it ends reads.
+    """Raise BadInputError if the first stage of the bypass lacks a port that the last stage of the bypass reads.
 
-    A port of another type counts as lacking. A stage with Python or a set time, `busy` and `discard` need no port.
+    A port of the right name and another type counts as lacking. No port is needed if the last stage is Python code, a
+    stage with a set time, or a block `busy` or `discard`. `file`: pipeline file. `types`: types of all known ports.
     """
     if file.bypass is None:
         return
@@ -179,9 +193,11 @@ def _check_bypass(file: PipelineFile, types: PortTypes) -> None:
 def _written(
     stage: StageKeys, known: PortTypes, network: GraphFile | None, networks: Mapping[str, GraphFile]
 ) -> dict[str, PortType]:
-    """Return the types of a stage's ports; empty if they are unknown. `known`: types of the earlier stages' ports.
+    """Return the types of the ports that a stage writes, by port; empty if they are unknown.
 
-    `network`: network of this stage, if any. `networks`: networks of all stages.
+    `stage`: keys of the stage. `known`: types of the earlier stages' ports. `network`: network of the stage; None for a
+    stage without a network.
+    `networks`: networks of all stages, by stage.
     """
     if stage.out is not None:
         return stage.out
@@ -203,7 +219,7 @@ def _written(
 
 
 def source_type(each: PortInput, known: PortTypes) -> PortType | None:
-    """Return the type of the port that an input reads; None if it is unknown. `known`: types of the known ports."""
+    """Return the type of the port that the input `each` reads; None for an unknown type. `known`: all known types."""
     ports = known.get(each.stage, {})
     if each.from_port:
         return ports.get(each.from_port)
@@ -222,14 +238,18 @@ def value_type(value: onnx.ValueInfoProto) -> PortType | None:
 
 
 def is_picture(port: PortType) -> bool:
-    """Return whether a port carries a picture: bytes, height x width x channels."""
+    """Return whether a port carries a picture: bytes of shape (height, width, channels) with 1, 3 or 4 channels."""
     return port.dtype == "u8" and len(port.shape) == 3 and port.shape[2] in PICTURE_CHANNELS
 
 
 def _check_inputs(
     file: PipelineFile, name: str, stage: StageKeys, known: PortTypes, networks: Mapping[str, GraphFile]
 ) -> None:
-    """Raise BadInputError if stage `name` cannot read a port. `known`: types of the known ports of earlier stages."""
+    """Raise BadInputError if stage `name` cannot read a port, because of the type of this port.
+
+    `file`: pipeline file. `stage`: keys of the stage. `known`: types of the known ports of earlier stages.
+    `networks`: networks of all stages, by stage.
+    """
     for each in stage.inputs:
         found = source_type(each, known)
         if found is None:
@@ -249,9 +269,11 @@ def _check_inputs(
 
 
 def _check_network(where: str, found: PortType, each: PortInput, network: GraphFile) -> None:
-    """Raise BadInputError unless the network's input has type `found`, or both are pictures.
+    """Raise BadInputError if a network cannot take a port of type `found` as its input.
 
-    `each`: input of the stage that reads a port of this type.
+    A network takes a port with numbers of the same kind and count, whatever their shape. An input for pictures takes
+    other pictures too, if they can be prepared. `where`: place in the pipeline file, for the message. `each`: input of
+    the stage that reads the port. `network`: network of this stage.
     """
     inputs = network.model.graph.input if each.port else fed_inputs(network)
     value = next(one for one in inputs if each.port in ("", one.name))

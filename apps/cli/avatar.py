@@ -182,7 +182,11 @@ app.command(epilog=avatar_network.EPILOG_EXPORT)(avatar_network.export)
 
 
 def _checked(capture: Capture, picture: Path) -> dict[str, Any]:
-    """Check `capture`, write the sheet with the fits to the file `picture`, and return facts. Raises BadInputError."""
+    """Check `capture`, write a sheet of fits to the file `picture`, and return the facts that the command prints.
+
+    The sheet shows the fits of some frames, each over the picture of its frame.
+    Raises BadInputError if the fits do not match the masks.
+    """
     from trilane.training.capture.capture_samples import BodyRaster
     from trilane.training.capture.check import (
         bad_frames,
@@ -213,7 +217,7 @@ def _checked(capture: Capture, picture: Path) -> dict[str, Any]:
 
 
 def _state_cost(capture: SyntheticCapture, recipe: Recipe) -> None:
-    """Print the estimated time, disk space and memory for all frames on stderr, after measuring one frame."""
+    """Measure one frame. Print the estimated time and disk space of all frames, and the memory in use, on stderr."""
     import psutil
 
     from trilane.training.capture.synthetic import measured_cost
@@ -225,7 +229,10 @@ def _state_cost(capture: SyntheticCapture, recipe: Recipe) -> None:
 
 
 def _shape(text: str) -> Shape:
-    """Return (height, width) from the value WIDTHxHEIGHT of `--picture`. Raises BadInputError."""
+    """Return (height, width) in pixels from `text`, the value WIDTHxHEIGHT of `--picture`.
+
+    Raises BadInputError for another form, and for a side that is too short or too long.
+    """
     match = re.fullmatch(r"([0-9]{1,5})x([0-9]{1,5})", text)
     if match is None or not all(LEAST_SIDE <= int(side) <= MOST_SIDE for side in match.groups()):
         expected = f"WIDTHxHEIGHT in pixels, each from {LEAST_SIDE} to {MOST_SIDE}, such as 1280x720"
@@ -235,9 +242,10 @@ def _shape(text: str) -> Shape:
 
 @contextmanager
 def _tracked(text: str) -> Iterator[Callable[[Sequence[int], Iterable[Any]], Iterable[Any]]]:
-    """Yield a function `track(numbers, work)`. It iterates over `work`, with a progress bar if stderr is a terminal.
+    """Yield a function `track(numbers, work)` that yields the items of `work` and shows a progress bar.
 
-    `numbers`: sequence that is as long as `work`. `text`: label of the bar.
+    The bar is shown only if stderr is a terminal. `numbers`: any sequence that is as long as `work`. `text`: label of
+    the bar.
     """
     from rich.progress import Progress
 

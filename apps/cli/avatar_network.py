@@ -154,12 +154,12 @@ def export(
 
 
 def _both_sides(size: str) -> str:
-    """Return the size `S` as `SxS`; a size with both sides stays as it is."""
+    """Return `size` as HEIGHTxWIDTH: a single side `S` becomes `SxS`, and a size with both sides stays as it is."""
     return size if "x" in size else f"{size}x{size}"
 
 
 def _shape(size: str) -> Shape:
-    """Return (height, width) from the value HEIGHTxWIDTH of `--size`. Raises BadInputError."""
+    """Return (height, width) from the value HEIGHTxWIDTH of `--size`. Raises BadInputError for any other text."""
     from trilane.arrays import parse_shape
     from trilane.unexpected_value import UnexpectedValue
 
@@ -172,7 +172,11 @@ def _shape(size: str) -> Shape:
 def _untrained(
     encoder: str, norm: str, width: int, channels: int, shape: Shape, seed: int
 ) -> tuple[onnx.ModelProto, int]:
-    """Return a float network with random weights, and the number of its parameters. Raises MissingPartError."""
+    """Return a float network with random weights, and the number of its parameters.
+
+    `encoder`, `norm`, `width`, `channels`: as the options of these names. `shape`: (height, width) of the input.
+    `seed`: seed of the weights. Raises MissingPartError without PyTorch.
+    """
     try:
         import torch
     except ModuleNotFoundError as error:
@@ -187,7 +191,10 @@ def _untrained(
 
 
 def _write_parts(whole: NetworkFile, at: list[str], folder: Path) -> list[Path]:
-    """Cut the network `whole` at the tensors `at`, write the parts to `folder`, and return their files, in order."""
+    """Cut the network `whole` at the tensors `at`, write the parts to `folder`, and return their files.
+
+    The files are in the order in which the parts run. Raises BadInputError if `folder` cannot be made.
+    """
     from trilane.avatars.network_split import split as cut_at
     from trilane.writing import write_bytes
 
@@ -308,9 +315,13 @@ def calibrations(
 
 
 def _material(source: Path | None, frames: Path | None, avatar: str | None) -> tuple[Any, list[Any], int]:
-    """Return a float network, a list of inputs (H,W,C) float32, and how many inputs at its end are held out.
+    """Return a float network, a list of its inputs (H, W, C) float32, and the number of held-out inputs.
 
-    Raises BadInputError, MissingPartError.
+    The held-out inputs are the last of the list. `source`: file of the network. `frames`: file of the inputs.
+    `avatar`: avatar whose float network is used, on views drawn as in training. Either `avatar` or both files are
+    given; the others are None.
+
+    Raises BadInputError for any other choice and for a bad file, MissingPartError if a part for drawing is missing.
     """
     from trilane.avatars.network_file import parse_network
     from trilane.training.quantising.calibration_table import COUNTS, EVALUATED
@@ -326,9 +337,10 @@ def _material(source: Path | None, frames: Path | None, avatar: str | None) -> t
 
 
 def _write_layers(path: Path, model: Any, result: Any, frame: Any) -> Any:
-    """Compare each layer of the quantised network with the float one on `frame`; write a row for each, return the rows.
+    """Compare each layer of a quantised network with the float network, write a row for each layer, return the rows.
 
-    `path`: JSON file to write. `model`: float network. `result`: its quantised network, as `quantise_on` returns it.
+    `path`: JSON file to write. `model`: float network. `result`: quantised network, as `quantise_on` returns it.
+    `frame`: input (H, W, C) for both networks.
     """
     from trilane.training.quantising.noise_model import layer_report
     from trilane.writing import write_bytes
@@ -340,7 +352,10 @@ def _write_layers(path: Path, model: Any, result: Any, frame: Any) -> Any:
 
 
 def _frames(path: Path) -> list[Any]:
-    """Return the frames (H,W,C) float32 of a .npy file, at most `MAX_FRAMES` of them. Raises BadInputError."""
+    """Return the first `MAX_FRAMES` frames of a .npy file, each an array (H, W, C) float32.
+
+    Raises BadInputError unless the file has floats of the shape (N, H, W, C).
+    """
     import numpy as np
 
     from trilane.files import read_npy

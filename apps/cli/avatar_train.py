@@ -133,7 +133,7 @@ def train(
 
 
 def _require_torch() -> None:
-    """Raise MissingPartError with installation commands if a package for training is missing."""
+    """Raise MissingPartError if a package that training needs is missing. The error says how to install it."""
     missing = [name for name in ("torch", "scipy", "skimage") if not machine.here.has_package(name)]
     if "torch" in missing:
         lines = f"{package_line('torch')} --index-url {CPU_INDEX} (CPU) or {package_line('torch')} (NVIDIA GPU)"
@@ -144,7 +144,11 @@ def _require_torch() -> None:
 
 @contextmanager
 def _shown(log: EventLog | None) -> Iterator[_ShownTraining]:
-    """Yield a listener that shows a training on stderr, as bars on a terminal, else as lines, and writes to `log`."""
+    """Yield a listener that shows the progress of a training on stderr, and writes its losses to `log`.
+
+    A terminal shows bars. Without a terminal, stderr gets lines. `log`: log of losses, closed at the end of the `with`
+    block; None for no log.
+    """
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = stderr_console()
@@ -158,7 +162,10 @@ def _shown(log: EventLog | None) -> Iterator[_ShownTraining]:
 
 
 class _ShownTraining:
-    """Shows the progress of a training. It implements `trilane.training.train.Listener`."""
+    """Shows the progress of a training on `console`, as a `trilane.training.train.Listener`.
+
+    `progress`: bars for a terminal. `log`: log for TensorBoard, which gets all losses; None for no log.
+    """
 
     def __init__(self, console: Console, progress: Progress, log: EventLog | None) -> None:
         self._console, self._progress, self._log = console, progress, log
@@ -192,8 +199,8 @@ class _ShownTraining:
 class EventLog:
     """Writes the losses of a training into `folder` as a log for TensorBoard.
 
-    The first `write` makes the file. If a training continues from a saved state, the entries after that state are
-    removed.
+    The first `write` creates the log's file. If a training continues from a saved state, TensorBoard discards the
+    entries of steps after that state.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -201,7 +208,10 @@ class EventLog:
         self._writer: Any = None
 
     def write(self, step: int, terms: Mapping[str, float], loss: float) -> None:
-        """Log the unweighted `terms` of the loss at `step`, by name, and their weighted sum `loss`."""
+        """Log the loss of the training step `step`.
+
+        `terms`: unweighted terms of the loss, by name. `loss`: their weighted sum.
+        """
         if self._writer is None:
             self._writer = _writer(self._folder, step)
         self._writer.add_scalar("loss", loss, step)
@@ -215,7 +225,7 @@ class EventLog:
 
 
 def _writer(folder: Path, step: int) -> Any:
-    """Return TensorBoard's writer to `folder`. The entries of an earlier training from `step` on are discarded."""
+    """Return TensorBoard's writer to `folder`. Earlier entries of `step` and of later steps are discarded."""
     from torch.utils.tensorboard import SummaryWriter
 
     return SummaryWriter(str(folder), purge_step=step, flush_secs=FLUSH_S)
@@ -296,7 +306,10 @@ def validate(
 
 
 def _band_table(validation: Validation) -> Table:
-    """Return a table with a row for each band of zoom: errors with the first runtime, and loss by quantising."""
+    """Return a table of image errors with the first runtime, and of PSNR lost by quantising.
+
+    The rows are the bands of distances, from `far` to `face`.
+    """
     from rich.table import Table
 
     from trilane.avatars.validation import from_validation
@@ -318,7 +331,10 @@ def _band_table(validation: Validation) -> Table:
 
 
 def _size_table(by_size: BySize) -> Table:
-    """Return a table of PSNR in dB with a row for each size of the body and a column for each size of the tensor."""
+    """Return a table of PSNR in dB: a row for each size of the body in the picture, a column for each tensor size.
+
+    Both sizes are squares, given by their sides in pixels.
+    """
     from rich.table import Table
 
     from trilane.avatars.validation import from_validation
@@ -336,7 +352,8 @@ def _size_table(by_size: BySize) -> Table:
 def _validate(bundle: Bundle, plan: ValidationPlan, float_network: Path | None, sheet: Path | None) -> Bundle:
     """Validate `bundle`, write the figures into its manifest, and return the new bundle.
 
-    `float_network`: weights before quantising, to compare with. `sheet`: file for a picture of the worst views.
+    `plan`: views and runtimes to validate with. `float_network`: file of the weights before quantising, for a
+    comparison; None for no comparison. `sheet`: file for a picture of each seed's worst view; None for no picture.
     """
     from rich.progress import Progress
 
@@ -363,7 +380,8 @@ def _validate(bundle: Bundle, plan: ValidationPlan, float_network: Path | None, 
 def _add_sizes(bundle: Bundle, plan: ValidationPlan) -> Bundle:
     """Measure `bundle` at several tensor sizes, add the figures to its manifest, and return the new bundle.
 
-    Raises BadInputError if the bundle has no validation of its present files.
+    `plan`: views and runtime to measure with. Raises BadInputError if the present files of the bundle were not
+    validated.
     """
     from rich.progress import Progress
 
@@ -388,7 +406,10 @@ def _psnr_db(sample: Evaluated, plan: ValidationPlan) -> float:
 
 
 def _float_network(bundle: Bundle, weights: Path) -> FloatNetwork:
-    """Return the float network in the file `weights`, for `bundle`. Raises BadInputError, MissingPartError."""
+    """Return the float network of `bundle`, with the weights in the file `weights`.
+
+    Raises MissingPartError if a package for the network is missing, and BadInputError for wrong weights.
+    """
     try:
         from trilane.training.trainable_avatar import float_painter_of
     except ImportError as error:

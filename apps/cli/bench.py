@@ -2,7 +2,7 @@
 
 Rule: a bench is a line of `BENCHES` and a module with a function `measure`. The parameters of `measure` are the
 command's options, whose types follow from their defaults. The docstrings of the module and of `measure` are the help.
-An option has the same meaning in all benches, unless `MEANINGS` has a line for this bench and option.
+`MEANINGS` explains an option once for all benches. A line for one bench and option takes precedence.
 """
 
 from __future__ import annotations
@@ -134,7 +134,7 @@ MEANINGS = {
 
 
 def bench_command(name: str) -> Any:
-    """Return the command of bench `name`, with an option for each parameter of its `measure`."""
+    """Return the command of bench `name`. The command has an option for each parameter of the bench's `measure`."""
     module = importlib.import_module(BENCHES[name][0])
     measure = module.measure
 
@@ -169,16 +169,21 @@ def bench() -> None:
 
 
 def _help(name: str, module: ModuleType) -> str:
-    """Return the help of a bench: its line, the first paragraph of its module, and the docstring of `measure`."""
+    """Return the help of bench `name`: its line in `BENCHES`, a question and an answer.
+
+    The question is the first paragraph of the docstring of `module`. The answer is the docstring of `measure` up to the
+    word `Raises`.
+    """
     question = (inspect.getdoc(module) or "").split("\n\n")[0]
     answer = (inspect.getdoc(module.measure) or "").partition("Raises ")[0].rstrip()
     return f"{BENCHES[name][1]}\n\n{question}\n\n{answer}"
 
 
 def _option(bench: str, parameter: inspect.Parameter) -> Any:
-    """Return Typer's option for a parameter of `measure`. Its type is the type of the default.
+    """Return Typer's option for `parameter`, which is a parameter of `measure` in the module of bench `bench`.
 
-    If the default is a tuple, the option may be given several times, once for each value.
+    The option has the type of the parameter's default. If the default is a tuple, the option may be given several
+    times, once for each value.
     """
     default = parameter.default
     several = isinstance(default, tuple)
@@ -218,7 +223,7 @@ def show(name: str, measure: Callable[..., Mapping[str, Any]], asked: Mapping[st
 
 
 def flat(data: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `data` without nested mappings: the keys of inner mappings are joined by dots."""
+    """Return `data` without nested mappings. The key of an inner value is the outer key, a dot and the inner key."""
     joined: dict[str, Any] = {}
     for key, value in data.items():
         inner = flat(value) if isinstance(value, Mapping) else None
@@ -248,5 +253,5 @@ def _text(value: Any) -> str:
 
 
 def meaning(bench: str, option: str) -> str:
-    """Return the line in `--help` for `option` of `bench`. Raises KeyError if `MEANINGS` has none."""
+    """Return the line in `--help` for `option` of `bench`. Raises KeyError if `MEANINGS` has no such line."""
     return MEANINGS.get(f"{bench} {option}") or MEANINGS[option]

@@ -54,7 +54,10 @@ def inspect(path: BodyFileArgument, json: JsonOption = False) -> None:
 
 
 def body_facts(path: Path) -> dict[str, Any]:
-    """Return facts about a body file: counts, size and skinning weights. Raises BadInputError."""
+    """Return the facts that `trilane body inspect --json` prints: counts, size and skinning weights of a body.
+
+    Raises BadInputError if `path` is no usable body file.
+    """
     from trilane.body.body import load_body
     from trilane.body.skinning import WEIGHT_COUNTS, weight_error_bound
 
@@ -120,7 +123,8 @@ def _check_poses(path: Path, frames: NDArray[np.float64], expected: str) -> NDAr
 def _write_vertices(out: Path, shaped: ShapedBody, frames: NDArray[np.float64]) -> tuple[int, int, int]:
     """Write the vertices of every pose to the file `out` (.npy), and return the shape (T, V, 3) of the array.
 
-    `frames`: poses (T, 165), axis-angle. Raises BadInputError.
+    The array is float32, in metres. `shaped`: body to pose. `frames`: poses (T, 165), axis-angle, radians.
+    Raises BadInputError if `out` cannot be written.
     """
     import numpy as np
 
@@ -140,7 +144,7 @@ def _write_vertices(out: Path, shaped: ShapedBody, frames: NDArray[np.float64]) 
 
 
 def _check_place(path: Path, size: int) -> None:
-    """Raise BadInputError if no file of `size` bytes can be written to `path`."""
+    """Raise BadInputError if `path` is a folder, or if its own folder is absent or lacks space for `size` bytes."""
     if path.is_dir():
         raise BadInputError(path, "a folder", "a file in a folder", OTHER_OUT)
     if not path.parent.is_dir():

@@ -73,9 +73,13 @@ def check(file: FileArgument, svg: SvgOption = None, profile: ProfileOption = No
 
 
 def _checked(file: str, profile: str | None) -> tuple[dict[str, Any], str]:
-    """Return the document for `--json`, and a scene's pipeline as the text of a pipeline file ("" for such a file).
+    """Return the document for `--json`, and the text of a pipeline file that describes the pipeline of a scene.
 
-    `profile`: chip for the times of a scene; not allowed with a pipeline file. Raises BadInputError, MissingPartError.
+    If `file` is a pipeline file, this text is empty. `file`: pipeline file, or name or file of a scene.
+    `profile`: chip whose times the stages of a scene get; None for stages without times.
+
+    Raises BadInputError for a faulty file, and for a `profile` with a pipeline file. Raises MissingPartError for a
+    scene whose run needs a part that is not installed.
     """
     from trilane.apps.check.checked import check_file, check_scene, is_scene
     from trilane.errors import BadInputError
@@ -100,7 +104,7 @@ def _head(document: Mapping[str, Any]) -> str:
 
 
 def _stages(document: Mapping[str, Any]) -> Table:
-    """Return a table of the stages, grouped by unit. `document`: result of `check_file`."""
+    """Return a table with a row for each stage, grouped by unit. `document`: result of `check_file`."""
     from rich.markup import escape
     from rich.table import Table
 

@@ -64,7 +64,11 @@ class OnceCommand(TyperCommand):
 
 
 def _refuse_empty(parameter: Any, typed: str | Sequence[str] | None) -> None:
-    """Raise BadInputError for an empty path or argument, which Typer would read as `.`. `typed`: words as typed."""
+    """Raise BadInputError for an empty path, which Typer would read as `.`, and for an empty text of an argument.
+
+    `parameter`: Typer's option or argument. `typed`: value as typed; a sequence if the parameter takes several values,
+    None if the parameter is not on the command line.
+    """
     kinds = [*_kinds(parameter.type_descriptor.annotation)]
     names_a_thing = parameter.param_type_name == "argument" and str in kinds
     texts = [typed] if isinstance(typed, str) else typed or ()
@@ -82,7 +86,8 @@ def _kinds(kind: Any) -> Iterator[Any]:
 def _wrong_value(parameter: Any, error: ValidationError, model: type[Options] | None) -> BadInputError:
     """Return the error about the value of an option or argument that pydantic has refused.
 
-    `parameter`: Typer's option or argument. `error`: pydantic's error. `model`: class of the command's options.
+    `parameter`: Typer's option or argument. `error`: pydantic's error. `model`: class of the command's options; None
+    for a command without such a class.
     """
     first, kind = error.errors()[0], parameter.type_descriptor.annotation
     where = parameter.opts[0]
@@ -98,29 +103,32 @@ def _wrong_value(parameter: Any, error: ValidationError, model: type[Options] | 
 
 
 def _may_be_repeated(option: TyperOption) -> bool:
-    """Return whether an option may be repeated: it collects or counts, or is a flag without an opposite."""
+    """Return whether `option` may be repeated: an option that collects or counts values, or a flag without opposite."""
     return option.multiple or option.count or (option.is_flag and not option.secondary_opts)
 
 
 def given(ctx: typer.Context) -> set[str]:
-    """Return the names of the parameters that stand on the command line."""
+    """Return the names of the command's parameters that the user has given on the command line."""
     sources = {name: ctx.get_parameter_source(name) for name in ctx.params}
     return {name for name, source in sources.items() if source is not None and source.name == "COMMANDLINE"}
 
 
 class Commands(typer.Typer):
-    """A Typer application without markup and shell completion; its commands are `OnceCommand`s."""
+    """A Typer application without markup and shell completion. Each of its commands is a `OnceCommand`."""
 
     def __init__(self, **settings: Any) -> None:
         super().__init__(rich_markup_mode=None, add_completion=False, **settings)
 
     def command(self, name: str | None = None, **settings: Any) -> Callable[[Any], Any]:
-        """Register a command as `typer.Typer.command` does."""
+        """Return a decorator that registers a function as a `OnceCommand`.
+
+        `name`: name of the command; None for the name of the function. `settings`: as for `typer.Typer.command`.
+        """
         return super().command(name, cls=OnceCommand, **settings)
 
 
 def _described(model: type[Options], name: str) -> Any:
-    """Return Typer's option or argument for field `name` of `model`. Its callback checks the value with the field."""
+    """Return Typer's option or argument for field `name` of `model`. `model` checks each value on the command line."""
     field = model.model_fields[name]
     option = option_of(field)
 
@@ -140,11 +148,12 @@ def _described(model: type[Options], name: str) -> Any:
 def with_options(
     model: type[Options], names: Collection[str] | None = None
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Return a decorator for a command whose first parameter is a `model`. Each field becomes an option.
+    """Return a decorator for a command whose first parameter is an instance of `model`. Each field becomes an option.
 
-    Typer reads a command's options from its signature, so the decorator builds one with a parameter for each field. The
-    command gets a `model` in which only fields from the command line count as set.
-    `names`: fields that become options; all if None.
+    Typer reads the options of a command from its signature. Therefore the decorator builds a signature with a parameter
+    for each field. In the instance that the command gets, only fields from the command line count as set.
+
+    `model`: class of the command's options. `names`: names of the fields that become options; None for all fields.
     """
     fields = [name for name in model.model_fields if names is None or name in names]
 

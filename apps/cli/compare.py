@@ -3,9 +3,10 @@
 Rule: this module reads options and shows results; every figure comes from `trilane.apps.compare`. The verdict comes
 first, followed by its evidence and the uncertain figures.
 
-A gate may also write annotations for GitHub and a summary in Markdown (docs.github.com, "Workflow commands for GitHub
-Actions" and "Adding a job summary"). Texts from files are escaped there, so that none acts as a command or as Markdown.
-Annotations go to stderr, which GitHub reads too, so that stdout stays one document with --json.
+With `--github`, a gate writes annotations for GitHub and a summary in Markdown. Their formats are described at
+docs.github.com, in "Workflow commands for GitHub Actions" and "Adding a job summary". Texts from files are escaped in
+annotations and summary, so that no text acts as a command or as Markdown. Annotations go to stderr, which GitHub reads
+too. Therefore stdout has one document with `--json`.
 """
 
 from __future__ import annotations
@@ -175,7 +176,7 @@ def _gates(asked: Sequence[str], slower: str | None) -> list[Gate]:
 
 
 def _say(judged: Sequence[JudgedLimit]) -> None:
-    """Print the outcome of each limit on stderr."""
+    """Print a line for each limit on stderr: its outcome and the reason. With several runs, the line names the run."""
     several = len({each.name for each in judged}) > 1
     for each in judged:
         said = without_controls(f"{each.name}: {each.said}" if several else each.said)
@@ -183,7 +184,7 @@ def _say(judged: Sequence[JudgedLimit]) -> None:
 
 
 def _leave(judged: Sequence[JudgedLimit]) -> None:
-    """Raise typer.Exit with the exit code of the gate, unless all limits are kept."""
+    """Raise typer.Exit with BROKEN if a limit is broken, or with CANNOT_TELL if a limit is undecided."""
     from trilane.apps.compare.gate import LimitOutcome, whole
 
     codes = {LimitOutcome.KEPT: 0, LimitOutcome.BROKEN: BROKEN, LimitOutcome.UNKNOWN: CANNOT_TELL}
@@ -246,7 +247,10 @@ LEFT_OUT = {
 
 
 def sweep_lines(comparison: SweepComparison, show_all: bool) -> Iterator[str | Table]:
-    """Yield the texts and tables that compare two sweeps. `show_all`: whether to show trials that do not differ."""
+    """Yield the texts and tables that show `comparison`, the comparison of two sweeps.
+
+    `show_all`: whether to show all pairs of trials. If False, only pairs that surely differ are shown.
+    """
     from trilane.apps.compare.compared_sweeps import METHOD
 
     yield f"{comparison.other} beside {comparison.base}: {len(comparison.pairs)} trials of equal configuration"
@@ -269,7 +273,11 @@ def sweep_lines(comparison: SweepComparison, show_all: bool) -> Iterator[str | T
 
 
 def _trial_table(pairs: Sequence[TrialPair]) -> Table:
-    """Return a table of pairs of trials: options that vary, mean frame times, their change, and its interval."""
+    """Return a table with a row for each pair of trials of equal configuration.
+
+    The columns are the options that vary, both mean frame times in ms, their change, the 95 % interval of the change,
+    and the outcome.
+    """
     from trilane.apps.compare.comparison import change_of, interval_of, setting
     from trilane.apps.compare.rows import MS
 
@@ -288,7 +296,7 @@ def _trial_table(pairs: Sequence[TrialPair]) -> Table:
 
 
 def _table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    """Return a table with column titles and rows. Cells are plain texts, without Rich's markup."""
+    """Return a table with the column `titles` and `rows` of cells. Cells are plain texts, without Rich's markup."""
     from rich.table import Table
     from rich.text import Text
 
@@ -299,9 +307,9 @@ def _table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
 
 
 def _left_out(comparison: Comparison, shown: Sequence[Figure]) -> Iterator[str]:
-    """Yield sentences on the figures that the table leaves out: how many do not differ, and how many are uncertain.
+    """Yield sentences that count the figures left out of the table: figures without difference, and undecided figures.
 
-    `shown`: figures in the table.
+    `comparison`: comparison of two runs. `shown`: figures in the table.
     """
     from trilane.apps.compare.difference import Finding
 
@@ -343,9 +351,12 @@ LEVELS: Final = {"kept": "notice", "broken": "error", "cannot tell": "warning"}
 
 
 def write_to_github(judged: Sequence[JudgedLimit], verdict: str) -> None:
-    """Write an annotation for each limit to stderr. Add a summary to the file in GITHUB_STEP_SUMMARY, if it is set.
+    """Write an annotation for each limit of a gate to stderr, and append a summary to a file that GitHub reads.
 
-    `verdict`: verdict of the comparison, in words. Raises BadInputError if the file cannot be written.
+    The environment variable GITHUB_STEP_SUMMARY names this file. Without the variable, no summary is written.
+    `judged`: limits with their outcomes. `verdict`: verdict of the comparison, in words.
+
+    Raises BadInputError if the file cannot be written.
     """
     for each in judged:
         stderr_console().file.write(annotation(each) + "\n")

@@ -28,9 +28,9 @@ _WRITTEN_OUT = {code: repr(chr(code))[1:-1] for code in (*range(0x20), *range(0x
 
 
 class _Kept:
-    """Wraps a stream so that writes raise no error after its terminal was closed. Their text is then lost.
+    """A wrapper around `stream`. After the terminal was closed, a write raises no error, and its text is lost.
 
-    `lost`: further error numbers that are ignored in the same way.
+    `lost`: error numbers of a write that are ignored too, besides EIO, which a closed terminal gives.
     """
 
     def __init__(self, stream: IO[str], *lost: int) -> None:
@@ -58,14 +58,14 @@ class _Kept:
 
 
 def stderr_console() -> Console:
-    """Return Rich's console on stderr, for messages and progress. If the reader of a pipe leaves, nothing fails."""
+    """Return Rich's console on stderr, for messages and progress. Writes to a pipe without a reader do not fail."""
     from rich.console import Console
 
     return Console(stderr=True, file=cast("IO[str]", _Kept(sys.stderr, errno.EPIPE)), highlight=False)
 
 
 def stdout_console() -> Console:
-    """Return Rich's console on stdout, for results in text. Without a terminal it has 120 columns for tables."""
+    """Return Rich's console on stdout, for results in text. If stdout is no terminal, the console has 120 columns."""
     from rich.console import Console
 
     file = cast("IO[str]", _Kept(sys.stdout))
@@ -89,7 +89,7 @@ def note(text: str) -> None:
 
 @contextmanager
 def stdout_kept() -> Iterator[None]:
-    """Redirect file descriptor 1 to stderr inside the block, because the output of libraries is not a result."""
+    """Redirect file descriptor 1 to stderr inside the `with` block, so that the output of libraries is no result."""
     sys.stdout.flush()
     stdout_copy = os.dup(1)
     os.dup2(2, 1)
@@ -103,7 +103,7 @@ def stdout_kept() -> Iterator[None]:
 
 @contextmanager
 def spinner(text: str) -> Iterator[None]:
-    """Show `text` with a spinner while the block runs, if stderr is a terminal."""
+    """Show `text` with a spinner on stderr while the `with` block runs. Without a terminal, nothing is shown."""
     console = stderr_console()
     if not console.is_terminal:
         yield
@@ -115,7 +115,8 @@ def spinner(text: str) -> Iterator[None]:
 def without_controls(value: Any) -> Any:
     """Return `value` with escaped control characters in its texts, because a terminal would execute them.
 
-    `value`: a text, or nested mappings and lists of texts and other values. Other values stay as they are.
+    `value`: text, mapping, list or tuple; nested to any depth. A tuple becomes a list. The keys of mappings are escaped
+    too. A value of any other type stays as it is.
     """
     if isinstance(value, str):
         return value.translate(_WRITTEN_OUT)
@@ -125,9 +126,10 @@ def without_controls(value: Any) -> Any:
 
 
 def shown_messages(messages: Sequence[str], failure: str | None) -> list[str]:
-    """Return the messages of a run that the terminal shows: at most MOST_SHOWN, without the text of `failure`.
+    """Return the first MOST_SHOWN of a run's `messages`, without the message that equals `failure`.
 
-    If there are more messages, a last line states how many.
+    If more messages are left, a last line states how many. `failure`: cause of the run's failure; None if the run did
+    not fail.
     """
     others = [message for message in messages if message != failure]
     more = len(others) - MOST_SHOWN
@@ -135,7 +137,10 @@ def shown_messages(messages: Sequence[str], failure: str | None) -> list[str]:
 
 
 def print_kept(parts: Iterable[Any]) -> None:
-    """Print texts and tables on stdout, without wrapping texts. A pipe that its reader has closed is no error."""
+    """Print `parts`, texts and Rich's tables, on stdout, without wrapping texts.
+
+    A pipe that its reader has closed is no error.
+    """
     console = stdout_console()
     with console.capture() as written:
         for part in parts:
@@ -153,9 +158,10 @@ def print_json(document: Mapping[str, Any]) -> None:
 
 
 def verdict_text(lines: Iterable[Sequence[str]], width: int) -> Text:
-    """Return the lines of a verdict for a terminal of `width` columns. The texts are wrapped in their own column.
+    """Return the lines of a verdict as one text for a terminal of `width` columns.
 
-    `lines`: pairs of a label and a text.
+    `lines`: pairs of a label, such as `PASS`, and a text. The labels form a column on the left. The texts are wrapped
+    to the right of this column.
     """
     from rich.text import Text
 
@@ -188,7 +194,7 @@ def print_facts(facts: Mapping[str, Any], as_json: bool) -> None:
 
 
 def _written(value: Any) -> str:
-    """Return `value` as a text for a table. Floats have four digits, also in lists of numbers and in mappings."""
+    """Return `value` as a text for a table. A float has four significant digits, also in a list or a mapping."""
     if isinstance(value, float):
         return f"{value:.4g}"
     if isinstance(value, list) and all(isinstance(each, int | float) for each in value):
@@ -199,10 +205,11 @@ def _written(value: Any) -> str:
 
 
 def _flat(facts: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield a table's rows, each as a key and a value, without nested mappings.
+    """Yield the rows of a table of `facts`, each as a key and a value.
 
-    The keys of inner mappings are joined by dots. Each mapping in a list becomes a row, with its `name` or its number
-    as the key. `prefix`: text before all keys.
+    An inner mapping gives a row for each of its keys: outer key, dot, inner key. A list of mappings gives a row for
+    each mapping. The key of this row is the mapping's `name`; without a `name`, the key of the list, a dot and a number
+    from 1. `prefix`: text before the keys.
     """
     for key, value in facts.items():
         if isinstance(value, dict):

@@ -31,7 +31,7 @@ class PartCheck:
     """The check of one part that a run uses.
 
     `name`: name of the part. `found`: finding in words. `works`: whether the part was tried and works.
-    `needed`: whether a run needs the part. `install`: command, or advice, that makes it work.
+    `needed`: whether every run needs the part. `install`: command or advice that makes the part work; may be empty.
     """
 
     name: str
@@ -109,7 +109,7 @@ def _memfd() -> PartCheck:
 
 
 def _dev_shm() -> PartCheck:
-    """Check /dev/shm, which a run does not need, because slots are memfds. Files of other programs do not matter."""
+    """Check whether /dev/shm exists. A run does not need it, because slots are memfds."""
     if not SHM.is_dir():
         return PartCheck(str(SHM), "absent", works=False, needed=False, install="mount -t tmpfs tmpfs /dev/shm")
     free = shutil.disk_usage(SHM).free
@@ -117,7 +117,7 @@ def _dev_shm() -> PartCheck:
 
 
 def _wakeup() -> PartCheck:
-    """Check whether cores stay awake. This is optional: a message to a sleeping core takes about 50 us longer."""
+    """Check whether a run can keep idle cores awake. It is optional: a message to a sleeping core takes 50 us more."""
     from trilane.machine import AWAKE, LATENCY_FILE, awake
 
     install = f'apt-get install acl; setfacl -m "u:$USER:w" {LATENCY_FILE}'
@@ -126,7 +126,7 @@ def _wakeup() -> PartCheck:
 
 
 def _counters() -> PartCheck:
-    """Check the hardware counters. They are optional: without them, a trace has no instructions and cache misses."""
+    """Check the CPU's hardware counters. Without these counters, a trace has no instructions and no cache misses."""
     from trilane.pipeline.job_times import absence, availability, remedy
 
     why = absence()
@@ -135,7 +135,10 @@ def _counters() -> PartCheck:
 
 
 def checks(gl: dict[str, Any] | None) -> list[PartCheck]:
-    """Return the checks of all parts, in the order of the output. `gl`: result of `gl_facts`."""
+    """Return the checks of all parts, in the order of the output.
+
+    `gl`: result of `gl_facts`; None if no OpenGL driver works.
+    """
     machine = [_python(), _cpu(), _int8(), _counters(), _memfd(), _dev_shm(), _wakeup(), _gl(gl)]
     return [*machine, _runtimes(), *_packages()]
 

@@ -176,7 +176,10 @@ def _efficiency(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _budget(document: Mapping[str, Any]) -> Table:
-    """Return a table with the parts of the frame time on the critical path, by stage and cause."""
+    """Return a table of the frame time: the ms a frame and the share of each stage and cause on the critical path.
+
+    Parts below LEAST_SHARE are added up in the last row. `document`: document of `trilane explain --json`.
+    """
     from rich.table import Table
 
     table = Table(
@@ -200,7 +203,10 @@ def _budget(document: Mapping[str, Any]) -> Table:
 
 
 def _shared(rows: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield a line for each stage that lacked its core for a noticeable time, with the stages that had this core."""
+    """Yield a line for each stage whose jobs lacked a core for a noticeable time, with the stages that had the core.
+
+    `rows`: value of `shared_cores` in the document of `trilane explain --json`.
+    """
     for row in rows:
         if row["preempted_ms"] < LEAST_SHARE * row["service_ms"]:
             continue
@@ -351,7 +357,10 @@ def _show_plan(document: dict[str, Any]) -> None:
 
 
 def _drawn(row: dict[str, Any]) -> str:
-    """Return a line on how an avatar is drawn in all frames. Avatars of the same bundle have the same line."""
+    """Return a line on how an avatar is drawn in all frames. `row`: an entry of `avatars` in the plan's document.
+
+    The line names the bundle. Therefore two avatars of one bundle with equal settings have the same line.
+    """
     return (
         f"avatar {row['bundle']}: skinned by the {row['skinned_on']} unit; detail: {row['detail']}; "
         f"texture filter {row['texture_filter']}; expression: {row['expression']}"
@@ -379,7 +388,7 @@ def _saved(saved: dict[str, float]) -> str:
 
 
 def _left_out(phases: list[dict[str, Any]]) -> list[str]:
-    """Return a line for each level of detail in use, with the parts of the body that it leaves out."""
+    """Return a line for each level of detail in use. The line names the parts of the body that the level leaves out."""
     rows = [row for phase in phases for row in phase["avatars"]]
     lines = {}
     for row in rows:
@@ -396,7 +405,11 @@ def _image(image: dict[str, Any]) -> str:
 
 
 def _modelled(rows: list[dict[str, Any]]) -> str:
-    """Return a line for each level of detail among the avatars of a phase, with their largest errors in pixels."""
+    """Return a text with a line for each level of detail among the avatars of a phase.
+
+    The line ends with the largest bound of the error, and the largest measured error, of these avatars, in pixels.
+    `rows`: avatars of the phase.
+    """
     lines = []
     for modelled in dict.fromkeys(_model(row) for row in rows):
         own = [row for row in rows if _model(row) == modelled]

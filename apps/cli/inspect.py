@@ -72,7 +72,7 @@ def inspect(file: FileArgument, out: SheetOption = None, json: JsonOption = Fals
 
 
 def _draw(found: Any, out: Path | None) -> Path | None:
-    """Write the sheet to `out` and return this path; None if `out` is not given or there is nothing to draw.
+    """Write the contact sheet to `out` and return `out`; None if `out` is None, or if the file has no sheet.
 
     `found`: result of `inspect_file`.
     """
@@ -87,7 +87,10 @@ def _draw(found: Any, out: Path | None) -> Path | None:
 
 
 def lines(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield lines for people that show `document`, the document of `trilane inspect --json`."""
+    """Yield the lines that `trilane inspect` prints without `--json`.
+
+    `document`: document of `trilane inspect --json`.
+    """
     yield f"{document['file']}: {document['what']}"
     rows = {
         "not usable": document["problem"],
@@ -254,7 +257,10 @@ def _show(read: Measurements) -> None:
 
 
 def _table(kind: str, measurements: Sequence[Measurement]) -> Table:
-    """Return a table with a row for each measurement, without empty columns. `kind`: run, wall or layer."""
+    """Return a table with a row for each of the `measurements`, without empty columns.
+
+    `kind`: kind of all these measurements, as title of the first column: run, wall or layer.
+    """
     from rich.markup import escape
     from rich.table import Table
 
@@ -288,9 +294,10 @@ def _figure(value: float | None) -> str:
 
 
 def _distribution(measurement: Measurement) -> str:
-    """Return a measurement's distribution from its minimum to its maximum, as a text.
+    """Return a text that shows the distribution of a measurement from its minimum to its maximum.
 
-    The text is a histogram of the samples. Without samples, it is a line with marks at p50 and p95.
+    The text is a histogram of the samples. Without samples, the text is a line with marks at p50 and p95. The text is
+    empty if minimum or maximum is unknown, or if both are equal.
     """
     low, high = measurement.min_ms, measurement.max_ms
     if low is None or high is None or high <= low:

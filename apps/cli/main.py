@@ -1,8 +1,8 @@
 """Entry point of the `trilane` command: the table of commands, the global options and the exit codes.
 
 Rule: `COMMANDS` names the module of each command. The module has a Typer `app` and is imported when the command is
-called. No slow module is imported earlier. An error that a person can cause becomes one sentence on stderr and an exit
-code, never a traceback.
+called. No slow module is imported earlier. An error becomes a message on stderr and an exit code. A traceback is shown
+only with `--debug`.
 """
 
 from __future__ import annotations
@@ -69,9 +69,9 @@ Exit codes:
 
 
 def command_of(name: str) -> Any:
-    """Import the module of command `name` and return the command.
+    """Import the module of command `name`, and return the command or the group of commands.
 
-    The module's `app` is this command, the group `name`, or a collection of commands that contains it.
+    The module's `app` is the command itself, or has it among its commands. Raises TrilaneError if memory is too short.
     """
     require_memory(part=2)  # with less, NumPy's import or the kernel would end the process
     command = typer.main.get_command(importlib.import_module(COMMANDS[name][0]).app)
@@ -83,8 +83,8 @@ def command_of(name: str) -> Any:
 def lazy_group(lines: Mapping[str, str], command_of: Callable[[str], Any]) -> type[TyperGroup]:
     """Return the class of a group whose commands are imported when they are called.
 
-    For a mistyped name, the group suggests similar names. `lines`: line in `--help` of each command, by name.
-    `command_of`: function that imports the command of a given name.
+    For a mistyped name, the group suggests similar names. `lines`: line in `--help` of each command, by the command's
+    name. `command_of`: function that takes a command's name, imports the command and returns it.
     """
 
     class LazyGroup(TyperGroup):
@@ -140,7 +140,7 @@ def _fail(message: str, code: int, details: tuple[str, ...] = ()) -> NoReturn:
 
 
 def describe(error: Exception) -> tuple[str, int]:
-    """Return a sentence about an error that no command handled, and the exit code."""
+    """Return the sentence to print about an `error` that no command handled, and the exit code of the process."""
     if isinstance(error, TrilaneError):
         return str(error), error.exit_code
     if isinstance(error, ModuleNotFoundError):
@@ -167,9 +167,9 @@ def _has_working_directory() -> bool:
 
 
 def _is_of_stdout(error: OSError) -> bool:
-    """Return whether a write to stdout caused `error`, which may mean a full disk.
+    """Return whether a failed write to stdout caused `error`: a full disk, a full quota or an I/O error.
 
-    The test writes one more byte to stdout.
+    The function writes one more byte to stdout. If this write fails with the same error number, stdout is the cause.
     """
     if error.errno not in (errno.ENOSPC, errno.EDQUOT, errno.EIO):
         return False
@@ -181,7 +181,10 @@ def _is_of_stdout(error: OSError) -> bool:
 
 
 def _call(arguments: list[str]) -> None:
-    """Run the command and flush its output. Raises OSError for a full disk, but not if the reader of a pipe left."""
+    """Run the command line `arguments`, and flush stdout when the command ends. Ends with the command's SystemExit.
+
+    Raises OSError if the flush fails, such as on a full disk. A pipe whose reader has left is no error.
+    """
     try:
         app(args=arguments, prog_name="trilane")
     except SystemExit:
@@ -191,7 +194,10 @@ def _call(arguments: list[str]) -> None:
 
 
 def _in_new_names(arguments: list[str]) -> list[str]:
-    """Return the command line with new names in place of old ones, and print a note on stderr for each old name."""
+    """Return `arguments` with each old name of a command or option replaced by its new name.
+
+    Prints a note on stderr for each old name. `arguments`: words of the command line after `trilane`.
+    """
     notes: dict[str, None] = {}
     words = in_new_names(arguments, notes.setdefault)
     if notes:
@@ -203,7 +209,10 @@ def _in_new_names(arguments: list[str]) -> list[str]:
 
 
 def main() -> None:
-    """Run the command line of `sys.argv`. Ends with SystemExit and one of the exit codes."""
+    """Run the command line of `sys.argv`. Ends with SystemExit and one of the exit codes in `EPILOG`.
+
+    With `--debug`, an error of the command is raised instead, so that Python prints its traceback.
+    """
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # characters that the locale's encoding lacks become question marks
     arguments = [argument for argument in sys.argv[1:] if argument != "--debug"]

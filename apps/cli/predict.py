@@ -1,7 +1,7 @@
 """`trilane predict`: predictions for a configuration, a table of configurations, a pipeline file or several pipelines.
 
-`trilane predict FILE.toml` predicts a pipeline file, and `trilane predict SCENE --beside …` several pipelines on one
-chip.
+`trilane predict FILE.toml` predicts a pipeline file. `trilane predict SCENE --beside …` predicts several pipelines that
+share one chip.
 
 Rule: this module reads options and shows results; every figure comes from `trilane.hw_profiles`. `predict_output.py`
 shows the predictions for a configuration or a table.
@@ -39,7 +39,10 @@ if TYPE_CHECKING:
 
 
 def predict_pipeline_file(options: PredictOptions, path: Path, as_json: bool) -> None:
-    """Print the predictions for the pipeline file `path` and its variants. Raises BadInputError."""
+    """Print the predictions for the pipeline file `path`, and for each variant of the file that a --set describes.
+
+    Raises BadInputError for a faulty file or option.
+    """
     from trilane.apps.predict.asked_file import predict_asked_file
 
     with spinner("predicting"):
@@ -102,12 +105,15 @@ def _ms(value: float) -> str:
 
 
 def _digits(value: float) -> str:
-    """Return `value` with four digits, without an exponent."""
+    """Return `value` with four significant digits; from 10000 on, as a whole number, so that it has no exponent."""
     return f"{value:.4g}" if value < 1e4 else f"{value:.0f}"
 
 
 def _span(low: float | None, high: float | None, share: str = ", 80 %") -> str:
-    """Return an interval in brackets; "" if it is a point or unknown. `share`: text after the bounds."""
+    """Return the interval from `low` to `high` in brackets, with the text `share` after the bounds.
+
+    The result is "" if both bounds are equal, or if a bound is None, which means unknown.
+    """
     return "" if low == high or low is None or high is None else f" ({_digits(low)} to {_digits(high)}{share})"
 
 
@@ -153,9 +159,9 @@ def _what_ifs(answers: list[dict[str, Any]]) -> Table:
 
 
 def predict_pipelines(options: PredictOptions, as_json: bool) -> None:
-    """Print the prediction for the scene of `options` and the pipelines of --beside, on one chip.
+    """Print the prediction for several pipelines that share one chip: the scene of `options`, and those of --beside.
 
-    Raises BadInputError.
+    Raises BadInputError for an unknown chip, scene or edge, and for a faulty pipeline.
     """
     from trilane.apps.predict.asked_pipelines import answer_of, tenants
     from trilane.hw_profiles.profile_files import load_runnable
@@ -181,7 +187,10 @@ def predict_pipelines(options: PredictOptions, as_json: bool) -> None:
 def _write_beside(
     chip: Profile, found: Sequence[SharingPipeline], options: PredictOptions, answer: Mapping[str, Any], target: Path
 ) -> None:
-    """Write the simulated runs of the pipelines into one trace, the file `target`. `found`: pipelines on the chip."""
+    """Simulate the pipelines `found` on the shared `chip`, and write their runs as one trace to the file `target`.
+
+    `options`: options of the prediction. `answer`: its document, from which the trace takes `machine` and `config`.
+    """
     from trilane.apps.explain.trace import write_predicted
     from trilane.hw_profiles.schema import corners_of
     from trilane.hw_profiles.shared_chip import together
@@ -192,7 +201,11 @@ def _write_beside(
 
 
 def _variant(policy: str | None, edge: str | None) -> Variant:
-    """Return policy and edge of the scenes; None means the usual one. Raises BadInputError for an unknown edge."""
+    """Return how the stages of the scenes are connected and scheduled. Raises BadInputError for an unknown edge.
+
+    `policy`, `edge`: values of the options; None for the policy or edge of NEWEST. The policy `reference` gives
+    REFERENCE, whatever `edge` is.
+    """
     from trilane.hw_profiles.application import REFERENCE
     from trilane.hw_profiles.tenants import NEWEST
     from trilane.transport.slots import edge_rule
@@ -348,7 +361,11 @@ def predict(options: PredictOptions, *, json: JsonOption = False) -> None:
 
 
 def _write_trace(chip: Profile, plan: Plan, options: PredictOptions, answer: dict[str, Any], target: Path) -> None:
-    """Write the simulated run that gave the predicted busy and idle shares, as a trace in the file `target`."""
+    """Simulate the run behind the predicted busy and idle shares again, and write its trace to the file `target`.
+
+    `chip`: hardware profile. `plan`: application on the chip. `options`: options of the prediction. `answer`: document
+    of the prediction, from which the trace takes `machine` and `config`.
+    """
     from trilane.apps.explain.trace import write_predicted
     from trilane.hw_profiles.predict import predicted_run
 
@@ -357,7 +374,10 @@ def _write_trace(chip: Profile, plan: Plan, options: PredictOptions, answer: dic
 
 
 def _predict_table(chip: Profile, path: Path, options: PredictOptions) -> list[dict[str, Any]]:
-    """Return a prediction for each row of the table in the file `path`. Raises BadInputError."""
+    """Return a prediction for each row of the table in the file `path`, in the order of the rows.
+
+    Raises BadInputError for a faulty table.
+    """
     from rich.progress import Progress
 
     from trilane.hw_profiles.predict import predict_table

@@ -29,8 +29,8 @@ SHOWN = ("bench_gpu_ms", "bench_dsp_ms", "app_gpu_ms", "app_dsp_ms", "confidence
 def show_table(profile: str, performance_profile: str, answers: list[dict[str, Any]], as_json: bool) -> None:
     """Print a prediction for each row of a table of configurations.
 
-    `profile`: hardware profile of the chip. `performance_profile`: performance profile of the chip.
-    `answers`: answers of `predict_table`.
+    `profile`: name of the chip's hardware profile. `performance_profile`: name of the performance profile.
+    `answers`: predictions of `predict_table`, in the order of the rows.
     `as_json`: whether to print one JSON document, or a table for people.
     """
     from rich.table import Table
@@ -54,7 +54,8 @@ def draw(chip: Profile, plan: Plan, asked: str, minutes: float, governor: str | 
 
     `chip`: hardware profile of the chip. `plan`: application that runs on the chip.
     `asked`: performance profile to draw besides `burst` and `sustained_high_performance`.
-    `minutes`: virtual minutes. `governor`: name of the governor against heat; None for the profile's own.
+    `minutes`: virtual minutes to draw. `governor`: name of the governor; None for the governor of `chip`.
+    `path`: picture to write.
     """
     from trilane.hw_profiles.governor import over_time, plot_over_time
 
@@ -67,10 +68,10 @@ def draw(chip: Profile, plan: Plan, asked: str, minutes: float, governor: str | 
 
 
 def show_networks(chip: Profile, options: PredictOptions, answers: list[dict[str, Any]], as_json: bool) -> None:
-    """Print the predictions for networks by themselves.
+    """Print the predictions for networks that run without the rest of the avatar's pipeline.
 
-    `chip`: hardware profile of the chip.
-    `options`: options of the prediction. `answers`: answers of `predict_network`.
+    `chip`: hardware profile of the chip. `options`: options of the prediction.
+    `answers`: predictions of `predict_network`, one for each network and unit.
     `as_json`: whether to print one JSON document, or text and tables for people.
     """
     performance_profile, minutes, governor = options.cap, options.minutes, options.governor
@@ -98,7 +99,7 @@ def show_networks(chip: Profile, options: PredictOptions, answers: list[dict[str
 
 
 def _compared_units(answers: list[dict[str, Any]]) -> Table:
-    """Return a table with a row for each network on each unit. `answers`: answers of `predict_network`."""
+    """Return a table with a row for each network on each unit. `answers`: predictions of `predict_network`."""
     from rich.table import Table
 
     table = Table("network", "unit", "numbers", "ms", "80 %, ms", "a second", "W", "rate")
@@ -172,7 +173,10 @@ def _reserve(rate: dict[str, Any]) -> str:
 
 
 def _span(low: float | None, high: float | None, form: str, unit: str = "") -> str:
-    """Return an interval in brackets; "" if it is unknown. `form`: format of a number, such as ".1f"."""
+    """Return the interval from `low` to `high` in brackets; "" if a bound is None, which means unknown.
+
+    `form`: format of a bound, such as ".1f". `unit`: text after the bounds.
+    """
     return "" if low is None or high is None else f" ({low:{form}} to {high:{form}}{unit})"
 
 
@@ -205,7 +209,10 @@ def _operator_table(answer: dict[str, Any]) -> Table:
 
 
 def show_answer(answer: dict[str, Any], as_json: bool) -> None:
-    """Print one prediction of the avatar's pipeline. `answer`: document of `trilane predict --json`."""
+    """Print one prediction of the avatar's pipeline.
+
+    `answer`: document of `trilane predict --json`. `as_json`: whether to print this document, or text and tables.
+    """
     if as_json:
         print_json(answer)
         return
@@ -269,7 +276,10 @@ def _unit_table(answer: dict[str, Any]) -> Table:
 
 
 def idle_causes(units: Iterable[Mapping[str, Any]]) -> list[str]:
-    """Return the idle causes of all `units`, each once, in order. `units`: mappings with a key `idle`."""
+    """Return the idle causes of all `units`, each once, in the order in which they are found.
+
+    `units`: mappings whose key `idle` has the share of each cause.
+    """
     return [*dict.fromkeys(cause for unit in units for cause in unit["idle"])]
 
 

@@ -168,10 +168,10 @@ def fit(
 
 
 def _next_command(result: ProfileFit | Calibrated, profile: Path, networks: Path) -> list[str]:
-    """Return the command that predicts the network of the table's first row, as a list of at most one line.
+    """Return a line with the command that predicts the network of the first measured row, as a list of one line.
 
-    The list is empty for a table of the reference networks. `profile`: file of the fitted profile. `networks`: folder
-    of the networks.
+    The list is empty if the rows are of the reference networks. `result`: result of the fit. `profile`: file of the
+    fitted profile. `networks`: folder of the networks.
     """
     from trilane.hw_profiles.calibrate import network_file
     from trilane.hw_profiles.fit import ProfileFit

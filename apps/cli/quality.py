@@ -105,14 +105,17 @@ def quality(
 
 
 def _refuse_without_by_cause(options: dict[str, Path | None]) -> None:
-    """Raise BadInputError for a given option that needs --by-cause. `options`: values by spelling, None if absent."""
+    """Raise BadInputError if an option is given that needs --by-cause.
+
+    `options`: value of each such option, by its spelling; None for an option that is not given.
+    """
     for name, value in options.items():
         if value is not None:
             raise BadInputError(name, str(value), "it beside --by-cause", "the other comparisons do not use it")
 
 
 def _refuse_other_comparisons(hard_cases: bool, runtimes: list[str]) -> None:
-    """Raise BadInputError if --hard-cases or several runtimes stand beside --by-cause, which examines one run."""
+    """Raise BadInputError if --hard-cases or several runtimes are given with --by-cause, which examines one run."""
     if hard_cases:
         raise BadInputError("--by-cause", "--hard-cases beside it", "one of them")
     if len(runtimes) > 1:
@@ -121,7 +124,10 @@ def _refuse_other_comparisons(hard_cases: bool, runtimes: list[str]) -> None:
 
 
 def _refuse_a_scene(scene: str, options: dict[str, object]) -> None:
-    """Raise BadInputError for a scene or its options beside --hard-cases, because hard cases have their own inputs."""
+    """Raise BadInputError if a scene or an option of a scene is given with --hard-cases, which has its own inputs.
+
+    `scene`: value of the argument. `options`: values by spelling; None for an option that is not given.
+    """
     asked = [name for name, value in options.items() if value is not None]
     if scene != SCENE or asked:
         found = ", ".join(asked) or scene
@@ -205,10 +211,13 @@ def _shown(value: Any) -> str:
 def _show_by_cause(
     scene: str, request: dict[str, Any], frames: int, out: Path | None, lpips_weights: Path | None, as_json: bool
 ) -> None:
-    """Measure the error of a run's frames by cause, and print it. Raises BadInputError, MissingPartError.
+    """Measure the error of a run's frames, split by cause, and print the errors.
 
-    `request`: options of the run by name. `frames`: number of frames. `out`: folder for heat maps, if any.
-    `lpips_weights`: file with the weights of LPIPS, if any.
+    `scene`: name or file of the scene. `request`: further options of the run, by name. `frames`: number of frames.
+    `out`: folder for heat maps; None for no heat maps. `lpips_weights`: file with the weights of LPIPS; None if LPIPS
+    is not measured. `as_json`: whether to print one JSON document, or tables for people.
+
+    Raises BadInputError for wrong options or files, and MissingPartError if a part that the run needs is missing.
     """
     from trilane.apps.experiments.error_by_cause import error_by_cause
     from trilane.apps.experiments.picture_errors import Lpips

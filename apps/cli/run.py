@@ -1,8 +1,8 @@
 """`trilane run`: runs a scene or a pipeline file, and shows the verdict or a table.
 
 Rule: this file reads options and shows results; `trilane.apps.run.asked_run` does the work. Every figure of the table
-comes from report.json, and its source stands below the table. Unknown figures are dashes, and figures from too few
-frames are marked.
+comes from report.json, and the source of the figures stands below the table. An unknown figure is a dash. A percentile
+of too few frames is marked.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ DashboardOption = Annotated[
 
 @contextmanager
 def _hooks() -> Iterator[Hooks]:
-    """Yield callbacks that show messages on stderr, and a progress bar if stderr is a terminal."""
+    """Yield the run's callbacks, which show messages and progress on stderr. Progress is shown only on a terminal."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
     from rich.text import Text
 
@@ -138,7 +138,11 @@ def _run_live(options: RunOptions, command: tuple[str, ...], port: int | None) -
 
 
 def _print_outcome(outcome: RunOutcome, as_json: bool, with_table: bool) -> None:
-    """Print the report or its verdict on stdout. Print the folder, messages and the cause of a failure on stderr."""
+    """Print the report as JSON, or its verdict, on stdout. Print folder, messages and cause of a failure on stderr.
+
+    `outcome`: end of the run, with its report. `as_json`: whether to print JSON. `with_table`: whether to print the
+    table of all figures below the verdict.
+    """
     from trilane.apps.run.verdict_facts import verdict_of
 
     report = outcome.report
@@ -164,19 +168,19 @@ TOO_FEW = " *"
 
 @cache
 def needed() -> dict[str, int]:
-    """Return the number of samples that each percentile needs, by name."""
+    """Return the number of samples that each percentile needs, by the percentile's name: `p90`, `p95` and `p99`."""
     from trilane.scheduler.stats import samples_needed
 
     return {name: samples_needed(int(name[1:]) / 100) for name in ("p90", "p95", "p99")}
 
 
 def too_few_note() -> str:
-    """Return the explanation of the mark TOO_FEW at a percentile."""
+    """Return the explanation of the mark TOO_FEW: how many samples each percentile needs."""
     return f"{TOO_FEW} of too few frames: " + ", ".join(f"{name} needs {count}" for name, count in needed().items())
 
 
 def run_table(report: Report) -> Table:
-    """Return a table of stages, units, times and rates, with a column for the run and a column for its baseline."""
+    """Return a table of stages, units, times and rates. The columns are the run and, if measured, its baseline."""
     from rich.table import Table
 
     runs: list[PolicyMetrics] = [report, report.baseline] if report.baseline else [report]
@@ -244,7 +248,10 @@ def _pace(pace: PaceComparison) -> str:
 
 
 def _check(check: Check) -> list[str]:
-    """Return a line for each comparison of the check: with the truth, and with the float path."""
+    """Return a line with the image errors that `check` measured against the truth or, if unknown, the float path.
+
+    If `check` compared with both, a second line has the errors against the float path.
+    """
     errors = [check, *([check.float_path] if check.float_path else [])]
     return [f"of this run, {check.frames} frames against {_errors(each)} ({MEASURED})" for each in errors]
 
@@ -267,9 +274,10 @@ def _caps(caps: Caps, temperature: Temperature) -> str:
 
 
 def accuracy_line(name: str, facts: Mapping[str, Any]) -> str:
-    """Return a line with the error of an avatar's pictures and its source, or with the reason why it is unknown.
+    """Return a line with the image error of an avatar and the error's source. If the error is unknown, say why.
 
-    Older reports do not state the source of their figures, so these figures are not shown.
+    Older reports do not state the source of the error, which then counts as unknown. `name`: name of the avatar.
+    `facts`: value for this avatar in the report's `accuracy`.
     """
     source = facts.get("source", NO_FIGURES)
     if source == NO_FIGURES:
@@ -300,9 +308,9 @@ def _service_and_wait(times: StageTimes | None) -> str:
 
 
 def _byte_rows(runs: Sequence[PolicyMetrics]) -> Rows:
-    """Yield two rows: the bytes that each stage moves for a frame, and their sum with its ratio to the least bytes.
+    """Yield two rows: the MB that each stage moves for a frame, and the MB that all stages move for a frame.
 
-    Yields nothing if no run counts bytes.
+    The second row also has the ratio to the least bytes, and the rate in GB/s. Yields nothing if no run counts bytes.
     """
     if not any(run.bytes for run in runs):
         return
@@ -340,7 +348,10 @@ def _shares(unit: UnitShares | None, causes: Iterable[str]) -> str:
 
 
 def _core_rows(runs: Sequence[PolicyMetrics]) -> Rows:
-    """Yield a row for each set of cores, with the CPU time of its units. An older report has no such rows."""
+    """Yield a row for each set of cores: the CPU time of its units, in % of the time that the cores had.
+
+    Yields nothing for an older report, which does not have these shares.
+    """
     for index, first in enumerate(runs[0].core_shares):
         shares = [run.core_shares[index] if index < len(run.core_shares) else None for run in runs]
         name = f"core{'s' if len(first.cores) > 1 else ''} {','.join(map(str, first.cores))}"
@@ -367,17 +378,20 @@ def _time(run: PolicyMetrics, times: TimeSummary, statistic: str) -> str:
 
 
 def _too_few(times: TimeSummary, statistic: str) -> bool:
-    """Return whether a percentile rests on too few samples. It is false for older reports, which do not count them."""
+    """Return whether `statistic` is a percentile of too few samples. False for older reports, which count no samples.
+
+    `times`: summary that has the statistic. `statistic`: name of the statistic, such as `p99`.
+    """
     return times.samples is not None and times.samples < needed().get(statistic, 0)
 
 
 def _between(low: float | None, high: float | None) -> str:
-    """Return a 95 % interval as a text."""
+    """Return the bounds of a 95 % interval as a text; TOO_SHORT if a bound is None, because the run was too short."""
     return TOO_SHORT if low is None or high is None else f"{_number(low)} to {_number(high)}"
 
 
 def _skipped(report: Report) -> str:
-    """Return a line on the presented frames that skipped stages. For a scene, it states how many had which reason."""
+    """Return a line that counts the presented frames that skipped stages; for a scene, also for each reason."""
     frames = report.frames
     if "pipeline" in report.config:
         return f"took the bypass: {frames.skipped} of {frames.presented} frames"
@@ -414,9 +428,10 @@ def _left_out(frames: FrameCounts) -> str:
 
 
 def _bounds(part: PathShare | None, *, is_slowed: bool) -> str:
-    """Return the cost of a slower unit or stage as a text, else its share of the critical path.
+    """Return a text with the name of `part`, and what its slowing costs or, if unknown, its share of the critical path.
 
-    `is_slowed`: whether the row shows costs; a share is then marked as such.
+    `part`: unit or stage that bounds a run; None gives a dash. `is_slowed`: whether the row shows costs; a share is
+    then marked as a share of the path.
     """
     if part is None:
         return DASH

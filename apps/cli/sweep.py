@@ -1,7 +1,7 @@
 """`trilane sweep`: tries many configurations of one command, and keeps the results in a folder.
 
-Rule: this file reads options and shows results; `trilane.apps.sweep` defines and runs sweeps. If stderr is a terminal,
-it shows a bar with the remaining time. Otherwise it gets a line for each trial that ends.
+Rule: this file reads options and shows results; `trilane.apps.sweep` defines and runs sweeps. On a terminal, stderr
+shows a bar with the remaining time. Without a terminal, stderr gets a line for each trial that ends.
 """
 
 from __future__ import annotations
@@ -163,9 +163,10 @@ def of_words(
 
 
 def _trials(first: str, definition: Definition, command: SweptCommand) -> list[Trial]:
-    """Return the trials of a definition. Raises BadInputError.
+    """Return the trials of the sweep `definition`.
 
-    `first`: first word after `sweep`. If it is a sweep file, errors name this file.
+    `first`: first word after `sweep` on the command line. If this word is a sweep file, errors name the file.
+    `command`: command that the trials run. Raises BadInputError for options or axes that do not fit each other.
     """
     from trilane.apps.sweep.definition import trials_of
 
@@ -178,9 +179,9 @@ def _trials(first: str, definition: Definition, command: SweptCommand) -> list[T
 
 
 def require_checks(trials: Sequence[Trial]) -> None:
-    """Raise MissingPartError before the first trial if a library for `--check` is missing.
+    """Raise MissingPartError if a trial of `run` has the option `check`, and a library for this check is missing.
 
-    Other faults of a trial are ignored here, because the trial itself reports them.
+    A wrong scene or avatar of a trial raises no error here, because the trial itself reports it.
     """
     from trilane.apps.run.run_job import require_parts
     from trilane.avatars.bundle import load_bundle
@@ -195,7 +196,10 @@ def require_checks(trials: Sequence[Trial]) -> None:
 
 
 def default_folder(name: str, trials: Sequence[Trial]) -> Path:
-    """Return the usual folder of a sweep. Its name has a digest of the trials, so a rerun finds finished trials."""
+    """Return the folder of a sweep without `--out`: `sweeps/NAME-HASH`.
+
+    The hash comes from the trials. Therefore the same sweep gets the same folder again, with its finished trials.
+    """
     digest = hashlib.sha256("".join(sorted(trial.id for trial in trials)).encode()).hexdigest()
     return Path("sweeps") / f"{name}-{digest[:8]}"
 
@@ -203,7 +207,10 @@ def default_folder(name: str, trials: Sequence[Trial]) -> Path:
 def _run(
     trials: Sequence[Trial], folder: Path, definition: Definition, engine: EngineName, resume: bool, as_json: bool
 ) -> bool:
-    """Run the remaining trials and print a summary. Return whether any trial has failed or was lost."""
+    """Run the trials that have not ended yet, and print a summary. Return whether any trial has failed or was lost.
+
+    Raises typer.Exit if the sweep is interrupted.
+    """
     from trilane.apps.run.report_facts import made_facts
     from trilane.apps.sweep.store import Store, is_ended, run_sweep, summary
 
@@ -274,7 +281,8 @@ def _print_planned(trials: Sequence[Trial], as_json: bool) -> None:
 def seconds_left(elapsed_s: float, ended: int, left: int) -> float:
     """Return the expected remaining time in seconds, from the mean time of the ended trials.
 
-    `ended`: number of ended trials, at least 1. `left`: number of remaining trials.
+    `elapsed_s`: time since the begin, in seconds. `ended`: number of trials that ended in this time, at least 1.
+    `left`: number of trials that have not ended.
     """
     return elapsed_s / ended * left
 
@@ -314,7 +322,10 @@ def _line(record: Mapping[str, Any]) -> str:
 
 
 def _disturbed(record: Mapping[str, Any]) -> str:
-    """Return a text on how often a trial was repeated, and on the reason why its result still cannot be trusted."""
+    """Return a text that says how often a trial was repeated, and one reason why its result is still unsure.
+
+    The text is empty if the trial was not repeated and its result is sure.
+    """
     times = record.get("repeated", 0)
     again = f"; done again {times} {'time' if times == 1 else 'times'}, as the machine was not quiet" if times else ""
     return again + "".join(f"; UNSURE: {reason}" for reason in record.get("unsure", [])[:1])
@@ -331,7 +342,8 @@ def _time(seconds: float) -> str:
 def print_summary(document: Mapping[str, Any], definition: Definition, records: Mapping[str, Any]) -> None:
     """Print a table with a row for each trial, a line of counts, and a line for each error of failed trials.
 
-    `document`: document of `--json`. `records`: records of trials.jsonl, by the trial's id.
+    `document`: document of `--json`. `definition`: definition of the sweep, with the axes. `records`: records of
+    trials.jsonl, by the trial's id.
     """
     from rich.table import Table
 
@@ -358,7 +370,10 @@ def print_summary(document: Mapping[str, Any], definition: Definition, records: 
 
 
 def _answer(result: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the figures in a trial's result. In a prediction for a pipeline file, they belong to the last variant."""
+    """Return the part of a trial's `result` that has the figures, such as `fps`.
+
+    This part is the whole result. For a prediction of a pipeline file, it is the last of the predicted variants.
+    """
     pipelines = result.get("pipelines")
     return pipelines[-1] if pipelines and "what_if" in pipelines[-1] else result
 
@@ -371,7 +386,10 @@ def _figure(result: Mapping[str, Any], path: tuple[str, ...]) -> Any:
 
 
 def marked(word: str, row: Mapping[str, Any]) -> str:
-    """Return `word`, followed by UNSURE if the machine was not quiet during the trial. `row`: facts of the trial."""
+    """Return `word`, followed by UNSURE if the machine was not quiet during a trial.
+
+    `row`: document of the trial, whose key `unsure` has the reasons.
+    """
     return f"{word}, UNSURE" if row.get("unsure") else word
 
 

@@ -32,9 +32,10 @@ NOT_SWEPT = {
 
 
 class SweptCommand:
-    """A command that a sweep tries, and its options. `words`: the command, such as `run`, or `bench` and a name.
+    """A command that a sweep tries, with the options of this command.
 
-    Raises BadInputError for any other command.
+    `words`: words of the command, such as `run`, or `bench` and the name of a bench. An old name becomes the new name.
+    Raises BadInputError for a command that a sweep cannot try.
     """
 
     def __init__(self, words: Sequence[str]) -> None:
@@ -44,9 +45,10 @@ class SweptCommand:
         self._parameters = {_name(each): each for each in self._command.params if _name(each) not in NOT_SWEPT}
 
     def in_new_names(self, given: Mapping[str, Sequence[Value]], where: str) -> dict[str, Sequence[Value]]:
-        """Return `given`, the values of options by name, with new names in place of old ones.
+        """Return the values of options by their new names, and print a note for each old name.
 
-        `where`: place that errors name. Raises BadInputError if an option has both names.
+        `given`: values by old or new name. `where`: place that an error names, such as a file and its table. Raises
+        BadInputError if an option is given by its old name and its new name.
         """
         found: dict[str, Sequence[Value]] = {}
         for old, values in given.items():
@@ -57,9 +59,10 @@ class SweptCommand:
         return found
 
     def values_of(self, tokens: Sequence[str]) -> dict[str, list[Value]]:
-        """Return the values of each option that `tokens` give, by name, in order. Raises BadInputError.
+        """Return the values that the command line gives each option: name of the option -> values in the typed order.
 
-        `tokens`: words of the command line after the command.
+        `tokens`: words of the command line after the command. Raises BadInputError for an unknown option, and for a
+        missing or wrong value.
         """
         found: dict[str, list[Value]] = {}
         arguments = [name for name, each in self._parameters.items() if each.param_type_name == "argument"]
@@ -74,7 +77,8 @@ class SweptCommand:
     def converted(self, name: str, value: Any, where: str = "") -> Value:
         """Return the value of option `name` after the command's own conversion, as plain data.
 
-        `where`: place that errors name. Raises BadInputError for a value that the command refuses.
+        `value`: value as typed, or as read from a sweep file. `where`: place that an error names, such as a file and
+        its table; "" for the command line. Raises BadInputError for a value that the command refuses.
         """
         parameter = self._named(name, where)
         words = self.words_of({name: value})
@@ -93,7 +97,7 @@ class SweptCommand:
             raise BadInputError(place, repr(value), f"a value that {' '.join(self.words)} takes", str(error)) from None
 
     def words_of(self, options: Options) -> tuple[str, ...]:
-        """Return `options`, which maps names to values, as words of a command line."""
+        """Return the words of a command line that give the command these `options`, a mapping from names to values."""
         words: list[str] = []
         for name, value in options.items():
             words += self._typed(self._named(name), value)
@@ -108,7 +112,11 @@ class SweptCommand:
         return self._parameters[name]
 
     def _option(self, token: str, left: Iterator[str]) -> tuple[str, Value]:
-        """Return name and value of the option `token`. Without a `=`, the value may be the next item of `left`."""
+        """Return the name and the value of the option that begins with `token`.
+
+        `left`: words after `token`. The first of them is the value, unless `token` contains `=` or the option is a
+        flag. Raises BadInputError for an unknown option, and for a missing value.
+        """
         spelling, has_value, value = token.partition("=")
         for name, parameter in self._parameters.items():
             if spelling in (*parameter.opts, *parameter.secondary_opts) and parameter.param_type_name == "option":

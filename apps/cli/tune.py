@@ -1,7 +1,8 @@
 """`trilane tune`: finds the fastest configuration of a grid within given limits, in few trials.
 
 Rule: this file reads options and shows results; `trilane.apps.sweep.tuner` searches. Folder, trials and engines are
-those of a sweep. Predictions for a chip are computed in this process; every other trial has its own process.
+those of a sweep. With the engine `local`, predictions for a chip are computed in this process. Every other trial has
+its own process.
 """
 
 from __future__ import annotations
@@ -140,9 +141,10 @@ def tune(
 
 
 def _goals(words: Sequence[str]) -> tuple[tuple[str, ...], list[str]]:
-    """Return the goals, and the words that name a sweep file or a command. Raises BadInputError.
+    """Return the goals, and the words after the goals: a sweep file, or a command with its options.
 
-    `words`: arguments as typed. Without a goal, the goal is `fps`.
+    `words`: arguments as typed. Without a goal, the goal is `fps`. Raises BadInputError if the first word is neither
+    goals, nor a sweep file, nor a command.
     """
     from trilane.apps.sweep.definition import COMMANDS
     from trilane.apps.sweep.tuner import METRICS
@@ -158,9 +160,12 @@ def _goals(words: Sequence[str]) -> tuple[tuple[str, ...], list[str]]:
 
 
 def _space(words: Sequence[str], axes: Sequence[str], chip: str | None) -> tuple[str, Definition, Space]:
-    """Return the name of a sweep, its definition, and the space of its configurations. Raises BadInputError.
+    """Return the name of a sweep, its definition, and the space of its configurations.
 
-    `words`: sweep file, or command with options. `axes`: values of --axis, as typed. `chip`: value of --on.
+    `words`: sweep file, or command with its options; if empty, the command is `run`, or `predict` with a chip.
+    `axes`: values of --axis, as typed. `chip`: value of --on; None if not given.
+
+    Raises BadInputError for a wrong or repeated --axis, and for a chip with another command than `predict`.
     """
     from trilane.apps.sweep.tuner import Space
     from trilane.hw_profiles.profile_files import load_runnable
@@ -210,7 +215,11 @@ def _tune(
 ) -> dict[str, Any]:
     """Search for the best configuration, keep the trials in `folder`, and return the document that `--json` prints.
 
-    `budget`: number of configurations to try. `short`: frames of a trial's first short run, if any.
+    `search`: goals, limits and configurations. `definition`: sweep that the folder belongs to. `engine`: machines that
+    run the trials. `budget`: number of configurations to try. `short`: frames of the short run before each trial; None
+    for no short runs. `resume`: whether to resume a search that was interrupted.
+
+    Raises typer.Exit if the search is interrupted.
     """
     from trilane.apps.run.report_facts import made_facts
     from trilane.apps.sweep.store import Store, run_sweep
@@ -246,7 +255,10 @@ def _tune(
 
 @contextmanager
 def _engine(name: EngineName, store: Store, trials: Sequence[Trial]) -> Iterator[tuple[Engine, int]]:
-    """Yield the engine, and the number of trials that it runs at the same time."""
+    """Yield a pair: the engine `name` for `trials`, and the number of trials that this engine runs at the same time.
+
+    `store`: open folder of the sweep.
+    """
     from trilane.apps.sweep.engines import at_once, at_once_on_ray, run_inside
 
     if name is EngineName.LOCAL and all(_is_of_chip(trial) for trial in trials):
@@ -262,7 +274,10 @@ def _is_of_chip(trial: Trial) -> bool:
 
 
 def _called(words: list[str]) -> tuple[int, str, str]:
-    """Run a command in this process, and return its exit code, stdout and stderr. `words`: command and arguments."""
+    """Run a command in this process, and return its exit code, stdout and stderr. `words`: command and arguments.
+
+    Raises KeyboardInterrupt if the command was interrupted.
+    """
     from trilane.apps.cli.main import command_of, describe
 
     out, messages = io.StringIO(), io.StringIO()
@@ -278,7 +293,7 @@ def _called(words: list[str]) -> tuple[int, str, str]:
 
 
 def _print(document: Mapping[str, Any], axes: Sequence[str]) -> None:
-    """Print the best configuration and its command, the frontier, and the failed and untried configurations.
+    """Print the best configuration and its command, the frontier, and the numbers of failed and untried configurations.
 
     `document`: result of `_tune`. `axes`: names of the axes.
     """
@@ -324,7 +339,7 @@ def _print_frontier(document: Mapping[str, Any], axes: Sequence[str]) -> None:
 
 
 def _unit(name: str) -> str:
-    """Return the unit of measure of the figure `name`; "" if there is none, or if the name itself is the unit."""
+    """Return the unit of measure of the figure `name`; "" for a figure without a unit, or if `name` is the unit."""
     from trilane.apps.sweep.tuner import METRICS
 
     return METRICS[name].unit if name in METRICS and METRICS[name].unit != name else ""

@@ -1,8 +1,8 @@
 """`trilane watch`, `trilane show` and `trilane trace`: views of one run, during it or after it.
 
 Rule: this file reads options and shows results. Figures come from `trilane.apps.watch`, the page from
-`trilane.apps.dashboard`, the trace from `trilane.apps.explain.trace`. `trilane watch` redraws a screen on a terminal,
-and prints lines otherwise. Speed is shown with the error of the avatars' pictures and the sources of the figures.
+`trilane.apps.dashboard`, the trace from `trilane.apps.explain.trace`. On a terminal, `trilane watch` redraws a screen.
+Without a terminal, it prints lines. Speed is shown with the avatars' image error and the sources of the figures.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def _print_lines(first: RunLook, rest: Iterator[RunLook]) -> None:
 def _show(first: RunLook, rest: Iterator[RunLook]) -> None:
     """Show successive figures of a run, on a redrawn screen, or line by line if stdout is no terminal.
 
-    `first`: first figures. `rest`: later ones, which come as the run goes on.
+    `first`: first figures. `rest`: later figures, which arrive while the run goes on.
     """
     from rich.live import Live
 
@@ -198,7 +198,7 @@ MIB = 1 << 20
 
 
 def screen(look: RunLook, width: int) -> Group:
-    """Return the whole screen with the figures of a run, for a terminal of `width` columns."""
+    """Return all texts and tables that show the figures of a run on a terminal of `width` columns."""
     from rich.console import Group
     from rich.text import Text
 
@@ -245,7 +245,10 @@ def _passed(figures: MomentFigures) -> str:
 
 
 def heading(look: RunLook) -> str:
-    """Return the heading for the lines of `line`: the run's name and state, how figures are computed, and errors."""
+    """Return the heading above the lines of `line`, as a text of several lines.
+
+    The heading states the run's name and state, how the figures are computed, and each avatar's image error.
+    """
     from trilane.apps.watch.followed_run import RunState
 
     of_fps = "between the first frame and the last" if look.state is RunState.FINISHED else "of the last 5 s"
@@ -254,17 +257,17 @@ def heading(look: RunLook) -> str:
 
 
 def ending(look: RunLook) -> str:
-    """Return a sentence about the end of a run that went on before."""
+    """Return a sentence that says how a run has ended. `look`: first figures since the end of the run."""
     return f"run {look.name}: {ENDINGS[look.state]}"
 
 
 def errors(figures: MomentFigures) -> list[str]:
-    """Return a line for each avatar: the error of its pictures, or why this error is unknown."""
+    """Return a line for each avatar: its image error, or the reason why this error is unknown."""
     return [accuracy_line(name, facts) for name, facts in figures.accuracy.items()] or [NO_ERROR]
 
 
 def dropped(figures: MomentFigures) -> int:
-    """Return the number of dropped frames, over all edges."""
+    """Return the number of dropped frames: the sum over all edges and causes."""
     return sum(drop.frames for drop in figures.frames.dropped)
 
 
@@ -305,7 +308,7 @@ def _table(*names: str) -> Table:
 
 
 def _add_row(table: Table, *cells: str) -> None:
-    """Add a row of plain texts, because names of stages and units may look like Rich's markup."""
+    """Add a row of plain `cells` to `table`, because a name of a stage or unit may look like Rich's markup."""
     from rich.text import Text
 
     table.add_row(*map(Text, cells))
@@ -340,7 +343,10 @@ def _three(times: Mapping[str, float]) -> str:
 
 
 def _time(times: Mapping[str, float], key: str) -> str:
-    """Return a statistic in ms as a text: a dash without samples, marked with TOO_FEW if it needs more samples."""
+    """Return a statistic in ms as a text. Without samples, the text is a dash. With too few samples, TOO_FEW follows.
+
+    `times`: values in ms by the name of the statistic, and the number of `samples`. `key`: name, such as `p95`.
+    """
     if not times["samples"]:
         return DASH
     return f"{times[key]:.1f}{TOO_FEW if times['samples'] < needed().get(key, 0) else ''}"
@@ -355,7 +361,10 @@ def _stages(figures: MomentFigures) -> Table:
 
 
 def _moved(kinds: Mapping[str, Moved]) -> tuple[str, str]:
-    """Return two texts: the MiB that a job moves, in all and by kind, and the least possible MiB. Unknown: a dash."""
+    """Return two texts: the MiB that a job moves, in all and by kind, and the least bytes of a job in MiB.
+
+    An unknown number is a dash. `kinds`: moved bytes of a stage, by kind; the least bytes have the key LEAST.
+    """
     from trilane.apps.watch.live_figures import LEAST
 
     shown = {kind: moved.per_job / MIB for kind, moved in kinds.items() if kind != LEAST and moved.total}
@@ -394,7 +403,10 @@ def _percent(share: float) -> str:
 
 
 def _short_bound(figures: MomentFigures) -> str:
-    """Return the unit that bounds, with its cost if it is slower, or its share of the critical path; "" if unknown."""
+    """Return the unit that is the bound, and the cost of slowing this unit; "" if the bound is unknown.
+
+    Without a known cost, the text has the unit's share of the critical path.
+    """
     unit = (figures.bound or {}).get("unit")
     if not unit:
         return ""
@@ -403,7 +415,10 @@ def _short_bound(figures: MomentFigures) -> str:
 
 
 def _short_error(figures: MomentFigures) -> str:
-    """Return a text with the PSNR of each avatar at the distance where it is least, by the avatar's validation."""
+    """Return a text with each avatar's lowest PSNR in dB over the bands of distances, or that the error is unknown.
+
+    The PSNR comes from the avatar's validation.
+    """
     known = {
         name: min(facts["psnr_db_by_band"].values())
         for name, facts in figures.accuracy.items()
@@ -413,7 +428,7 @@ def _short_error(figures: MomentFigures) -> str:
 
 
 def _sources(figures: MomentFigures) -> str:
-    """Return a text with the sources of all figures, of temperatures, and of duties, as far as the run has them."""
+    """Return a text with the source of the figures, and the sources of temperatures and duties if the run has any."""
     said = [f"figures: {figures.sources['fps']}"]
     for place in figures.temperature_c:
         source = figures.sources.get(f"temperature_c.{place}", figures.sources["temperature_c"])

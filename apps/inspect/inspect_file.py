@@ -1,7 +1,7 @@
-"""Says what a file or folder is. Rule: content identifies a file, and only the reader of its kind reads it.
+"""Says what a file or folder is, and lets the reader of this kind describe it.
 
-If the content is ambiguous, the ending of the name decides. To identify a file, only its head, the names in an archive,
-or a text are read.
+Rule: content identifies a file. If the content is ambiguous, the ending of the name decides. To identify a file, this
+module reads only its head, the names in an archive, or a whole text. Only the reader of the file's kind reads more.
 """
 
 from __future__ import annotations
@@ -112,7 +112,10 @@ AS_BVH = "export the motion as BVH, such as in Blender: File > Import, then File
 
 
 def inspect_file(path: Path) -> Inspection:
-    """Return the inspection of `path`, usable or not. Raises BadInputError only without a readable file or folder."""
+    """Return the inspection of the file or folder `path`, which need not be usable.
+
+    Raises BadInputError only if `path` is no readable file or folder.
+    """
     kind, signature = kind_of(path)
     if signature is not None:
         return _foreign(signature)
@@ -128,7 +131,10 @@ def inspect_file(path: Path) -> Inspection:
 
 
 def _other(path: Path) -> Inspection:
-    """Return the inspection of an unknown file. A broken JSON file is named as such: it may be a damaged known file."""
+    """Return UNKNOWN. For a JSON file that does not parse, return an inspection that says so.
+
+    Such a file may be a damaged file of a known kind.
+    """
     if path.suffix.lower() != ".json":
         return UNKNOWN
     try:
@@ -141,7 +147,7 @@ def _other(path: Path) -> Inspection:
 
 
 def _folder_of(path: Path) -> Inspection:
-    """Return the inspection of an unknown folder. The advice names files in it that Trilane knows."""
+    """Return the inspection of an unknown folder. The advice names files in this folder whose kind Trilane knows."""
     files = itertools.islice((file for file in sorted(path.iterdir()) if file.is_file()), MOST_LOOKED_AT)
     known = [f"{file.name} ({kind})" for file in files if (kind := _kind_or_none(file)) in READERS]
     if not known:
@@ -165,10 +171,10 @@ def _foreign(signature: Signature) -> Inspection:
 
 
 def kind_of(path: Path) -> tuple[str, Signature | None]:
-    """Return the kind of `path`: a constant of this module or of `trilane.files`.
+    """Return the kind of `path`, a constant of this module or of `trilane.files`, and its signature or None.
 
-    For a foreign file, an archive, and a file with a remedy, also return its signature. Raises BadInputError without a
-    readable file or folder.
+    The signature is given for a file that Trilane does not read: a foreign format, an archive, or a format with a
+    remedy. Raises BadInputError if `path` is no readable file or folder.
     """
     if path.is_dir():
         return _folder(path), None
@@ -204,7 +210,7 @@ def _arrays(path: Path) -> str:
 
 
 def _by_text(path: Path) -> str:
-    """Return the kind of a file that has no signature in its head: by its name, its text, or its ending."""
+    """Return the kind of a file without a signature in its head: by its name, else its text, else its ending."""
     if path.name == JOURNAL:
         return RUN
     if path.name in COLMAP_FILES:
@@ -257,7 +263,10 @@ def _is_camera(path: Path) -> bool:
 
 
 def _is_table(text: str) -> bool:
-    """Return whether more than half of the first lines, without comments, are rows of two or more numbers."""
+    """Return whether more than half of the first 50 lines are rows of two or more numbers.
+
+    Comments after a `#` are ignored, and so are lines without other text.
+    """
     lines = [line.split("#", 1)[0].replace(",", " ").split() for line in text[:20_000].splitlines()[:50]]
     rows = [words for words in lines if words]
     return 2 * sum(_are_numbers(words) for words in rows) > len(rows)

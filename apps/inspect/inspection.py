@@ -1,8 +1,10 @@
-"""The description of one file, as plain data for people and JSON, and its sheet of skeletons, paths or points.
+"""The description of one file as plain data for people and JSON, and its contact sheet.
 
-Rule: a file is usable if the reader of a run accepts it; a problem is that reader's own sentence. All skeletons of a
-row have one scale, and so have all views of a path, so that lengths can be compared. Y is up, and a person who faces +Z
-faces the reader; the person's left is blue, the right is orange.
+Rule: a file is usable if the other commands can read it. A problem is the error of their reader, in its words.
+
+A contact sheet shows skeletons, a path or points. All skeletons of a row have the same scale, and so have all views of
+a path. Therefore lengths can be compared. Y is up. In the view from the front, a person who faces +Z looks at the
+reader. The person's left side is blue, the right side is orange.
 """
 
 from __future__ import annotations
@@ -42,7 +44,11 @@ FRUSTUM = np.array([[-0.8, -0.6, -1.0], [0.8, -0.6, -1.0], [0.8, 0.6, -1.0], [-0
 
 @dataclass(frozen=True)
 class Length:
-    """The length of a recording. `samples`: number of usable frames or poses. `rate_hz`: 1 / median step, or None."""
+    """The length of a recording.
+
+    `samples`: number of usable frames or poses. `seconds`: duration. `rate_hz`: samples a second; None if unknown, as
+    for a single sample.
+    """
 
     samples: int
     seconds: float
@@ -50,7 +56,10 @@ class Length:
 
     @classmethod
     def of(cls, times_s: F64) -> Length:
-        """Return the length of increasing times (N,), s."""
+        """Return the length of a recording whose samples have the increasing times `times_s` (N,), in seconds.
+
+        The rate is 1 / the median step between two times; None for a single time.
+        """
         steps = np.diff(times_s)
         rate = 1 / float(np.median(steps)) if len(steps) else None
         return cls(len(times_s), float(times_s[-1] - times_s[0]), rate)
@@ -60,9 +69,11 @@ class Length:
 class Inspection:
     """The description of one file.
 
-    `what`: the file in words. `problem`: why the file is not usable; empty if it is usable. `advice`: a command that
-    uses the file, or a remedy. `detected`: what its reader detected. `notes`: notes as a run prints them. `draw`:
-    draws the contact sheet; None if there is nothing to draw.
+    `kind`: kind of the file in a word, such as `motion`. `what`: description of the file in words. `problem`: reason
+    why the file is not usable; empty for a usable file. `advice`: command that uses the file, or remedy.
+    `detected`: format and conventions that the reader detected. `length`: length of a recording; None for other files.
+    `facts`: further facts, by name. `notes`: notes as a run prints them. `draw`: function that draws the contact sheet;
+    None for a file without a sheet.
     """
 
     kind: str
@@ -80,7 +91,10 @@ class Inspection:
         return not self.problem
 
     def document(self, file: Path, sheet: Path | None) -> dict[str, Any]:
-        """Return the JSON document of the inspection. `sheet`: path of the written contact sheet, or None."""
+        """Return the document that `trilane inspect --json` prints.
+
+        `file`: inspected file. `sheet`: contact sheet that was written; None if no sheet was written.
+        """
         found = {key: value for key, value in asdict(self.detected).items() if key not in ("joints", "unmapped")}
         mapped = dict(self.detected.joints)
         missing = [name for name in BODY_JOINTS if name not in mapped] if mapped else []
@@ -101,12 +115,18 @@ class Inspection:
 
 
 def used(option: str, file: Path) -> str:
-    """Return a `trilane run` command with `file`, after `option` if that is not empty, quoted for a shell."""
+    """Return a `trilane run` command that uses `file`, quoted for a shell.
+
+    `option`: option that takes the file, such as `--motion`; empty if the file is an argument.
+    """
     return shlex.join(["trilane", "run", *([option] if option else []), str(file)])
 
 
 def refused(kind: str, what: str, error: BadInputError, file: Path) -> Inspection:
-    """Return the inspection of a file that its reader refuses with `error`."""
+    """Return the inspection of a file that its reader refuses with `error`.
+
+    `kind`: kind of the file. `what`: description of the file in words. The problem names the place inside of `file`.
+    """
     where = error.where
     for itself in (str(file), str(file.absolute())):
         if where.startswith(itself):
@@ -117,7 +137,11 @@ def refused(kind: str, what: str, error: BadInputError, file: Path) -> Inspectio
 
 @dataclass(frozen=True)
 class _Tile:
-    """A square of `side` pixels to draw on. `middle` (2,): point at its centre, metres. `scale`: pixels per metre."""
+    """A square picture that shows points given in metres.
+
+    `draw`: Pillow's tool that draws on the picture. `side`: side of the picture in pixels. `middle` (2,): point at the
+    centre, in metres. `scale`: pixels per metre.
+    """
 
     draw: ImageDraw.ImageDraw
     side: int
@@ -125,7 +149,7 @@ class _Tile:
     scale: float
 
     def at(self, points: F64) -> list[tuple[float, float]]:
-        """Return the pixels (x, y) of points (N, 2), metres."""
+        """Return the pixel coordinates (x, y), y down, of `points` (N, 2), in metres, y up."""
         pixels = (points - self.middle) * (self.scale, -self.scale) + self.side / 2
         return [(float(x), float(y)) for x, y in pixels]
 
@@ -145,10 +169,10 @@ class _Tile:
 
 
 def drawn_skeletons(joints: F64, times_s: F64, path: F64) -> Image.Image:
-    """Return a sheet with a row of tiles for each view: the skeleton at each moment, and the path of the pelvis.
+    """Return a sheet with a row for each view: a tile for the skeleton at each time, and a tile for the pelvis path.
 
-    `joints` (M, 55, 3): places of the joints, metres, Y up, at the times `times_s` (M,). `path` (T, 3): places of the
-    pelvis, metres.
+    `joints` (M, 55, 3): places of the joints at each time, in metres, Y up. `times_s` (M,): the times in seconds.
+    `path` (T, 3): places of the pelvis, in metres, Y up.
     """
     rows: list[list[Image.Image]] = []
     extent = _extent(path)
@@ -170,10 +194,10 @@ def drawn_skeletons(joints: F64, times_s: F64, path: F64) -> Image.Image:
 
 
 def drawn_cameras(turns: F64, places: F64) -> Image.Image:
-    """Return a sheet with three views of a camera path, and the camera at some of its places.
+    """Return a sheet with three views of a camera path, and the camera at up to `CAMERAS` of its places.
 
-    `turns` (N, 3, 3), `places` (N, 3): rotation and place of the camera, camera to world, metres, Y up; the camera
-    looks along its -Z.
+    `turns` (N, 3, 3): rotation matrices, camera to world; the camera looks along its own -Z axis.
+    `places` (N, 3): places of the camera in the world, in metres, Y up.
     """
     chosen = np.unique(np.linspace(0, len(places) - 1, min(CAMERAS, len(places))).round().astype(int))
     size = max(float(np.ptp(places, axis=0).max()), LEAST_EXTENT_M) * 0.09
@@ -187,7 +211,7 @@ def drawn_cameras(turns: F64, places: F64) -> Image.Image:
 
 
 def drawn_points(vertices: F64) -> Image.Image:
-    """Return a sheet with three views of points. `vertices` (V, 3): places, metres, Y up."""
+    """Return a sheet with three views of a body's points. `vertices` (V, 3): places of the points, in metres, Y up."""
     tiles, extent = [], _extent(vertices)
     radius = 0.5 if len(vertices) > SPARSE else 3
     for name, view in VIEWS.items():
@@ -216,10 +240,12 @@ def _path_tile(
     every: F64 | None = None,
     seen: tuple[F64, F64, F64] | None = None,
 ) -> Image.Image:
-    """Return a tile with a path and a scale bar. `path` (T, 2): points, metres. `side`: pixels of the tile.
+    """Return a tile with a path and a scale bar.
 
-    `extent`: metres that the tile shows. `every` (N, 2): points around whose middle the tile is centred; None for
-    `path`. `seen`: cameras to draw, as (eyes, corners, view), or None.
+    `path` (T, 2): points of the path, in metres. `name`: title of the tile. `side`: side of the tile in pixels.
+    `extent`: metres that the tile shows along a side. `every` (N, 2): points whose bounding box is centred in the tile;
+    None for the points of `path`. `seen`: cameras to draw, None for no cameras: their places (K, 3), the corners of
+    their frustums (K, 4, 3), both in metres, and the axes of the view (2, 3).
     """
     room = path if every is None else every
     low, high = room.min(axis=0), room.max(axis=0)
@@ -239,7 +265,7 @@ def _path_tile(
 
 
 def _extent(points: F64) -> float:
-    """Return the longest side of the box around points (N, 3), metres, at least `LEAST_EXTENT_M`."""
+    """Return the longest side of the bounding box of `points` (N, 3), in metres, at least `LEAST_EXTENT_M`."""
     return max(float(np.ptp(points, axis=0).max()), LEAST_EXTENT_M)
 
 

@@ -1,7 +1,8 @@
-"""Describes motions, cameras, pictures, bodies, avatars, networks, scenes and runs, each by a command's own reader.
+"""Describes motions, cameras, pictures, bodies, avatars, networks, scenes and runs.
 
-Rule: the reader finds all facts and decides whether a file is usable; this module only adds words. Nothing is placed in
-a scene, so all facts are about the file alone. Pictures and videos are read like a background.
+Rule: each file is read by the function that the other commands use. This function finds the facts and decides whether
+the file is usable; this module only adds words. Nothing is placed in a scene. Therefore all facts are about the file
+alone. Pictures and videos are read as backgrounds.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ MOST_PATH_POINTS = 2000
 
 
 def inspect_body(path: Path) -> Inspection:
-    """Describe a body. Raises BadInputError if it is not usable."""
+    """Describe a body file. Raises BadInputError if the body is not usable."""
     shaped = load_body(path).shape()
     height = float(np.ptp(shaped.vertices[:, 1]))
     facts = {
@@ -81,7 +82,7 @@ def _drawn_body(vertices: F32) -> Image.Image:
 
 
 def inspect_avatar(path: Path) -> Inspection:
-    """Describe an avatar. `path`: its folder or manifest. Raises BadInputError if the bundle is not usable."""
+    """Describe an avatar. `path`: its bundle's folder or manifest. Raises BadInputError if the bundle is not usable."""
     folder = path if path.is_dir() else path.parent
     bundle = load_bundle(folder)
     found = bundle_facts(bundle)
@@ -133,7 +134,10 @@ def inspect_network(path: Path) -> Inspection:
 
 
 def inspect_scene(path: Path) -> Inspection:
-    """Describe a scene. The files that it names are not read; a missing one makes it unusable. Raises BadInputError."""
+    """Describe a scene. The files that the scene names are not read. If one of them is missing, the scene is unusable.
+
+    Raises BadInputError if the scene itself cannot be read.
+    """
     values = load_scene(path)
     avatars = values["avatars"]
     named = [values["background"], values["camera"]["source"], *(raw["motion"] for raw in avatars)]
@@ -147,7 +151,7 @@ def inspect_scene(path: Path) -> Inspection:
 
 
 def inspect_profile(path: Path) -> Inspection:
-    """Describe a hardware profile. Raises BadInputError if it is not usable."""
+    """Describe a hardware profile. Raises BadInputError if the profile is not usable."""
     profile = load_profile(path)
     found = Detected("hardware profile", "TOML with a title and units")
     return Inspection(
@@ -161,7 +165,10 @@ def inspect_profile(path: Path) -> Inspection:
 
 
 def inspect_run(path: Path) -> Inspection:
-    """Describe a run. `path`: its folder or journal. Raises BadInputError if neither report nor journal is readable."""
+    """Describe a run by its report or, without a report, by its journal. `path`: folder or journal of the run.
+
+    Raises BadInputError if this report or journal cannot be read.
+    """
     folder = path if path.is_dir() else path.parent
     sheet = folder / SHEET
     detected = Detected("run folder", "a report or a journal in it")
@@ -214,7 +221,7 @@ def inspect_sweep_file(path: Path) -> Inspection:
 
 
 def inspect_trace(path: Path) -> Inspection:
-    """Describe a trace, of Perfetto or in Chrome's format. Raises BadInputError if `path` is no trace."""
+    """Describe a trace in Perfetto's or Chrome's format. Raises BadInputError if `path` is no trace."""
     events = _trace_events(path)
     found, advice = Detected("trace", "its events"), "open it at https://ui.perfetto.dev"
     return Inspection("trace", f"a trace of {events} events", "", advice, found, facts={"events": events})
@@ -244,7 +251,7 @@ def _packets(path: Path) -> int:
 
 
 def inspect_motion(path: Path) -> Inspection:
-    """Describe a motion. Raises BadInputError if it is not usable."""
+    """Describe a motion file. Raises BadInputError if the motion is not usable."""
     motion = load_motion(AvatarSpec(motion=str(path.absolute())), Path(), _body().joints)
     places = motion.translation
     facts = {
@@ -267,7 +274,7 @@ def inspect_motion(path: Path) -> Inspection:
 
 
 def inspect_camera(path: Path) -> Inspection:
-    """Describe a camera path. Raises BadInputError if it is not usable."""
+    """Describe a camera path. Raises BadInputError if the path is not usable."""
     camera = load_camera(CameraSpec(source=str(path.absolute())), Path())
     low, high = camera.places.min(axis=0), camera.places.max(axis=0)
     steps = np.linalg.norm(np.diff(camera.places, axis=0), axis=1)
@@ -294,7 +301,7 @@ def inspect_camera(path: Path) -> Inspection:
 
 @cache
 def _body() -> ShapedBody:
-    """Return the body on which motions are drawn: the default avatar's."""
+    """Return the body of the default avatar, whose skeleton shows the motions."""
     return load_body(bundle_folder(DEFAULT) / "body.npz").shape()
 
 
@@ -314,7 +321,7 @@ def _drawn_camera(camera: CameraPath) -> Image.Image:
 
 
 def _thinned(samples: np.ndarray) -> np.ndarray:
-    """Return at most MOST_PATH_POINTS of `samples` (N, ...), evenly spread, with the first and the last."""
+    """Return at most MOST_PATH_POINTS of `samples` (N, ...), evenly spread. The first and the last sample are kept."""
     if len(samples) <= MOST_PATH_POINTS:
         return samples
     return np.asarray(samples[np.linspace(0, len(samples) - 1, MOST_PATH_POINTS).round().astype(int)])
@@ -327,7 +334,10 @@ DAMAGED = (OSError, ValueError, SyntaxError, Image.DecompressionBombError)
 
 
 def inspect_picture(path: Path) -> Inspection:
-    """Describe a picture, or a video if it has several frames. Raises BadInputError if no background can use it."""
+    """Describe a picture. A file with several frames, such as a GIF, is described as a video.
+
+    Raises BadInputError if the file cannot be a background.
+    """
     if not is_picture(path) and _moves(path):
         return inspect_video(path)
     thumb = read_picture(path, THUMB)
@@ -353,7 +363,11 @@ def _moves(path: Path) -> bool:
 
 
 def picture_facts(path: Path) -> tuple[str, dict[str, Any]]:
-    """Return a picture's encoding, and its `width`, `height`, `mode` and `exif_orientation`. Raises BadInputError."""
+    """Return a picture's encoding, such as `PNG`, and its facts by name.
+
+    The facts are `width` and `height` in pixels, Pillow's `mode`, and `exif_orientation` (1 to 8, 1 if not stated).
+    Raises BadInputError for a file that is no readable picture.
+    """
     try:
         with warnings.catch_warnings(action="ignore"), Image.open(path) as image:
             turn = image.getexif().get(ExifTags.Base.Orientation, 1)
@@ -396,13 +410,16 @@ def inspect_folder(path: Path) -> Inspection:
 
 
 def _folder_rate(footage: Footage) -> str:
-    """Return the rate of the pictures in words, with notes. Without times, each frame of the scene has one picture."""
+    """Return the rate of the pictures in words, followed by notes.
+
+    If the pictures have no times, each frame of the scene takes one picture.
+    """
     own = footage.rate if footage.clock_s else ("the scene's, one a frame", *footage.rate[1:])
     return "; ".join(own)
 
 
 def inspect_video(path: Path) -> Inspection:
-    """Describe a video. Raises BadInputError if no background can use it."""
+    """Describe a video. Raises BadInputError if the video cannot be a background."""
     footage = survey(path, FOLDER_FPS)
     try:
         with av.open(str(path), metadata_errors="replace") as container:
@@ -429,7 +446,7 @@ def inspect_video(path: Path) -> Inspection:
 
 
 def _counted(path: Path) -> int:
-    """Return the number of frames of a video, counted in the file, at most MOST_PACKETS."""
+    """Return the number of frames in a video file, counted up to MOST_PACKETS packets."""
     with av.open(str(path), metadata_errors="replace") as container:
         packets = container.demux(container.streams.video[0])
         return sum(packet.size > 0 for packet in itertools.islice(packets, MOST_PACKETS))
@@ -448,7 +465,10 @@ def _video_facts(stream: Any) -> dict[str, Any]:
 
 
 def _rotation(stream: Any) -> int:
-    """Return by how many degrees the file has its first frame turned clockwise; 0 without a frame."""
+    """Return the clockwise turn of a video's first frame, as the file states it, in degrees: 0, 90, 180 or 270.
+
+    A video without frames gives 0.
+    """
     for frame in stream.container.decode(stream):
         return 90 * quarters_of(frame)
     return 0
@@ -461,7 +481,7 @@ def _seconds(container: Any, stream: Any) -> float:
 
 
 def _film(path: Path, seconds: float) -> Image.Image:
-    """Return a sheet with frames of a video at evenly spread times. `seconds`: length of the video."""
+    """Return a contact sheet of frames of the video `path`, at evenly spread times. `seconds`: length of the video."""
     background = open_background(path, THUMB, FOLDER_FPS)
     pictures, captions = [], []
     try:
