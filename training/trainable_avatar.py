@@ -468,7 +468,7 @@ class ByteGrid:
         low, high = map(float, self.ends[place])
         step = (high - low) / BYTE
         zero = round(-low / step)
-        rounded: Tensor = _Rounded.apply(x, -zero * step, (BYTE - zero) * step, step)  # type: ignore[no-untyped-call]
+        rounded: Tensor = _Rounded.apply(x, -zero * step, (BYTE - zero) * step, step)
         return rounded
 
 

@@ -27,7 +27,7 @@ from onnx import helper, numpy_helper
 
 from trilane import machine
 from trilane.arrays import BUCKET_STEP, F32, F64, U8, Shape
-from trilane.avatars.bundle import BUILT_IN, Bundle, bundle_folder
+from trilane.avatars.bundle import Bundle, bundle_folder
 from trilane.avatars.manifest import sha256_of
 from trilane.avatars.network_file import NetworkFile, constants_of, reshaped
 from trilane.bench.lib import float_raster
@@ -41,6 +41,7 @@ from trilane.stages.gpu.skinned_mesh import MeshArrays, avatar_mesh
 from trilane.training.clothing import clothing_layers, find_landmarks, look_of
 from trilane.training.sample_renderer import ClothedBody
 from trilane.training.surface import body_arrays
+from trilane.units import AVATARS
 
 #: Number of points along each side of a tensor pixel at which the neural texture is read.
 SAMPLES = 4
@@ -223,7 +224,7 @@ def true_pictures(cast: Cast, ctx: Any) -> TruePictures | None:
 
     `ctx`: OpenGL context in use.
     """
-    is_known = set(cast.avatars) <= {bundle_folder(name).absolute() for name in BUILT_IN}
+    is_known = set(cast.avatars) <= {bundle_folder(name).absolute() for name in AVATARS}
     return TruePictures(cast, ctx) if is_known else None
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from trilane.avatars.bundle import (
-    BUILT_IN,
     as_kept,
     bundle_folder,
     load_bundle,
@@ -20,6 +19,7 @@ from trilane.avatars.bundle import (
 )
 from trilane.avatars.manifest import digests_of
 from trilane.errors import BadInputError
+from trilane.units import AVATARS
 
 
 def some_offsets(vertices: int) -> np.ndarray:
@@ -93,7 +93,7 @@ def test_a_manifest_s_offsets_lie_in_its_folder(raised: Path, tmp_path: Path) ->
             load_bundle(raised)
 
 
-@pytest.mark.parametrize("name", BUILT_IN)
+@pytest.mark.parametrize("name", AVATARS)
 def test_avatars_of_the_package_wear_clothes_and_their_figures_are_of_their_files(name: str) -> None:
     """Clothes stand off by a centimetre or two in the mean, hair and shoes by some more."""
     bundle = load_bundle(name)
