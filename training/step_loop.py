@@ -7,6 +7,7 @@ as one that was never interrupted.
 from __future__ import annotations
 
 import copy
+import ctypes
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -188,6 +189,9 @@ def _measured(
 # Rule: a device that is named is used, or an error says that the device is absent. Only `auto` leaves a choice.
 
 MB = 1e6
+#: Numbers and values of options of glibc (malloc.h). M_MMAP_MAX: no memory apart from the heap. M_TRIM_THRESHOLD: bytes
+#: at the heap's end from which they are returned to the kernel.
+MALLOC_OPTIONS = ((-4, 0), (-1, 2**31 - 1))
 
 
 def chosen_device(asked: str) -> torch.device:
@@ -204,6 +208,17 @@ def device_words(device: torch.device, threads: int) -> str:
     if device.type == "cuda":
         return f"the GPU {torch.cuda.get_device_name(device)}"
     return f"{threads} {'thread' if threads == 1 else 'threads'} of the CPU"
+
+
+def keep_freed_memory() -> None:
+    """Make the C library keep the memory that this process frees, if the C library is glibc.
+
+    By default, glibc returns large tensors to the kernel, which clears the same memory for the next tensor.
+    """
+    set_option = getattr(ctypes.CDLL(None), "mallopt", None)
+    if set_option is not None:
+        for option, value in MALLOC_OPTIONS:
+            set_option(option, value)
 
 
 def memory_words(device: torch.device) -> str:

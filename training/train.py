@@ -52,6 +52,7 @@ from trilane.training.step_loop import (
     chosen_device,
     device_words,
     first_state,
+    keep_freed_memory,
     load_state,
     memory_words,
     probe_loss,
@@ -138,6 +139,7 @@ def train_avatar(places: TrainingPlaces, asked: TrainingSettings, listener: List
     settings = resumed_settings(places.work / NAME, with_vgg(asked, places.vgg))
     vgg = read_vgg16(places.vgg) if places.vgg is not None else None
     torch.set_num_threads(settings.threads)
+    keep_freed_memory()
     listener.say(f"trains on {device_words(chosen_device(settings.device), settings.threads)}")
     if settings.loss.perceptual:
         listener.say(f"perceptual loss: {'MS-SSIM' if vgg is None else f'features of VGG-16 in {places.vgg}'}")

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -393,3 +395,23 @@ def test_what_has_no_gradient_neither_moves_nor_decays_nor_forgets() -> None:
     assert torch.equal(optimiser.state[parameter]["exp_avg"][3], moment[3])
     parameter.grad = None
     optimiser.step()
+
+
+#: Prints how many pages the kernel clears for ten tensors of 64 MB, each freed before the next, in a large heap.
+FREED = """
+import resource, torch
+from trilane.training.step_loop import keep_freed_memory
+keep_freed_memory()
+for count in (10, 10):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(count):
+        torch.empty(16_000_000).fill_(1.0)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the option is one of glibc")
+def test_memory_that_a_step_frees_is_there_for_the_next() -> None:
+    """Without the option, ten tensors take 156,250 new pages of 4 KiB. One tensor has 15,625 pages."""
+    done = subprocess.run([sys.executable, "-c", FREED], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 15_625
