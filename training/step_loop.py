@@ -189,9 +189,9 @@ def _measured(
 # Rule: a device that is named is used, or an error says that the device is absent. Only `auto` leaves a choice.
 
 MB = 1e6
-#: Numbers and values of options of glibc (malloc.h). M_MMAP_MAX: no memory apart from the heap. M_TRIM_THRESHOLD: bytes
-#: at the heap's end from which they are returned to the kernel.
-MALLOC_OPTIONS = ((-4, 0), (-1, 2**31 - 1))
+#: Numbers and values of options of glibc (malloc.h), bytes. M_MMAP_THRESHOLD: from this size on, memory lies apart from
+#: the heap; 32 MiB is the most. M_TRIM_THRESHOLD: free memory at the heap's end that is returned to the kernel.
+MALLOC_OPTIONS = ((-3, 2**25), (-1, 2**31 - 1))
 
 
 def chosen_device(asked: str) -> torch.device:
@@ -213,7 +213,8 @@ def device_words(device: torch.device, threads: int) -> str:
 def keep_freed_memory() -> None:
     """Make the C library keep the memory that this process frees, if the C library is glibc.
 
-    By default, glibc returns large tensors to the kernel, which clears the same memory for the next tensor.
+    By default, glibc returns large tensors to the kernel, which clears the same memory for the next tensor. Without
+    the bound of 32 MiB on what stays in the heap, the heap would grow for as long as tensors have other sizes.
     """
     set_option = getattr(ctypes.CDLL(None), "mallopt", None)
     if set_option is not None:
