@@ -111,8 +111,9 @@ def level_facts(level: MeshLevel, side: int) -> dict[str, Any]:
 def add_levels(bundle: Bundle) -> dict[str, Any]:
     """Make coarser levels of the mesh of `bundle`, write them into the avatar's folder, and return facts about them.
 
-    Keys: `avatar`, path of the folder. `triangles`, number in the whole mesh. `levels`, list of the `level_facts`.
-    Raises BadInputError for a file that is wrong or cannot be written, MissingPartError for a missing package.
+    Keys: `avatar`, path of the folder. `triangles`, number in the whole mesh. `levels`, list with the `level_facts` of
+    each level.
+    Raises BadInputError for a file that is wrong or cannot be written, MissingPartError without meshoptimizer.
     """
     from trilane.training.mesh_levels import make_mesh_levels
 
@@ -252,9 +253,10 @@ def _manifest(base: Bundle, parts: Parts, network: NetworkFile, name: str) -> Ma
 def _provenance(own: Manifest, parts: Parts) -> dict[str, Any]:
     """Return the provenance for the manifest of a new avatar.
 
-    The entries about the body stay if the body is not replaced. The entry about the weights stays if the network is not
-    replaced. All other entries are stored as they are under `base`.
-    `own`: manifest of the avatar that gives all other files.
+    Its `base` is the whole provenance of the old avatar. The entries about the body also stay at the top if the body is
+    not replaced; the entry about the weights, if the network is not replaced.
+    `own`: manifest of the old avatar.
+    `parts`: files that replace files of the old avatar.
     """
     stays = {"body": (parts.body, CAPTURED), "weights": (parts.network, UNTRAINED)}
     kept = {key: word for key, (part, word) in stays.items() if part is None and own.provenance.get(key) == word}

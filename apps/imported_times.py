@@ -60,7 +60,7 @@ def document(reads: Sequence[Measurements]) -> dict[str, Any]:
 def samples_csv(reads: Sequence[Measurements]) -> str:
     """Return a CSV with a row for each sample of each measurement. `trilane times` can read this CSV.
 
-    The columns are `OWN_COLUMNS`; samples are in the measurement's own unit, and are numbered from 0.
+    The columns are `OWN_COLUMNS`; the column `sample` counts the samples of a measurement from 0.
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
