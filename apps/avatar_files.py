@@ -253,8 +253,8 @@ def _manifest(base: Bundle, parts: Parts, network: NetworkFile, name: str) -> Ma
 def _provenance(own: Manifest, parts: Parts) -> dict[str, Any]:
     """Return the provenance for the manifest of a new avatar.
 
-    Its `base` is the whole provenance of the old avatar. The entries about the body also stay at the top if the body is
-    not replaced; the entry about the weights, if the network is not replaced.
+    Its key `base` has the whole provenance of the old avatar. The entries about the body also stay at the top if the
+    body is not replaced. The entry about the weights stays if the network is not replaced.
     `own`: manifest of the old avatar.
     `parts`: files that replace files of the old avatar.
     """

@@ -305,7 +305,8 @@ class TimeTable:
     def near(self, time: float, reach: float, most: int) -> NDArray[Any]:
         """Return the rows that overlap the interval from `time - reach` to `time + reach`, sorted by begin.
 
-        `most`: largest number of rows to return; the rows nearest to `time` are chosen.
+        `time`: middle of the interval. `reach`: half its length.
+        `most`: largest number of rows to return; if there are more, the rows nearest to `time` are returned.
         """
         low, high = time - reach, time + reach
         touching = [piece for piece in self._pieces if piece.begin <= high and piece.end >= low]

@@ -298,8 +298,8 @@ class FileWatch:
     """Shows a pipeline file's run on the page, and passes the page's requests to the run.
 
     It is a viewer as `trilane.apps.run.run_file.Watch` describes.
-    `link`: function that makes the link to the page's server. Its arguments are the height and width of pictures in
-    pixels, and a function that gets each request of the page, on a thread of its own.
+    `link`: function that makes the link to the page's server. Its first arguments are the height and width of pictures
+    in pixels. Its last argument is a function that gets each request of the page, on a thread of its own.
     """
 
     def __init__(self, link: Callable[[int, int, Callable[[ControlAsked | ChangesAsked], None]], ServerLink]) -> None:
