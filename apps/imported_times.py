@@ -39,7 +39,7 @@ UNIT_OF_WORD: Final = {
 def document(reads: Sequence[Measurements]) -> dict[str, Any]:
     """Return the document of `trilane times --json`: the files, their measurements and the refused rows.
 
-    Each is a list of mappings, with the keys `files`, `measurements` and `refused`.
+    The document has the keys `files`, `measurements` and `refused`; each value is a list of mappings.
     """
     return {
         "files": [
@@ -76,8 +76,8 @@ def one_of(reads: Sequence[Measurements], name: str) -> tuple[Measurements, Meas
 
     `reads`: files to search.
     `name`: name of the measurement; empty for the only run of the only file.
-    Raises BadInputError if no file or several files have the measurement, or if its value cannot be a service time. For
-    an empty name, raises BadInputError for several files or several runs.
+    Raises BadInputError if no file or several files have the measurement, or if the measurement cannot be a service
+    time. For an empty name, raises BadInputError for several files or several runs.
     """
     holding = [read for read in reads if any(each.name == name for each in read.measurements)] if name else reads
     if not holding:
@@ -154,9 +154,10 @@ def with_row(
     and whether each value comes from the measured file or is assumed. The file `path` need not exist.
     `read`: measurements of the file that contains `measurement`.
     `network`: path of the network, relative to the folder of the table.
-    `asked`: value for each column in OPTION_OF. None means the value in the measured file or, without one, the fit's
-    default.
-    Raises BadInputError for the time of a layer, for a table with other columns, and for a missing network.
+    `asked`: value for each column in OPTION_OF. None means the value in the measured file or, if the file has no such
+    value, the fit's default.
+    Raises BadInputError for the time of a layer, for a table with other columns, for a missing network and for an
+    unknown value.
     """
     if measurement.kind == "layer":
         runs = [repr(each.name) for each in read.measurements if each.kind == "run"]

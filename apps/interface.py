@@ -86,7 +86,8 @@ class Run:
     def jobs(self) -> NDArray[Any]:
         """All jobs in the order of their ends: a structured array of shape (jobs,), with the fields of docs/explain.md.
 
-        Times are int64, ns; words are `str_`. A stage's metrics are float64, and NaN in the jobs of other stages.
+        Times are int64, ns; words are `str_`, flags are bool. A stage's metrics are float64, and NaN in the jobs of
+        other stages.
         Raises BadInputError for a missing or broken journal.
         """
         figures = figure_names(self.folder)
@@ -223,7 +224,7 @@ def _signature(
     `function`: `run` or `predict`.
     `model`: class of the options.
     `names`: names of the options to include.
-    `defaults`: defaults by name that replace the defaults of `model`; None replaces none.
+    `defaults`: defaults by name that replace the defaults of `model`; None to keep all defaults.
     """
     signature = inspect.signature(function, eval_str=True)
     first, *told, _ = signature.parameters.values()

@@ -215,9 +215,9 @@ def _pair(name: str, base: Side, other: Side) -> GatedPair:
 
 
 def _configurations(folder: Path) -> dict[str, dict[int, Mapping[str, Any]]]:
-    """Return the records of the trials in `folder`, by configuration, and for each by number of the repeat.
+    """Return the trials of the sweep in `folder`, as {configuration: {number of the repeat: record of the trial}}.
 
-    A key of the result is the command and the options as JSON text. Records are in the order in which the trials ended.
+    A configuration is the command and the options as JSON text. The records are in the order in which the trials ended.
     Raises BadInputError for a trial without command or options.
     """
     found: dict[str, dict[int, Mapping[str, Any]]] = {}

@@ -358,11 +358,12 @@ def _heads(found: Rows) -> Iterator[str]:
 
 
 def _works(found: Rows, rows: Rows, changes: Sequence[Change]) -> Iterator[str]:
-    """Yield a phrase for each stage that takes longer or shorter, the largest change in ms first.
+    """Yield a phrase for each stage that takes longer or shorter, the largest change in ms first, `MOST_NAMED` at most.
 
-    Stages with counted instructions are left out, because `_programs` names them.
-    `found`: rows that differ. `rows`: all rows. `changes`: changes of settings, which may explain the change of a
-    stage.
+    Stages whose instructions differ are left out, because `_programs` names them.
+    `found`: rows that differ.
+    `rows`: all rows.
+    `changes`: changes of settings, which may explain the change of a stage.
     """
     by_stage: dict[str, tuple[Figure, Difference]] = {}
     counted = {figure.of for figure in found if figure.measure in (INSTRUCTIONS, INSTRUCTION_TIME)}
@@ -381,11 +382,13 @@ def _works(found: Rows, rows: Rows, changes: Sequence[Change]) -> Iterator[str]:
 
 
 def _waits(found: Rows, rows: Rows, stages: Mapping[str, Sequence[str]]) -> Iterator[str]:
-    """Yield a phrase for each unit that waits more if frames take longer, or waits less if frames take less time.
+    """Yield phrases for units that wait more if frames take longer, or less if frames take less time.
 
-    If the frame time does not differ, yield both kinds. Increases come first. Within increases and decreases, the units
-    that were busiest in the base come first.
-    `found`: rows that differ. `rows`: all rows. `stages`: names of the stages of each unit.
+    If the frame time does not differ, both kinds are yielded. Increases come first. Within increases and decreases, the
+    units that were busiest in the base come first. At most `MOST_NAMED` units are named.
+    `found`: rows that differ.
+    `rows`: all rows.
+    `stages`: names of the stages of each unit.
     """
     frame_time = next((row.change for figure, row in found.items() if figure.measure == FRAME_TIME), 0.0)
     telling = [
@@ -462,9 +465,10 @@ def _amount(value: float, row: Difference, unit: str, sign: str = "") -> str:
 
 
 def _number(value: float, sign: str = "") -> str:
-    """Return a number as text with three digits. A number of 1000 or more is rounded to an integer, without exponent.
+    """Return a number as text with three significant digits; from 1000 on, rounded to an integer, without exponent.
 
-    `value`: the number. `sign`: as in `_amount`.
+    `value`: the number.
+    `sign`: as in `_amount`.
     """
     return f"{value:{sign}.3g}" if abs(value) < WITHOUT_FRACTION else f"{value:{sign}.0f}"
 

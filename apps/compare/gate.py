@@ -2,7 +2,7 @@
 
 Rule: a pass needs proof. A limit is broken if a figure surely became worse, and its interval reaches beyond the limit.
 A limit is kept if the whole interval lies within the limit, on a quiet machine. Otherwise, the outcome is unknown, and
-the gate states the number of runs that would decide.
+the gate states how many runs would decide, if more runs can decide.
 
 Three kinds of figures are judged: the frame time, without the share of other programs; each stage's time and CPU time;
 each stage's counted instructions. Counts of instructions repeat to 0.1 %. They alone decide the limit `slower` under
@@ -239,8 +239,9 @@ class JudgedLimit(NamedTuple):
 def whole(judged: Sequence[JudgedLimit]) -> LimitOutcome:
     """Return the outcome of all limits together.
 
-    If a limit is broken, the outcome is broken. Otherwise, if the outcome of a limit is unknown, it is unknown. Without
-    such a limit, it is kept.
+    The result is BROKEN if any limit is broken. Without a broken limit, it is UNKNOWN if the outcome of any limit is
+    unknown, otherwise KEPT.
+    `judged`: judgement of each limit.
     """
     found = [each.outcome for each in judged]
     return next(

@@ -126,8 +126,7 @@ def _document(path: Path) -> Mapping[str, Any]:
 
 
 def _names(trials: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return names for the trials of one sweep: the values of the options in which they differ, such as `256,
-    openvino`.
+    """Return names for the trials of one sweep: the values of the options that differ, such as `256, openvino`.
 
     If several of these options have numbers, these options are written with their names. An option that is on or off is
     written as `key` or `no key`. If several trials would have the same name, the number of the repeat is added to each.
@@ -189,9 +188,9 @@ def _dict(value: Any) -> dict[str, Any]:
 def _video(folder: Path, name: Any) -> Path | None:
     """Return the path of the video in a trial's run folder; the file may not exist.
 
+    None is returned if `name` is no text, or leads out of the sweep's folder.
     `folder`: folder of the sweep.
-    `name`: name of the run folder from the trial's record. None is returned if it is no text, or leads out of the
-    sweep's folder.
+    `name`: name of the run folder from the trial's record.
     """
     if not isinstance(name, str):
         return None
@@ -344,7 +343,10 @@ def _shows(scene: Mapping[str, Any]) -> str:
 
 
 def _unusual(scene: Mapping[str, Any]) -> Iterator[str]:
-    """Yield key and value of the settings of `scene` that differ from the defaults, such as `frames 60`."""
+    """Yield key and value of the settings of `scene` that differ from the defaults, such as `frames 60`.
+
+    Settings in `HOW_DRAWN` and `WITHOUT_KEY` are left out.
+    """
     usual = dict(_settings(Scene().model_dump(mode="json")))
     for key, value in _settings(scene):
         plain = re.sub(r"^avatars\[\d+\]", "avatars[0]", key)

@@ -182,8 +182,8 @@ def _chance(measure: str, of: str, statistic: str, noise: Noise) -> Chance:
 def _of_summaries(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figure, Difference]]:
     """Yield each figure that the summaries of all runs have, with its difference.
 
-    Means, medians and shares scatter within a run like the mean frame time. If this scatter is unknown, they have an
-    unknown uncertainty. All other statistics always have an unknown uncertainty.
+    Means, medians and shares scatter within a run like the mean frame time. If the scatter of the mean frame time is
+    unknown, their uncertainty is unknown too. The uncertainty of all other statistics is always unknown.
     `base`, `other`: runs of each side.
     `noise`: noise between the runs of the two sides.
     """
@@ -365,7 +365,7 @@ class Noise(NamedTuple):
         return self._chance(TAILS.get(statistic, 1.0) * (WALL_DEVIATION + self.others[0]), WAIT_FLOOR_MS)
 
     def of_share(self) -> Chance:
-        """Return the `Chance` of shares of the time."""
+        """Return the `Chance` of a share of the time, such as a busy share."""
         return self._chance(0.0, SHARE_DEVIATION, explained=self.others[2])
 
     def of_work(self, stage: str, statistic: str) -> Chance:

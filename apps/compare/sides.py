@@ -4,9 +4,9 @@ Rule: an error names what cannot be compared. A run folder with a journal has ev
 prediction, has summaries. A run that was killed has no report. Its journal gives the keys that a comparison reads, and
 `NOT_KNOWN` names the missing keys.
 
-An imported time is compared with the imported time, or the stage of a run, that has the same name. A single wall time
-is used as the frame time. The state of the machine is not known. Therefore two imported times scatter like any two runs
-on the host clock.
+An imported time is compared with the imported time, or the stage of a run, that has the same name. If a file has
+exactly one wall time, this is used as the frame time. The state of the machine is not known. Therefore two imported
+times scatter like any two runs on the host clock.
 """
 
 from __future__ import annotations

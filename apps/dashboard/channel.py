@@ -46,8 +46,8 @@ class RunBegins(NamedTuple):
     """A message to the server: a run begins.
 
     `folder`: folder into which the run writes its journal.
-    `facts`: fields of the run's `RunFacts`.
-    `controls`: fields of each `Control`.
+    `facts`: fields of the run's `RunFacts`, by name.
+    `controls`: fields of each `Control`, by name.
     """
 
     folder: str

@@ -252,7 +252,7 @@ def reasons_against(options: RunOptions) -> dict[str, str]:
 
 
 def _neighbours(avatar: str) -> Iterator[str]:
-    """Yield the folders of avatars in the folder around `avatar`, `avatar` itself included.
+    """Yield the paths of the first `MOST_AVATARS` avatars in the folder around `avatar`, in alphabetical order.
 
     Yield nothing if `avatar` is a built-in name or no folder.
     """

@@ -247,7 +247,10 @@ class RunView(Protocol):
         """
 
     def control(self, asked: ControlSaid) -> str:
-        """Carry out the request `asked` for one control, or begin to. Return why it is refused; "" if it is not."""
+        """Carry out the request `asked` for one control, or begin to.
+
+        Return why the request is refused, in words; "" for an accepted request.
+        """
 
     def restart(self, asked: ChangesSaid) -> Mapping[str, str]:
         """Request a new run with all changes in `asked`. Return the reason for each refusal, by control.
