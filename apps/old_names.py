@@ -1,6 +1,6 @@
 """Old names of commands and options, which work until the version `GONE_IN`, with a note.
 
-Rule: an old name with a new name of the same meaning stands here and nowhere else. Command lines, axes of a sweep and
+Rule: a name that was only replaced by a new name stands here and nowhere else. Command lines, axes of a sweep and
 options of a program are translated before any other code reads them.
 """
 

@@ -199,7 +199,7 @@ def _compared(base: Side, other: Side) -> Comparison:
 def _differing(rows: Rows, figures: Sequence[Figure]) -> tuple[Figure, ...]:
     """Return those of `figures` that differ significantly.
 
-    All figures are tested together. A figure without scatter needs no test and does not count among them.
+    All figures with scatter are tested together. A figure without scatter needs no test.
     `rows`: difference of each figure.
     """
     tested = {figure: rows[figure].probability or 0.0 for figure in figures if rows[figure].probability is not None}
@@ -232,7 +232,7 @@ def spoilt(runs: Sequence[ComparedRun]) -> Iterator[str]:
 
 
 def _about(told: ComparedRun) -> Iterator[str]:
-    """Yield remarks on the data of a run: kind of data, number of frames, end of the journal."""
+    """Yield remarks on the data of the run `told`: kind of data, number of frames, end of the journal."""
     if told.kind is RunKind.REPORT:
         yield "a report without a journal, so only summaries are compared, each as uncertain as the mean frame time"
     if told.kind is RunKind.TIMES:

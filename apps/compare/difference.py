@@ -168,9 +168,9 @@ def difference(
     then no scatter. If a run has too few frames for the statistic, the uncertainty is unknown.
     `base`, `other`: series of the figure in each run of a side.
     `statistic`: key of `STATISTICS`.
-    `is_ratio`: whether the change is a share of the base. If a value is 0 or less, the change is a plain difference in
-    any case.
-    `chance`: chance of the figure between runs of one kind.
+    `is_ratio`: whether the change is a share of the base. If the figure of any frame is 0 or less, the change is a
+    plain difference in any case.
+    `chance`: the `Chance` of the figure.
     """
     reduce = STATISTICS[statistic]
     sides = [[each.at(slice(-MOST_FRAMES, None)) for each in side] for side in (base, other)]
@@ -200,7 +200,7 @@ def settled(
     `values`: figure of each run, as two sequences: base, other side.
     `effects`: the same figures on the scale of `Difference.deviation`: logarithms for a ratio.
     `within`: variance of the change due to scatter within runs.
-    `chance`: chance of the figure between runs of one kind.
+    `chance`: the `Chance` of the figure.
     `is_ratio`: whether the change is a share of the base.
     """
     first, second = (float(side.mean()) for side in effects)

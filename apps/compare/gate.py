@@ -250,9 +250,11 @@ def whole(judged: Sequence[JudgedLimit]) -> LimitOutcome:
 
 
 def judge(gates: Sequence[Gate], pairs: Sequence[GatedPair]) -> list[JudgedLimit]:
-    """Return the judgement of every limit in `gates` for every pair, in the order of the pairs.
+    """Return the judgement of every limit for every pair.
 
-    All figures are tested together, so that false alarms are rare.
+    The judgements are in the order of `pairs`, and for each pair in the order of `gates`. All figures are tested
+    together, so that false alarms are rare.
+    `gates`: the limits.
     """
     asked = [(gate, pair, list(_weighed(gate, pair))) for pair in pairs for gate in gates]
     every = [each for _, _, figures in asked for each in figures if each.row.deviation]
@@ -287,7 +289,8 @@ def _is_said(figure: Figure, row: Difference, work: Difference | None, metric: G
 
     Service time adds nothing if it did not grow more than `work`; CPU time, if it is as long as `work`. If few jobs
     take much longer, the typical time does not show it, but the mean service time does. On a machine that is not quiet,
-    other programs make few jobs longer. Service time is not judged there, and no limit is kept anyway.
+    other programs make few jobs longer. Service time is not judged there, and no limit is kept anyway. If the metric
+    does not judge `work`, every figure adds something.
     `row`: difference of the figure.
     `work`: difference of the stage's typical time on its core; None if it is unknown.
     `metric`: metric with the limit.

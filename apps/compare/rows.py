@@ -83,7 +83,8 @@ class Figure(NamedTuple):
     """The subject of a row.
 
     `measure`: what is measured.
-    `of`: stage, unit or avatar, or for lost and dropped frames the cause; "" for the whole run.
+    `of`: stage, unit, or avatar with the key of its accuracy. For lost and dropped frames, it is the cause; "" means
+    the whole run.
     `cause`: cause of idle time, "" for other measures.
     `statistic`: as in `MEASURES`.
     `unit`: unit of the value, such as ms or share.
@@ -291,13 +292,13 @@ def _of_errors(base: Side, other: Side) -> Iterator[tuple[Figure, Difference]]:
 
 
 def exact_rows(base: Side, other: Side, key: str, unit: str) -> Rows:
-    """Return the differences of the numbers under one key of the reports, without scatter within a run.
+    """Return the differences of the float values under one key of the reports, without scatter within a run.
 
     The result is empty if a report lacks the key. It is also empty if the reports differ in integers, lists and texts
     under the key, such as the checked frames.
     `base`, `other`: runs of each side.
     `key`: key of the reports.
-    `unit`: unit of the numbers.
+    `unit`: unit of the values.
     """
     sides = [[told.document.get(key) or {} for told in side.runs] for side in (base, other)]
     every = [found for side in sides for found in side]
@@ -463,7 +464,7 @@ def _stages_by_cores(report: Mapping[str, Any]) -> Iterable[list[str]]:
 
 
 def remarks(reports: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return sentences on the share of the cores that other programs had.
+    """Return sentences about runs for which the share of other programs is unknown or large.
 
     `reports`: report of each run as JSON, by the run's name.
     """

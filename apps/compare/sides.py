@@ -340,9 +340,9 @@ Ms = Annotated[float, Field(ge=0, le=LONGEST_MS)]
 
 
 class ImportedTime(BaseModel):
-    """An imported time of a stage.
+    """An imported time, of a stage or of a whole run.
 
-    `name`: name of the stage.
+    `name`: name of the measurement, which is compared with the stage or measurement of the same name.
     `kind`: kind of the time, such as `run`, `layer` or `wall`.
     `count`: number of the single times. `sd_ms`: their standard deviation.
     `mean_ms`, `p50_ms`: mean and median of the single times.
@@ -380,7 +380,8 @@ def imported(document: Mapping[str, Any], path: Path) -> dict[str, Any]:
 
     `document`: content of the file with imported times.
     `path`: path of the file.
-    Raises BadInputError for a wrong key, no time, times of several files, and a name that occurs twice.
+    Raises BadInputError for a wrong key, for a file without a time, for times of several files, and for a name that
+    occurs twice.
     """
     rows = [_imported_time(row, f"{path}: {MEASUREMENTS}.{place}") for place, row in enumerate(document[MEASUREMENTS])]
     rows = [row for row in rows if row.ms >= SHORTEST_MS]

@@ -60,7 +60,7 @@ PIECE_ROWS = 4096
 
 
 class FinishedView:
-    """The `RunView` of the finished run in `folder`. Raises BadInputError as `_read_run` does."""
+    """The `RunView` of the finished run in `folder`. Raises BadInputError for a missing or broken journal."""
 
     def __init__(self, folder: Path) -> None:
         self._run = _read_run(folder)
@@ -276,7 +276,7 @@ class TimeTable:
     """A table in a temporary file. Each row has a begin and an end, and rows are found by time.
 
     The file consists of pieces of PIECE_ROWS rows. Memory holds only the offset, the number of rows, the earliest begin
-    and the latest end of each piece. Rows need not be sorted, but searches are faster if rows of similar times are
+    and the latest end of each piece. Rows need not be sorted exactly, but `near` is faster if rows of similar times are
     added together.
     `dtype`: type of a row, with the fields `begin` and `end` in one unit of time.
     """
@@ -323,7 +323,10 @@ class TimeTable:
         return rows[np.argsort(rows["begin"], kind="stable")]
 
     def last_before(self, time: float) -> np.void | None:
-        """Return the row with the latest end that is not after `time`; None if there is no such row."""
+        """Return the row with the latest end that is not after `time`; None if the table has no such row.
+
+        Only the last piece with such a row is searched. Therefore rows must be added about in the order of their ends.
+        """
         for piece in reversed(self._pieces):
             rows = self._read(piece)
             ended = rows[rows["end"] <= time]

@@ -196,7 +196,9 @@ class Director:
             return taken
 
     def do(self, asked: ControlAsked | ChangesAsked) -> None:
-        """Carry out the request `asked` of the page. The server has already checked its name and value."""
+        """Carry out the request `asked` of the page. The server has already checked the names and values in the
+        request.
+        """
         with self._lock:
             controls = self._controls
         if controls is None:

@@ -356,10 +356,9 @@ class LiveView:
         self._is_news = True
 
     def _now_ns(self) -> int | None:
-        """Return the present time in ns, for which to compute figures.
+        """Return the present time in ns, for which to compute figures; None for the time of the last record.
 
-        None is returned if the run is over, or if its journal is not fully read. It stands for the time of the last
-        record.
+        None is returned if the run is over, or if its journal is not fully read.
         """
         return None if self._is_behind or self._state in ("ended", "failed") else time.monotonic_ns()
 

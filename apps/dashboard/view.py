@@ -108,7 +108,7 @@ class Client:
 
 
 class Clients:
-    """All pages of a server."""
+    """All pages that are connected to a server."""
 
     def __init__(self) -> None:
         self._live: set[Client] = set()

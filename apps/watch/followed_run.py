@@ -48,7 +48,7 @@ def without_journal(folder: Path) -> str:
 
 
 class FollowedRun:
-    """A run that is followed by its journal. `name`: final name of the run folder.
+    """Follows a run by reading its journal. `name`: final name of the run folder.
 
     `folder`: run folder, partial or complete.
     Raises BadInputError if `folder` has no journal.

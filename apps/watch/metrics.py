@@ -99,7 +99,7 @@ class Metric(NamedTuple):
     `unit`: unit at the end of `name`, or "" for a plain number.
     `help`: meaning in one sentence.
     `labels`: names of its labels.
-    `rows`: function that returns label values and number of each row.
+    `rows`: function that returns the rows of the metric; a row has the values of the labels and the value.
     `source`: key of `MomentFigures.sources`; "" if the metric has no source there.
     """
 
@@ -144,7 +144,7 @@ def _psnr(figures: MomentFigures) -> Iterator[Row]:
 
 
 class Info(NamedTuple):
-    """A metric whose labels have the content; its value is always 1."""
+    """A metric whose content is in its labels; its value is always 1. `name`, `help`: as in `Metric`."""
 
     name: str
     help: str
