@@ -157,7 +157,8 @@ def assemble(base: Bundle, parts: Parts, out: Path) -> dict[str, Any]:
     `parts`: files that replace files of `base`.
 
     Keys: `avatar`, `made_from`, `replaced`, `network`, `texture`, `accuracy`.
-    Raises BadInputError before anything is written, if no part is given, `out` has files, or a part does not fit.
+    Raises BadInputError before anything is written: if no part is given, if a part does not fit, or if `out` exists and
+    is not an empty folder.
     """
     if not parts.files():
         raise BadInputError("avatar create", "no part", "--network, --texture or --body, at least one of them")
@@ -293,7 +294,7 @@ def _width(model: onnx.ModelProto) -> int:
 
 
 def _shapes(network: NetworkFile) -> str:
-    """Return a sentence on the tensor shapes at which the network can run."""
+    """Return a phrase on the tensor shapes at which the network can run."""
     _, height, width, _ = network.shape
     try:
         reshaped(network, STRIDE * 3, STRIDE * 5)
@@ -337,7 +338,7 @@ class _Recipe:
 
 
 def remade_avatar(name: str, options: RunOptions) -> tuple[Path, str]:
-    """Return the folder of the variant of an avatar for a run, and a sentence about the variant.
+    """Return the folder of the variant of an avatar for a run, and a phrase about the variant.
 
     The variant is made, or found in the cache. If `options` change nothing, the folder is the avatar's own.
     `name`: avatar, by name or folder.

@@ -203,7 +203,7 @@ class Entry:
     """One run, prediction or trial as a row of the table.
 
     `name`: name of its folder, or the options in which its trial differs from others. `trial`: id of its trial, "" for
-    none.
+    a run or prediction.
     `within`: name of the folder around the run folder; for a trial, name of the sweep's folder.
     `clock`: host or virtual. `machine`: the machine in one line. `facts`: facts about the machine.
     `settings`: values by dotted key. `command`: words of the command, empty if it is unknown.
@@ -214,7 +214,7 @@ class Entry:
     frames. All are None if unknown.
     `error_source`: source of the PSNR, or why the PSNR is unknown. `error_of`: `OF_RUN` with the reference pictures,
     `OF_AVATAR`, or "" without a PSNR.
-    `failure`: why the entry has no figures, "" for an entry with figures.
+    `failure`: why the run or trial failed, or why it cannot be read; "" for neither.
     `verdict`: PASS or FAIL, with the target rate. `bound`: the unit and the stages that bound the run. `trust`: "sure"
     or "UNSURE". All are "" if unknown.
     `other_programs`: share of the time of its cores that other programs had, None if unknown.
@@ -268,7 +268,7 @@ def entry_of(
     """Return the entry of a run, a prediction or a trial.
 
     `name`: name of the entry.
-    `document`: content of the report or prediction. For a failed trial, it has only a `failure`.
+    `document`: content of the report or prediction. For a failed trial, it has a `failure` and may lack all figures.
     `video`: path of the video, which may be missing; None for a run without a video.
     `options`: options of a trial, which are added to the settings; None for no trial.
     """

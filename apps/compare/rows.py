@@ -80,7 +80,7 @@ Documents = Sequence[Mapping[str, Any]]
 
 
 class Figure(NamedTuple):
-    """The subject of a row.
+    """The subject of one row of a comparison.
 
     `measure`: what is measured.
     `of`: stage, unit, or avatar with the key of its accuracy. For lost and dropped frames, it is the cause; "" means

@@ -196,9 +196,7 @@ class Director:
             return taken
 
     def do(self, asked: ControlAsked | ChangesAsked) -> None:
-        """Carry out the request `asked` of the page. The server has already checked the names and values in the
-        request.
-        """
+        """Carry out the request `asked` of the page. The server has already checked all names and values in it."""
         with self._lock:
             controls = self._controls
         if controls is None:

@@ -78,7 +78,7 @@ async def serve(listener: socket.socket, channel: ChannelEnd, window_fd: int) ->
     `listener`: socket that listens for clients.
     `channel`: this process's end of the channel to the run.
     `window_fd`: file descriptor of the window with the pictures.
-    Raises EOFError if the run ends before it sends the first message.
+    Raises EOFError if the run ends before its first message, UnexpectedValue if the first message is not `Opened`.
     """
     opened = await _first(channel)
     window = LiveWindow(window_fd, opened.height, opened.width)
