@@ -312,8 +312,8 @@ def predict(
     `profile`: hardware profile, by name or file.
     `options`: fields of `trilane.apps.predict.predict_options.PredictOptions` in `PREDICTED`; `trilane predict --help`
     explains them. `avatar` selects the avatar whose network the application runs, by default the avatar `default`.
-    `network` is an ONNX file. It is predicted by itself or, with `application`, in place of the avatar's network.
-    `encoder`, `norm`, `size` and `channels` select the published application.
+    `network` is an ONNX file. This network is predicted by itself or, with `application`, in place of the avatar's
+    network. `encoder`, `norm`, `size` and `channels` select the published application.
     `on_message(text)`: function that gets a message before this machine is measured for the profile `host`. The
     measurement may take half a minute.
     Raises BadInputError for an unknown profile, and for options that are wrong or do not fit together.

@@ -93,7 +93,7 @@ def in_new_name(command: str, name: str, value: object, note: Note = lambda _: N
 
 
 def _options(command: str, words: Sequence[str], note: Note) -> Iterator[str]:
-    """Yield the words of a command line with new names of options in place of old names.
+    """Yield the words of a command line, with old names of options replaced by new names.
 
     `command`: command, with its subcommand if it has one.
     `words`: words after the command.

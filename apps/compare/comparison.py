@@ -70,7 +70,7 @@ IN_THOUSANDS: Final = 10_000
 class Bounds(NamedTuple):
     """The bounds of the runs on both sides, as the key `bound` of report.json; None for a run with an unknown bound.
 
-    `base`, `other`: bounds of the runs of each side, in the order of the runs.
+    `base`, `other`: bounds on each side, in the order of the runs.
     `outcome`: finding whether the bounding unit changed. A change is certain only if no bound has rivals. If a report
     lacks the key `rivals`, its bound is certain if the unit has more than half of the path.
     """
@@ -91,7 +91,7 @@ class Bounds(NamedTuple):
         return Finding.DIFFERS if len(base) == len(other) == 1 and is_sure else Finding.UNKNOWN
 
     def as_json(self) -> dict[str, Any]:
-        """Return the key `bound` of an entry of `comparisons` or, for two sweeps, of an entry of `trials`."""
+        """Return the key `bound` for an entry of `comparisons` in the JSON or, for two sweeps, of `trials`."""
         return {**self._asdict(), "outcome": str(self.outcome)}
 
 

@@ -162,7 +162,7 @@ STATISTICS: Final[dict[str, Reduce]] = {
 def difference(
     base: Sequence[Series], other: Sequence[Series], statistic: str, *, is_ratio: bool, chance: Chance
 ) -> Difference:
-    """Return the change of a statistic between the runs of two sides, over the last `MOST_FRAMES` frames of each run.
+    """Return the change of a statistic between two sides, over the last `MOST_FRAMES` frames of each run.
 
     If the runs have the same frames, each frame is compared with itself. The differences between frames of a scene are
     then no scatter. If a run has too few frames for the statistic, the uncertainty is unknown.
@@ -216,10 +216,10 @@ def settled(
 def combined(pairs: Sequence[Difference]) -> Difference:
     """Return one difference for all `pairs`, of which there is at least one.
 
-    `base` and `other` are arithmetic means. The change is the mean of the effects: for ratios, the geometric mean. Its
-    deviation follows from the pairs' deviations, as if the pairs were independent. If the scatter of the pairs gives a
-    larger deviation (Birge's ratio above 1), the larger deviation counts. If only some pairs are ratios, the deviation
-    is unknown.
+    `base` and `other` are arithmetic means. The change is the mean of the effects: for ratios, the geometric mean. The
+    deviation of this mean follows from the pairs' deviations, as if the pairs were independent. If the scatter of the
+    pairs gives a larger deviation (Birge's ratio above 1), the larger deviation counts. If only some pairs are ratios,
+    the deviation is unknown.
     """
     base, other = (sum(getattr(pair, side) for pair in pairs) / len(pairs) for side in ("base", "other"))
     is_ratio = all(pair.is_ratio for pair in pairs)

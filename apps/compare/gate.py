@@ -5,8 +5,8 @@ A limit is kept if the whole interval lies within the limit, on a quiet machine.
 the gate states how many runs would decide, if more runs can decide.
 
 Three kinds of figures are judged: the frame time, without the share of other programs; each stage's time and CPU time;
-each stage's counted instructions. Counts of instructions repeat to 0.1 %. They alone decide the limit `slower` under
-three conditions: every stage has counts, no setting changed, and the frame time does not contradict the counts.
+each stage's counted instructions. Counts of instructions repeat to 0.1 %. The counts alone decide the limit `slower`
+under three conditions: every stage has counts, no setting changed, and the frame time does not contradict the counts.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ def read_gate(text: str, option: str = "--fail-if") -> Gate:
 class GatedPair:
     """Two sides to judge.
 
-    `name`: name of the other side, or of the configuration of two sweeps.
+    `name`: name of the other side; for two sweeps, name of the configuration.
     `base`, `other`: runs of each side.
     `rows`: difference of each figure.
     `changes`: settings and facts of the machine that changed.
@@ -336,9 +336,9 @@ def _settled(each: Weighed, is_sure: bool, tests: int, pair: GatedPair) -> Weigh
 def runs_needed(each: Weighed, sizes: tuple[int, int], tests: int) -> float | None:
     """Return how many runs on each side would decide, as in `Weighed.runs`.
 
-    It is assumed that further runs have the same mean and scatter.
+    Further runs are assumed to have the same mean and scatter.
     `each`: figure against its limit.
-    `sizes`: present number of runs of the base and of the other side.
+    `sizes`: present numbers of runs: base, other side.
     `tests`: number of figures that are tested together.
     """
     if each.row.deviation is None or (each.most >= each.limit and each.least <= 0):
@@ -379,7 +379,10 @@ def _judged(gate: Gate, pair: GatedPair, figures: tuple[Weighed, ...]) -> Judged
 
 
 def _missing(pair: GatedPair) -> list[str]:
-    """Return the names of the stages that are in some runs of `pair`, but not in all. Their change is unknown."""
+    """Return the names of the stages that are in some runs of `pair`, but not in all.
+
+    For such a stage, the change between the sides is unknown.
+    """
     stages = [{*run.document.get("stages", {})} for run in _runs(pair)]
     return sorted(set().union(*stages) - set[str]().union(*stages[:1]).intersection(*stages))
 

@@ -1,8 +1,8 @@
 """The figures of two sides as rows, each with its random variation.
 
 Rule: `MEASURES` names the statistics of each measure. If all runs have a journal, the differences come from the frames.
-Otherwise, they come from the summaries of reports and predictions. Each summary gets the uncertainty of the mean frame
-time, because no other uncertainty is known.
+Otherwise, they come from the summaries in reports and predictions. Means, medians and shares then get the uncertainty
+of the mean frame time, because no other uncertainty is known.
 
 `Noise` says how much more a figure differs between runs of one kind than their frames show. "Runs of one kind" are runs
 of the same configuration.
@@ -206,11 +206,11 @@ def _of_summaries(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figur
 
 
 def _relative_variance(base: Side, other: Side) -> float | None:
-    """Return the variance of the logarithm of the ratio of mean frame times, due to scatter within runs.
+    """Return the variance of log(other / base), where `other` and `base` stand for the mean frame times of both sides.
 
-    The variance comes from the intervals in the documents. It is 0 for predictions of one chip, because they share the
-    model's error. A run in virtual time without an interval adds 0. None is returned if any other document has no
-    interval.
+    Only scatter within runs counts. The variance comes from the intervals in the documents. It is 0 for predictions of
+    one chip, because they share the model's error. A run in virtual time without an interval adds 0. None is returned
+    if any other document has no interval.
     """
     runs = [*base.runs, *other.runs]
     if all(

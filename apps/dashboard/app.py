@@ -1,8 +1,8 @@
 """The dashboard's HTTP server: the page's files, a WebSocket, metrics and the trace.
 
-Rule: this module decides nothing about the run. For each request for a picture, a client gets one picture: the newest
-one that the client has not had. All other messages go to all clients at once. A client that does not receive or answer
-in time loses its connection.
+Rule: this module decides nothing about the run. News about the run goes to all clients at once; an answer goes only to
+the client that asked. For each request for a picture, a client gets one picture: the newest one that the client has not
+had. A client that does not receive or answer in time loses its connection.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Computes the figures of a run at any moment, from its growing journal.
 
 Rule: pure, with bounded memory. All times of the last `WINDOW_NS` are kept, so that their percentiles are exact. For
-the whole run, only sums and counts are kept. A unit's time follows the ledger (scheduler/ledger.py): its accounts and
-jobs are spans. Time in which a job was assigned, but neither ran nor was preempted, is overhead. `looks` yields the
-figures repeatedly until a live run ends, and once for a finished run.
+the whole run, only sums and counts are kept. The time of a unit is divided as in the ledger (scheduler/ledger.py). Time
+in which a job was assigned, but neither ran nor was preempted, is overhead. `looks` yields the figures repeatedly until
+a live run ends, and once for a finished run.
 """
 
 from __future__ import annotations
