@@ -89,9 +89,9 @@ class Difference(NamedTuple):
     """How far a statistic has changed from the base to the other side.
 
     `base`, `other`: value of each side, over all frames; for several runs, their arithmetic mean.
-    `change`: change from `base` to `other`, over the frames that all runs have. If `is_ratio`, it is a share of the
-    base. For several runs, it compares geometric means, so it may differ from `other` / `base` - 1. Without `is_ratio`,
-    it is in the statistic's unit.
+    `change`: change from `base` to `other`. If the runs show the same frames, it covers only the frames that all runs
+    have. If `is_ratio`, it is a share of the base. For several runs, it compares geometric means, so it may differ from
+    `other` / `base` - 1. Without `is_ratio`, it is in the statistic's unit.
     `low`, `high`: ends of the 95 % interval of `change`.
     `probability`: probability that runs of one kind differ by at least `change`.
     `is_ratio`: whether `change` is a share of the base.
@@ -164,8 +164,8 @@ def difference(
 ) -> Difference:
     """Return the change of a statistic between two sides, over the last `MOST_FRAMES` frames of each run.
 
-    If the runs have the same frames, each frame is compared with itself. The differences between frames of a scene are
-    then no scatter. If a run has too few frames for the statistic, the uncertainty is unknown.
+    If the runs show the same frames (see `ALIKE`), each frame is compared with itself. The differences between frames
+    of a scene are then no scatter. If a run has too few frames for the statistic, the uncertainty is unknown.
     `base`, `other`: series of the figure in each run of a side.
     `statistic`: key of `STATISTICS`.
     `is_ratio`: whether the change is a share of the base. If the figure of any frame is 0 or less, the change is a

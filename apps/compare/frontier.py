@@ -51,9 +51,9 @@ def frontier(entries: Sequence[Scored]) -> list[bool]:
     """Return for each entry whether it is on the frontier: no other entry of its group beats it.
 
     An entry A beats an entry B in either of two cases. In the first case, A has a PSNR that is larger by more than
-    `SAME_DB`, and its mean frame time is not larger. In the second case, A has an equal or better PSNR, and is surely
-    quicker. "Surely" means: the interval of A ends below the begin of the interval of B. An entry without a frame time
-    or a PSNR is not on the frontier.
+    `SAME_DB`, and its mean frame time is not larger. In the second case, A has a PSNR that is larger, or smaller by at
+    most `SAME_DB`, and A is surely quicker. "Surely" means: the interval of A ends below the begin of the interval of
+    B. An entry without a frame time or a PSNR is not on the frontier.
     """
     on = [False] * len(entries)
     for points in _groups(entries).values():

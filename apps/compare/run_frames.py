@@ -32,7 +32,7 @@ IN_FLIGHT = 100
 
 
 class Key(NamedTuple):
-    """The subject of a series.
+    """The subject of a series: what its values measure, and where.
 
     `measure`: what is measured.
     `of`: stage or unit, "" for the whole run.

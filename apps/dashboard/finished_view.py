@@ -186,7 +186,10 @@ class _FinishedRun:
         return figures
 
     def slices_near(self, t_ms: float, span_ms: float) -> Message:
-        """Return the message with the jobs and idle slices from `t_ms` - `span_ms` to `t_ms` + `span_ms`."""
+        """Return the message with the jobs and idle slices from `t_ms` - `span_ms` to `t_ms` + `span_ms`.
+
+        If there are more than `MOST_JOBS` jobs or `MOST_IDLE` idle slices, the nearest to `t_ms` are returned.
+        """
         jobs = [
             (int(r["unit"]), int(r["stage"]), int(r["frame"]), float(r["begin"]), float(r["end"]), float(r["wait"]))
             for r in self.jobs.near(t_ms, span_ms, MOST_JOBS)

@@ -341,7 +341,7 @@ class LiveView:
         return {**facts.config, "orbit": [camera.azimuth_deg, camera.elevation_deg], "zoom": camera.zoom}
 
     def _steer(self, name: str, value: Value) -> None:
-        """Steer the camera by `value` of the control `name`.
+        """Steer the camera by `value` of the control `name`; the control `recentre` undoes all steering.
 
         The picture follows a drag: a drag to the right moves the camera to the left, and a drag down lifts the camera.
         """
