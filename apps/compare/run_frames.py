@@ -49,7 +49,7 @@ class RunFrames:
     """The frames of a run as series.
 
     `begun`: first record of the journal.
-    `series`: series by subject, times in ms.
+    `series`: series by subject; times are in ms, times of an instruction in ns.
     `ended`: last record; None if the journal has no end.
     `presented`: number of presented frames of the whole run.
     `counted`: counts of lost and dropped frames; None if the journal has no counts.

@@ -141,8 +141,8 @@ class LiveFigures:
     def now(self, now_ns: int | None = None, state: RunState | None = None) -> MomentFigures:
         """Return the figures at a time of the run's clock.
 
-        `now_ns`: the time. The time of the last record is used instead if `now_ns` is None or earlier than the last
-        record. The time of the run's last step is used if `now_ns` is later.
+        `now_ns`: the time. If `now_ns` is None or earlier than the last record, the time of the last record is used.
+        Once the run is over, a later `now_ns` counts as the time of the run's last step.
         `state`: state of the run, because the journal of a killed run does not show it; None to take the state from the
         journal.
         """
