@@ -1,7 +1,7 @@
 """An avatar's files: facts about them, a new avatar with replaced files, and a variant of an avatar for a run.
 
 Rule: every fact about an avatar comes from its own files or its manifest. When a file is replaced, the new manifest
-lacks the figures and words about the old file. A validation is kept only if none of the validated files has changed.
+omits the figures and words about the old file. The validation stays only if none of the validated files has changed.
 
 `remade_avatar` makes a variant with another calibration, width or number of channels of the network. A new calibration
 quantises the avatar's own float network, so the pictures of the variant are valid. A network of another width or number
@@ -62,10 +62,11 @@ NAME_LENGTH = 100
 
 
 def bundle_facts(bundle: Bundle) -> dict[str, Any]:
-    """Return the manifest's entries, the sizes of the files, and facts about the network. Raises BadInputError.
+    """Return facts about the avatar `bundle`: entries of the manifest, sizes of the files, facts about the network.
 
     Keys: `name`, `folder`, `files`, `body`, `texture`, `network`, `quantisation`, `provenance`, `training_command`,
-    `validation`. Raises BadInputError.
+    `validation`.
+    Raises BadInputError for a file that is missing or wrong.
     """
     manifest = bundle.manifest
     shaped = bundle.shaped_body()
@@ -93,9 +94,11 @@ def bundle_facts(bundle: Bundle) -> dict[str, Any]:
 def level_facts(level: MeshLevel, side: int) -> dict[str, Any]:
     """Return facts about a coarser level of the mesh.
 
-    `triangles`, `vertices`: counts. `rest_mm`: largest distance between its surface and the whole mesh's, at rest.
-    `seam_texels`: largest shift of the texture at its seams, in texels.
+    `level`: the coarser level.
     `side`: side of the texture, in texels.
+
+    Keys: `triangles` and `vertices`, counts. `rest_mm`, largest distance at rest between the surface of the level and
+    that of the whole mesh. `seam_texels`, largest shift of the texture at the seams.
     """
     return {
         "triangles": len(level.faces),
@@ -106,9 +109,11 @@ def level_facts(level: MeshLevel, side: int) -> dict[str, Any]:
 
 
 def add_levels(bundle: Bundle) -> dict[str, Any]:
-    """Make coarser levels of the mesh of `bundle`, write them into its folder, and return facts about them.
+    """Make coarser levels of the mesh of `bundle`, write them into the avatar's folder, and return facts about them.
 
-    Raises BadInputError, MissingPartError.
+    Keys: `avatar`, path of the folder. `triangles`, number in the whole mesh. `levels`, list with the `level_facts` of
+    each level.
+    Raises BadInputError for a file that is wrong or cannot be written, MissingPartError without meshoptimizer.
     """
     from trilane.training.mesh_levels import make_mesh_levels
 
@@ -121,7 +126,10 @@ def add_levels(bundle: Bundle) -> dict[str, Any]:
 
 
 def network_facts(network: NetworkFile) -> dict[str, Any]:
-    """Return `shape` (N, H, W, C) and `sha256` of a network, and the keys of `graph_facts`. Raises BadInputError."""
+    """Return facts about `network`: `shape` (N, H, W, C), `sha256`, and the keys of `graph_facts`.
+
+    Raises BadInputError for a network whose work cannot be counted.
+    """
     try:
         work = graph_facts(network.model)
     except BadInputError as error:
@@ -131,21 +139,26 @@ def network_facts(network: NetworkFile) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Parts:
-    """Files that replace an avatar's own files. None keeps the avatar's file."""
+    """Files that replace an avatar's own files. None keeps the avatar's own file."""
 
     network: Path | None = None
     texture: Path | None = None
     body: Path | None = None
 
     def files(self) -> dict[str, Path]:
-        """Return the replacing files by key: `network`, `texture`, `body`."""
+        """Return the replacing files by key: `network`, `texture`, `body`. A file that is not replaced has no key."""
         return {key: file for key, file in vars(self).items() if file is not None}
 
 
 def assemble(base: Bundle, parts: Parts, out: Path) -> dict[str, Any]:
-    """Write an avatar to the folder `out`, with `parts` and all other files of `base`. Return facts about this avatar.
+    """Write a new avatar to the folder `out`, and return facts about it.
 
-    Raises BadInputError before anything is written, if a part is wrong or does not fit the other files.
+    `base`: avatar that gives all other files.
+    `parts`: files that replace files of `base`.
+
+    Keys: `avatar`, `made_from`, `replaced`, `network`, `texture`, `accuracy`.
+    Raises BadInputError before anything is written: if no part is given, if a part does not fit, or if `out` exists and
+    is not an empty folder.
     """
     if not parts.files():
         raise BadInputError("avatar create", "no part", "--network, --texture or --body, at least one of them")
@@ -174,7 +187,10 @@ def assemble(base: Bundle, parts: Parts, out: Path) -> dict[str, Any]:
 
 
 def _drawable(network: NetworkFile) -> NetworkFile:
-    """Return `network` if the GPU can fill its input, and its output is a picture. Raises BadInputError."""
+    """Return `network` unchanged if the GPU can fill its input, and its output is a picture.
+
+    Raises BadInputError for any other network.
+    """
     from trilane.stages.gpu.raster import CHANNELS
 
     check_integer_layers(network)
@@ -192,7 +208,9 @@ def _drawable(network: NetworkFile) -> NetworkFile:
 def _texture(source: Path, network: NetworkFile, parts: Parts) -> NDArray[np.float32]:
     """Return the neural texture of the file `source`, (H, W, C) float32.
 
-    Raises BadInputError, also if texture and `network` differ in the number of channels.
+    `network`: network that reads the texture.
+    `parts`: replacing files; errors name the options that give them.
+    Raises BadInputError for a wrong file, or if texture and network differ in the number of channels.
     """
     arrays = read_npz(source, TEXTURE_KEYS, "a neural texture")
     shape = arrays["texture"].shape if "texture" in arrays else ()
@@ -205,7 +223,7 @@ def _texture(source: Path, network: NetworkFile, parts: Parts) -> NDArray[np.flo
 
 
 def _check_body(base: Bundle, body: Body, parts: Parts) -> None:
-    """Raise BadInputError if `body` has another UV layout than the body of `base`, and no new texture is given."""
+    """Raise BadInputError if `body` has another UV layout than the body of `base`, and `parts` has no new texture."""
     own = load_body(base.body_path)
     pairs = ((own.uv, body.uv), (own.uv_faces, body.uv_faces))
     same = all(one.shape == other.shape and np.allclose(one, other, atol=1e-6) for one, other in pairs)
@@ -234,10 +252,12 @@ def _manifest(base: Bundle, parts: Parts, network: NetworkFile, name: str) -> Ma
 
 
 def _provenance(own: Manifest, parts: Parts) -> dict[str, Any]:
-    """Return the provenance for a new manifest.
+    """Return the provenance for the manifest of a new avatar.
 
-    The entries about the body stay if the body is not replaced. The entry about the weights stays if the network is
-    not replaced.
+    Its key `base` has the whole provenance of the old avatar. The entries about the body also stay at the top if the
+    body is not replaced. The entry about the weights stays if the network is not replaced.
+    `own`: manifest of the old avatar.
+    `parts`: files that replace files of the old avatar.
     """
     stays = {"body": (parts.body, CAPTURED), "weights": (parts.network, UNTRAINED)}
     kept = {key: word for key, (part, word) in stays.items() if part is None and own.provenance.get(key) == word}
@@ -249,7 +269,7 @@ def _provenance(own: Manifest, parts: Parts) -> dict[str, Any]:
 def _kind(base: Bundle, network: NetworkFile) -> tuple[str, str, int]:
     """Return the encoder, norm and width of `network`. The width is the number of channels of the first convolution.
 
-    Encoder and norm are those of `base` if both networks have the same operators, else `OTHER`.
+    If the network of `base` has the same operators, encoder and norm are those of `base`. Otherwise, both are `OTHER`.
     """
     own = base.manifest.network
     before, now = ([node.op_type for node in each.model.graph.node] for each in (base.read_network(), network))
@@ -258,7 +278,10 @@ def _kind(base: Bundle, network: NetworkFile) -> tuple[str, str, int]:
 
 
 def _width(model: onnx.ModelProto) -> int:
-    """Return the number of output channels of the first convolution in `model`; 1 if its weights are unknown."""
+    """Return the number of output channels of the first convolution in `model`, at most MAX_WIDTH.
+
+    The result is 1 without a convolution, or if its weights are not found.
+    """
     weights = {tensor.name: tensor.dims[0] for tensor in model.graph.initializer if len(tensor.dims) == 4}
     makers = {name: node for node in model.graph.node for name in node.output}
     for node in model.graph.node:
@@ -271,7 +294,7 @@ def _width(model: onnx.ModelProto) -> int:
 
 
 def _shapes(network: NetworkFile) -> str:
-    """Return a sentence on the tensor shapes at which the network can run."""
+    """Return a phrase on the tensor shapes at which the network can run."""
     _, height, width, _ = network.shape
     try:
         reshaped(network, STRIDE * 3, STRIDE * 5)
@@ -281,7 +304,7 @@ def _shapes(network: NetworkFile) -> str:
 
 
 def _clipped(texture: NDArray[np.float32], network: NetworkFile) -> float:
-    """Return the share of the texture's values beyond the range of the network's input bytes."""
+    """Return the share of the texture's values beyond the range of the network's input bytes, from 0 to 1."""
     scale, zero = network.input.scale, network.input.zero_point
     low, high = (-zero - 0.5) * scale, (255 - zero + 0.5) * scale
     return float(((texture < low) | (texture > high)).mean())
@@ -295,9 +318,12 @@ VERSION = 2
 
 @dataclass(frozen=True)
 class _Recipe:
-    """The network of a variant of an avatar. `trained`: whether `width` and `channels` are the avatar's own.
+    """The network of a variant of an avatar.
 
-    `method`: method of calibration, None to keep the avatar's network. `views`: number of views to calibrate on.
+    `width`: number of channels of the first convolution. `channels`: number of input channels.
+    `trained`: whether `width` and `channels` are those of the avatar's own network.
+    `method`: method of calibration, None to keep the avatar's network.
+    `views`: number of views on which to calibrate.
     """
 
     width: int
@@ -312,10 +338,12 @@ class _Recipe:
 
 
 def remade_avatar(name: str, options: RunOptions) -> tuple[Path, str]:
-    """Return the folder of the variant of avatar `name` that `options` request, and a sentence about the variant.
+    """Return the folder of the variant of an avatar for a run, and a phrase about the variant.
 
-    The variant is made, or found in the cache.
-    Raises BadInputError if the avatar's float network is needed but missing, MissingPartError without PyTorch,
+    The variant is made, or found in the cache. If `options` change nothing, the folder is the avatar's own.
+    `name`: avatar, by name or folder.
+    `options`: options of the run, which may have a width, a number of channels and a calibration.
+    Raises BadInputError if the avatar's float network is needed but missing, MissingPartError without PyTorch. Raises
     TrilaneError if the cache cannot be written.
     """
     bundle = load_bundle(name)
@@ -363,7 +391,10 @@ def _digest(bundle: Bundle, recipe: _Recipe) -> str:
 
 @contextmanager
 def _alone(lock: Path) -> Iterator[None]:
-    """Hold an exclusive lock on the file `lock` inside the block, so that only one process makes the same variant."""
+    """Hold an exclusive lock on the file `lock` inside the block, so that only one process makes a variant.
+
+    Raises BadInputError if the file cannot be opened.
+    """
     try:
         file = lock.open("w+")  # "w" alone would wait on a pipe
     except OSError as error:
@@ -417,7 +448,10 @@ def _quantised(bundle: Bundle, recipe: _Recipe, chosen: NDArray[np.intp]) -> Qua
 
 
 def _float_model(bundle: Bundle, recipe: _Recipe) -> onnx.ModelProto:
-    """Return the network to quantise: the avatar's own float network, or an untrained network."""
+    """Return the network to quantise: the avatar's own float network if `recipe` is trained, else an untrained network.
+
+    Raises BadInputError if the avatar's float network is missing.
+    """
     import torch
 
     from trilane.training.make_bundle import CALIBRATION_SHAPE, float_model
@@ -432,7 +466,7 @@ def _float_model(bundle: Bundle, recipe: _Recipe) -> onnx.ModelProto:
 
 
 def _named_weights(bundle: Bundle) -> Path:
-    """Return the file of the float network of `bundle`. Raises BadInputError if the manifest names none."""
+    """Return the file of the float network of `bundle`. Raises BadInputError if the manifest names no such file."""
     weights = float_weights(bundle)
     if weights is None:
         remedy = "`trilane avatar validate --float-network` notes which it is"
@@ -447,9 +481,10 @@ COMPARED_VIEWS = 50
 
 
 class Calibrations:
-    """Replaces the network of the first avatar of `checked` by networks of other calibrations.
+    """Replaces the network of a scene's first avatar by the same network with another calibration.
 
-    Each is quantised once, from the avatar's own float network, on views drawn as in training.
+    Each calibration quantises the avatar's float network once, on views drawn as in training.
+    `checked`: checked configuration of a scene.
     """
 
     def __init__(self, checked: Checked) -> None:
@@ -458,8 +493,9 @@ class Calibrations:
         self._made: dict[str, NetworkFile] = {}
 
     def changed(self, checked: Checked, method: str) -> Checked:
-        """Return `checked` with the network that `method` calibrates. `method`: `AS_IT_IS`, or a name in METHODS.
+        """Return `checked` with the network that `method` calibrates.
 
+        `method`: a name in METHODS; `AS_IT_IS` keeps the network.
         Raises BadInputError without the float network, MissingPartError without PyTorch.
         """
         if method == AS_IT_IS:
@@ -479,9 +515,11 @@ class Calibrations:
 
 
 def drawn_material(avatar: str, views: int, held_out: int) -> tuple[onnx.ModelProto, list[F32]]:
-    """Return the float network of `avatar`, and a list of inputs for it, each (H, W, C) float32.
+    """Return the float network of an avatar, and a list of inputs for it, each (H, W, C) float32.
 
-    The list has `views` inputs drawn as in training, followed by `held_out` inputs from held-out views.
+    `avatar`: avatar, by name or folder.
+    `views`: number of inputs drawn as in training, first in the list.
+    `held_out`: number of inputs from held-out views, last in the list.
     Raises BadInputError if the float network is missing, MissingPartError without PyTorch or OpenGL.
     """
     bundle = load_bundle(avatar)

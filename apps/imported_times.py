@@ -37,7 +37,10 @@ UNIT_OF_WORD: Final = {
 
 
 def document(reads: Sequence[Measurements]) -> dict[str, Any]:
-    """Return the content of `--json`: the files, their measurements and the refused rows."""
+    """Return the document of `trilane times --json`: the files, their measurements and the refused rows.
+
+    The document has the keys `files`, `measurements` and `refused`; each value is a list of mappings.
+    """
     return {
         "files": [
             {
@@ -55,7 +58,10 @@ def document(reads: Sequence[Measurements]) -> dict[str, Any]:
 
 
 def samples_csv(reads: Sequence[Measurements]) -> str:
-    """Return a CSV with a row for each sample of each measurement. `trilane times` can read this CSV."""
+    """Return a CSV with a row for each sample of each measurement. `trilane times` can read this CSV.
+
+    The columns are `OWN_COLUMNS`; the column `sample` counts the samples of a measurement from 0.
+    """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(OWN_COLUMNS)
@@ -68,8 +74,10 @@ def samples_csv(reads: Sequence[Measurements]) -> str:
 def one_of(reads: Sequence[Measurements], name: str) -> tuple[Measurements, Measurement]:
     """Return the file that has the measurement `name`, and this measurement.
 
-    An empty `name` means the only run of the only file. Raises BadInputError if no file has the measurement, or if
-    several files have it.
+    `reads`: files to search.
+    `name`: name of the measurement; empty for the only run of the only file.
+    Raises BadInputError if no file or several files have the measurement, or if the measurement cannot be a service
+    time. For an empty name, raises BadInputError for several files or several runs.
     """
     holding = [read for read in reads if any(each.name == name for each in read.measurements)] if name else reads
     if not holding:
@@ -82,11 +90,13 @@ def one_of(reads: Sequence[Measurements], name: str) -> tuple[Measurements, Meas
 
 
 def stage_text(path: Path, stage: str, read: Measurements, measurement: Measurement) -> str:
-    """Return the text of the pipeline file `path`, with `measurement` as the `time_ms` of `stage`.
+    """Return the text of the pipeline file `path`, with `measurement` as the `time_ms` of the stage `stage`.
 
-    All else in the file stays, including comments. The check sees the new text, so the stage may lack a time before.
+    All else in the file stays, including comments. The stage may have no time in the old file, because only the new
+    text is checked.
     `read`: measurements of the file that contains `measurement`.
-    Raises BadInputError for an unknown stage or too many samples, MissingPartError without tomlkit.
+    Raises BadInputError for an unknown stage, too many samples or a wrong pipeline file. Raises MissingPartError
+    without tomlkit.
     """
     try:
         import tomlkit
@@ -109,8 +119,8 @@ def stage_text(path: Path, stage: str, read: Measurements, measurement: Measurem
 def _as_toml(path: Path, read: Measurements, measurement: Measurement) -> Any:
     """Return `measurement` as an inline table for `time_ms`. Raises BadInputError for too many samples.
 
-    The table names the measured file if that lies in the folder of the pipeline file `path`. Otherwise the table
-    contains the samples, or the mean and the standard deviation.
+    If the measured file lies in the folder of the pipeline file `path`, the table names the measured file. Otherwise,
+    the table contains the samples. If there are no samples either, it contains the mean and the standard deviation.
     """
     import tomlkit
 
@@ -131,19 +141,23 @@ def _as_toml(path: Path, read: Measurements, measurement: Measurement) -> Any:
 
 
 def _rounded(ms: float) -> float:
-    """Return `ms` rounded to six digits, because sums of floats end in digits that nobody measured."""
+    """Return `ms` rounded to six significant digits, because no measurement is more exact."""
     return float(f"{ms:.6g}")
 
 
 def with_row(
     path: Path, read: Measurements, measurement: Measurement, network: str | None, asked: Mapping[str, str | None]
 ) -> tuple[str, list[str]]:
-    """Return the text of the CSV table `path` with a further row, and lines for people on the row's values and sources.
+    """Return the text of the CSV table `path` with one more row, and lines for people about the new row.
 
-    The row contains the measurement's median in ms, or its mean if there is no median. `path` need not exist.
-    `network`: path of the network from the folder of the table.
-    `asked`: value of each column in OPTION_OF. None means the value in the measured file, else the fit's default.
-    Raises BadInputError for the time of a layer, and for a table with other columns.
+    The row contains the measurement's median in ms, or its mean if the median is unknown. The lines state the values,
+    and whether each value comes from the measured file or is assumed. The file `path` need not exist.
+    `read`: measurements of the file that contains `measurement`.
+    `network`: path of the network, relative to the folder of the table.
+    `asked`: value for each column in OPTION_OF. None means the value in the measured file or, if the file has no such
+    value, the fit's default.
+    Raises BadInputError for the time of a layer, for a table with other columns, for a missing network and for an
+    unknown value.
     """
     if measurement.kind == "layer":
         runs = [repr(each.name) for each in read.measurements if each.kind == "run"]
@@ -169,7 +183,11 @@ def with_row(
 
 
 def _unit_told(read: Measurements, measurement: Measurement) -> str | None:
-    """Return the unit that the file names for the measurement, else for all layers; None if that is not one unit."""
+    """Return the unit of a hardware profile on which `measurement` ran, as the measured file names it.
+
+    If the measurement itself names no hardware, the hardware of all layers in the file decides. None is returned if the
+    file does not name exactly one unit.
+    """
     layers = [each.hardware for each in read.measurements if each.kind == "layer"]
     named = [measurement.hardware] if measurement.hardware else layers
     units = [{unit for word, unit in UNIT_OF_WORD.items() if word in each.upper()} for each in named]

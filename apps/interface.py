@@ -1,8 +1,8 @@
 """Trilane for programs and notebooks: `run`, `predict`, `load_run`, and their results (docs/python.md).
 
-Rule: the command line uses the same functions. Nothing here prints or ends the program: a failure raises a
-TrilaneError, and messages for people are in the report or go to a callback. A notebook shows a run or a prediction as
-an HTML table, in which every value is escaped.
+Rule: the command line uses the same functions. Nothing here prints or ends the program. A failure raises a
+TrilaneError. Messages for people are in the report or go to a callback. A notebook shows a run or a prediction as an
+HTML table, in which every value is escaped.
 """
 
 from __future__ import annotations
@@ -56,7 +56,8 @@ TOO_SHORT = "too short to tell"
 class Run:
     """A finished run.
 
-    `folder`: run folder. `report`: report.json (docs/report.md), with the machine and the avatars' error.
+    `folder`: run folder.
+    `report`: content of report.json (docs/report.md), with facts about the machine and the avatars' error.
     `jobs`, `events` and `idle` are read from the journal at first use and stay in memory.
     """
 
@@ -68,22 +69,26 @@ class Run:
 
     @cached_property
     def verdict(self) -> Verdict:
-        """The verdict: whether the run holds its rate, what bounds it, whether its machine was quiet, what to try."""
+        """The verdict: whether the run holds its rate, what bounds the run, how quiet the machine was, what to try."""
         return verdict_of(self.report, str(self.folder))
 
     def _repr_html_(self) -> str:
         return run_html(self.report, str(self.folder))
 
     def records(self) -> Iterator[Record]:
-        """Yield the records of the journal after the first record. Raises BadInputError."""
+        """Yield the records of the journal after the first record, in order.
+
+        Raises BadInputError for a missing or broken journal.
+        """
         return open_journal(self.folder)[1]
 
     @cached_property
     def jobs(self) -> NDArray[Any]:
         """All jobs in the order of their ends: a structured array of shape (jobs,), with the fields of docs/explain.md.
 
-        Times are int64, ns; words are `str_`. A stage's metrics are float64, and NaN in the jobs of other stages.
-        Raises BadInputError.
+        Times are int64, ns; words are `str_`, flags are bool. A stage's metrics are float64, and NaN in the jobs of
+        other stages.
+        Raises BadInputError for a missing or broken journal.
         """
         figures = figure_names(self.folder)
         begun, _ = open_journal(self.folder)
@@ -96,24 +101,31 @@ class Run:
 
     @cached_property
     def events(self) -> list[tuple[int, Event]]:
-        """The events that the scheduler received, in order: (time in ns, event of `trilane.scheduler.events`)."""
+        """The events that the scheduler received, in order, as pairs: time in ns, event of `trilane.scheduler.events`.
+
+        Raises BadInputError for a missing or broken journal.
+        """
         return [(step.now_ns, event) for step in self.records() if isinstance(step, Stepped) for event in step.events]
 
     @cached_property
     def idle(self) -> list[IdleSlice]:
-        """The idle slices of all units, in the order of their ends."""
+        """The idle slices of all units, in the order of their ends.
+
+        Raises BadInputError for a missing or broken journal.
+        """
         begun, records = open_journal(self.folder)
         timeline = Timeline(begun.graph, begun.settings, idle=True)
         facts = [fact for record in records for fact in timeline.add(record)]
         return [fact for fact in facts if isinstance(fact, IdleSlice)] + timeline.end()
 
     def frames(self) -> NDArray[Any]:
-        """Return the presented frames, in order: a structured array of shape (frames,), all int64.
+        """Return the presented frames, in order: a structured array of shape (frames,), all fields int64.
 
-        `frame`: number of the frame. `presented_ns`: time of its presentation. `frame_ns`: time since the previous
-        presented frame, -1 for the first. `latency_ns`: time from the sampling of the pose to the end of the stage that
-        the pipeline names, -1 if that stage had no job for the frame.
-        Raises BadInputError.
+        `frame`: number of the frame.
+        `presented_ns`: time of its presentation.
+        `frame_ns`: time since the previous presented frame, -1 for the first presented frame.
+        `latency_ns`: latency of the frame, -1 if the stage that ends the latency had no job for the frame.
+        Raises BadInputError for a missing or broken journal.
         """
         begun, records = open_journal(self.folder)
         timeline = Timeline(begun.graph, begun.settings)
@@ -125,7 +137,10 @@ class Run:
         return np.array(rows, FRAME_TYPE)
 
     def to_pandas(self) -> pandas.DataFrame:
-        """Return `jobs` as a data frame. Raises MissingPartError without pandas, which the extra `table` brings."""
+        """Return `jobs` as a data frame: a row for each job, a column for each field.
+
+        Raises MissingPartError without pandas, which the extra `table` installs, and BadInputError as `jobs` does.
+        """
         try:
             import pandas
         except ImportError:
@@ -133,15 +148,20 @@ class Run:
         return pandas.DataFrame({name: self.jobs[name] for name in self.jobs.dtype.names or ()})
 
     def explain(self, slowest: int = 10) -> dict[str, Any]:
-        """Return the document of `trilane explain RUN --json --slowest N` (docs/explain.md), with N = `slowest`.
+        """Return the document of `trilane explain RUN --json --slowest N` (docs/explain.md).
 
-        Raises BadInputError.
+        `slowest`: number N of slowest frames to name.
+        Raises BadInputError for a missing or broken journal.
         """
         return explain_run(self.folder, slowest)
 
 
 class RunFailedError(TrilaneError):
-    """A run ended early. `run`: the run until that moment. `exit_code`: exit code of `trilane run` in this case."""
+    """A run ended early.
+
+    `run`: the run, with all data until its end.
+    `exit_code`: exit code that `trilane run` has in this case.
+    """
 
     def __init__(self, message: str, run: Run, exit_code: int) -> None:
         super().__init__(message)
@@ -165,14 +185,15 @@ def run(
     on_message: Callable[[str], None] | None = None,
     **options: Any,
 ) -> Run:
-    """Run a scene or a pipeline file, with a process for each unit, and load the run folder.
+    """Run a scene or a pipeline file, with a process for each unit, and return the finished run.
 
     `scene`: a scene file, the name of a bundled scene, or a pipeline file.
     `options`: fields of `trilane.stages.run_options.RunOptions`; `trilane run --help` explains them. None means the
     scene's own value. `cores` may be a mapping, such as {"dsp": [0, 1]}. A `sequential` run for comparison follows only
     if `baseline_frames` is above 0.
-    `on_progress(what, done, total)`: function that gets numbers of frames, in the caller's thread. `what` is the
-    policy, or `check` during the check. `on_message(text)`: function that gets messages, in the caller's thread.
+    `on_progress(what, done, total)`: function that gets the progress, in the caller's thread. `what` is the policy, or
+    `check` during the check; `done` and `total` are numbers of frames.
+    `on_message(text)`: function that gets messages for a person, in the caller's thread.
     Raises BadInputError and MissingPartError before a run that cannot begin. Raises RunFailedError if the run ended
     early but left its folder, TrilaneError if no frame was presented. Raises KeyboardInterrupt after an interrupt, when
     the folder is complete.
@@ -198,9 +219,12 @@ def run(
 def _signature(
     function: Callable[..., Any], model: type[Options], names: Iterable[str], defaults: Mapping[str, Any] | None = None
 ) -> inspect.Signature:
-    """Return the signature of `function`, with a parameter for each option in `names` in place of `**options`.
+    """Return the signature of `function`, with a keyword parameter for each option in place of `**options`.
 
-    `model`: class of the options. `defaults`: defaults by name that replace the defaults of `model`.
+    `function`: `run` or `predict`.
+    `model`: class of the options.
+    `names`: names of the options to include.
+    `defaults`: defaults by name that replace the defaults of `model`; None to keep all defaults.
     """
     signature = inspect.signature(function, eval_str=True)
     first, *told, _ = signature.parameters.values()
@@ -219,11 +243,13 @@ run.__signature__ = _signature(run, RunOptions, RunOptions.model_fields, DEFAULT
 
 @dataclass(frozen=True, repr=False)
 class Prediction:
-    """A hardware profile's prediction for an application or a network; every figure is computed.
+    """A prediction of an application or a network on a chip; every figure is computed.
 
     `document`: document of `trilane predict --json`.
-    `profile`: name of the hardware profile. `what`: the avatar, network file or published network.
-    `frame_ms`: mean frame time. `low_ms`, `high_ms`: bounds of its 80 % interval, None if the error is unknown.
+    `profile`: name of the hardware profile.
+    `what`: the avatar, the network file or the published network.
+    `frame_ms`: mean frame time.
+    `low_ms`, `high_ms`: ends of the 80 % interval of `frame_ms`, None if the model's error is unknown.
     `latency_ms`: mean latency, None for a network by itself.
     `power_w`: power of the whole device.
     """
@@ -239,19 +265,19 @@ class Prediction:
 
     @property
     def fps(self) -> float:
-        """Return the rate in frames a second."""
+        """Return the frame rate, in frames a second."""
         return 1e3 / self.frame_ms
 
     @property
     def is_display_capped(self) -> bool:
-        """Return whether the display, or the requested rate, limits the frame rate."""
+        """Return whether the frame rate is limited by the display or by the requested rate, and not by the chip."""
         return bool(self.document.get("display_capped", False))
 
     @property
     def units(self) -> Mapping[str, Any]:
-        """Return a mapping for each unit: its `busy` share, and `idle`, its idle shares by cause.
+        """Return the shares of each unit's time, by the unit's name. The result is empty for a network by itself.
 
-        The result is empty for a network by itself.
+        Each value is a mapping: `busy` is the busy share, `idle` maps each cause to its idle share.
         """
         found: Mapping[str, Any] = self.document.get("units", {})
         return found
@@ -283,14 +309,14 @@ def predict(
 ) -> Prediction:
     """Predict frame time, idleness, heat and energy on a chip.
 
-    `profile`: a hardware profile, by name or file. `options`: fields of
-    `trilane.apps.predict.predict_options.PredictOptions` in `PREDICTED`; `trilane predict --help` explains them.
-    `avatar` selects the avatar whose network the application runs; it is `default` if not given. `network` is an ONNX
-    file. This network is predicted by itself, or in the avatar's place with `application`. `encoder`, `norm`, `size`
-    and `channels` select the published application.
-    `on_message(text)`: function that is called before this machine is measured for the profile `host`, which may take
-    half a minute.
-    Raises BadInputError.
+    `profile`: hardware profile, by name or file.
+    `options`: fields of `trilane.apps.predict.predict_options.PredictOptions` in `PREDICTED`; `trilane predict --help`
+    explains them. `avatar` selects the avatar whose network the application runs, by default the avatar `default`.
+    `network` is an ONNX file. This network is predicted by itself or, with `application`, in place of the avatar's
+    network. `encoder`, `norm`, `size` and `channels` select the published application.
+    `on_message(text)`: function that gets a message before this machine is measured for the profile `host`. The
+    measurement may take half a minute.
+    Raises BadInputError for an unknown profile, and for options that are wrong or do not fit together.
     """
     from trilane.apps.predict import asked_prediction as asked
     from trilane.avatars.bundle import DEFAULT
@@ -319,10 +345,12 @@ predict.__signature__ = _signature(predict, PredictOptions, PREDICTED)  # type: 
 
 
 def _bound(function: Callable[..., Any], first: str | Path, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of `function`, which is `run` or `predict`, by their present names.
+    """Return the arguments of a call, by the present names of the parameters.
 
-    `first`: value of the first parameter. `options`: other arguments by name.
-    An old name causes a DeprecationWarning. Raises TypeError for an unknown name, with the most similar option.
+    `function`: `run` or `predict`, which was called.
+    `first`: value of the first parameter.
+    `options`: other arguments by name. An old name causes a DeprecationWarning.
+    Raises TypeError for an unknown name, with the most similar option.
     """
     command, signature = function.__name__, inspect.signature(function)
     warned = partial(warnings.warn, category=DeprecationWarning, stacklevel=5)  # at the caller of `run` or `predict`
@@ -335,7 +363,10 @@ def _bound(function: Callable[..., Any], first: str | Path, options: Mapping[str
 
 
 def table(title: str, rows: Iterable[Row]) -> str:
-    """Return an HTML table with the caption `title` and a row for each figure. All texts are escaped."""
+    """Return an HTML table with the caption `title`. All texts are escaped.
+
+    `rows`: name, value and source of each figure, a row each.
+    """
     body = "".join(
         f"<tr><th style='text-align:left'>{escape(name)}</th><td style='text-align:left'>{escape(value)}</td>"
         f"<td style='text-align:left'><small>{escape(source)}</small></td></tr>"
@@ -346,7 +377,11 @@ def table(title: str, rows: Iterable[Row]) -> str:
 
 
 def run_html(report: Report, folder: str) -> str:
-    """Return an HTML table of a run: verdict, most important figures, error of the avatars, and machine."""
+    """Return an HTML table of a run: verdict, most important figures, error of the avatars, and machine.
+
+    `report`: report of the run.
+    `folder`: path of the run folder, for the caption.
+    """
     verdict = [(label, text, "") for label, text in verdict_of(report, folder).lines()]
     return table(f"Run {folder}", [*verdict, *_run_rows(report)])
 
@@ -379,7 +414,11 @@ def _between(low: float | None, high: float | None) -> str:
 
 
 def _error(facts: Mapping[str, Any]) -> tuple[str, str]:
-    """Return the PSNR of each band of zoom and its source, or else that there are no figures and why."""
+    """Return two texts about an avatar's error: the PSNR of each band of zoom, and the source of these figures.
+
+    For an avatar without figures, the texts are `NO_FIGURES` and the reason. `facts`: entry of `accuracy` in
+    report.json.
+    """
     if "psnr_db_by_band" not in facts:
         return NO_FIGURES, str(facts.get("why", ""))
     bands = ", ".join(f"{band} {value:.1f}" for band, value in facts["psnr_db_by_band"].items())
@@ -387,5 +426,9 @@ def _error(facts: Mapping[str, Any]) -> tuple[str, str]:
 
 
 def prediction_html(title: str, rows: Mapping[str, str]) -> str:
-    """Return an HTML table of a prediction. `rows`: texts by name; the source of each is `COMPUTED`."""
+    """Return an HTML table of a prediction.
+
+    `title`: caption of the table.
+    `rows`: texts by name; the source of each is `COMPUTED`.
+    """
     return table(title, ((name, value, COMPUTED) for name, value in rows.items()))

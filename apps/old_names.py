@@ -1,7 +1,7 @@
-"""Old names of commands and options, which work for one more version, with a note.
+"""Old names of commands and options, which work until the version `GONE_IN`, with a note.
 
-Rule: a name that was only replaced by another stands here and nowhere else. Command lines, axes of a sweep and options
-of a program are translated before any other code reads them.
+Rule: a name that was only replaced by a new name stands here and nowhere else. Command lines, axes of a sweep and
+options of a program are translated before any other code reads them.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ GONE_IN: Final = "0.3"
 class Renamed(NamedTuple):
     """An option of `command` that was called `old` and is called `new`. Both names include the dashes.
 
-    `values`: regular expression. A value that matches it shows that `old` means the old option. With any other value,
-    `old` means the option that has this name now.
+    `values`: regular expression for the values that the old option could have. With any other value, `old` means the
+    option that has this name now.
     """
 
     command: str
@@ -28,7 +28,7 @@ class Renamed(NamedTuple):
     values: str = ".*"
 
     def means(self, value: object) -> bool:
-        """Return whether `old`, given with `value`, means the old option."""
+        """Return whether `old`, given with `value`, means the option with the new name `new`."""
         return re.fullmatch(self.values, str(value), re.DOTALL) is not None
 
 
@@ -55,8 +55,9 @@ Note = Callable[[str], object]
 
 
 def in_new_names(words: Sequence[str], note: Note) -> list[str]:
-    """Return the command line `words`, which lacks `trilane`, with new names in place of old ones.
+    """Return a command line with new names in place of old names.
 
+    `words`: words of the command line, without `trilane`.
     `note`: function that gets a sentence about each old name.
     """
     if not words:
@@ -77,9 +78,12 @@ def in_new_names(words: Sequence[str], note: Note) -> list[str]:
 
 
 def in_new_name(command: str, name: str, value: object, note: Note = lambda _: None) -> str:
-    """Return the present name of the option `name` of `command`: `output` gives `picture`. Names have no dashes.
+    """Return the present name of an option. Example: the option `output` of `run` is called `picture` now.
 
-    `value`: value of the option. `note`: as in `in_new_names`.
+    `command`: command to which the option belongs.
+    `name`: present or old name of the option, without dashes.
+    `value`: value of the option.
+    `note`: function that gets a sentence about an old name.
     """
     for each in OPTIONS:
         if each.command == command and each.old == f"--{name.replace('_', '-')}" and each.means(value):
@@ -89,7 +93,12 @@ def in_new_name(command: str, name: str, value: object, note: Note = lambda _: N
 
 
 def _options(command: str, words: Sequence[str], note: Note) -> Iterator[str]:
-    """Yield `words`, the arguments of `command`, with new names of options in place of old ones."""
+    """Yield the words of a command line, with old names of options replaced by new names.
+
+    `command`: command, with its subcommand if it has one.
+    `words`: words after the command.
+    `note`: as in `in_new_names`.
+    """
     for place, word in enumerate(words):
         name, equals, own = word.partition("=")
         value: Any = own if equals else next(iter(words[place + 1 :]), "")
@@ -102,7 +111,10 @@ def _options(command: str, words: Sequence[str], note: Note) -> Iterator[str]:
 
 
 def _is_of_a_scene(words: Sequence[str]) -> bool:
-    """Return whether the words after `trilane explain` ask for the plan of a scene."""
+    """Return whether a command line asks for the plan of a scene, and not for an explanation of a run.
+
+    `words`: words after `trilane explain`.
+    """
     left, names = iter(words), []
     for word in left:
         option, equals, _ = word.partition("=")
@@ -116,7 +128,7 @@ def _is_of_a_scene(words: Sequence[str]) -> bool:
 
 
 def _is_scene(name: str) -> bool:
-    """Return whether `name` means a scene, and not the folder of a run with the same name."""
+    """Return whether `name` means a scene. If a run folder has the same name, the name means the run."""
     from trilane.apps.watch.followed_run import folder_of
     from trilane.scene.schema import scene_names
 

@@ -1,4 +1,4 @@
-"""Comparison of runs, predictions and sweeps: what differs, why, and the image error that each speed costs.
+"""Compares runs, predictions and sweeps: what differs, why, and which image error belongs to each speed.
 
 This folder may import from apps/ and every lower folder, but not from apps/cli/.
 """

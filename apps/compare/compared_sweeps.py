@@ -1,7 +1,7 @@
-"""Comparison of two sweeps: trials of one configuration in pairs, and the change over all pairs.
+"""Compares two sweeps: the trials of each configuration with each other, and the change over all configurations.
 
-Rule: a pair has the same configuration on both sides. A trial that is not done, or that the other sweep lacks, is
-counted and named. A trial is compared by its run folder or, without one, by the result in its line.
+Rule: a pair has the same configuration on both sides. A configuration without finished trials on both sides is counted
+and named. A trial is compared by its run folder or, without a run folder, by the result in its line.
 """
 
 from __future__ import annotations
@@ -45,9 +45,13 @@ _Found = tuple[str, Side, Side, Mapping[str, Any]]
 class TrialPair:
     """One configuration in both sweeps.
 
-    `name`: name of its first trial in the base. `runs`: number of runs on each side. `frame_time`: difference of the
-    mean frame times. `differs`: whether the frame times differ, by a test of all pairs together. `sides`: figures of
-    both sides, for the gates. `bounds`: bounds of its runs.
+    `name`: name of its first trial in the base.
+    `options`: options of the configuration, by name.
+    `runs`: number of runs on each side.
+    `frame_time`: difference of the mean frame times.
+    `differs`: whether the frame times differ, by a test of all pairs together.
+    `sides`: figures of both sides, for the gates.
+    `bounds`: bounds of the runs on both sides.
     """
 
     name: str
@@ -60,7 +64,7 @@ class TrialPair:
 
     @property
     def outcome(self) -> Finding:
-        """The finding about the frame time."""
+        """The finding about the mean frame time."""
         return self.frame_time.outcome(differs=self.differs)
 
 
@@ -68,8 +72,12 @@ class TrialPair:
 class SweepComparison:
     """The comparison of the sweep `other` with the sweep `base`.
 
-    `over_all`: difference of the mean frame times over all pairs. `left_out`: names of configurations without a
-    partner, by reason. `changes`: changes that every pair has. `notes`: facts that make the comparison less sure.
+    `base`, `other`: folders of the sweeps, as the user gave them.
+    `pairs`: configurations with finished trials in both sweeps.
+    `over_all`: difference of the mean frame times over all pairs.
+    `left_out`: names of the configurations that are not compared, by reason: `not_done`, `base_alone`, `other_alone`.
+    `changes`: changes of settings and machine that all pairs have.
+    `notes`: facts that make the comparison less sure.
     """
 
     base: str
@@ -82,7 +90,7 @@ class SweepComparison:
 
     @property
     def verdict(self) -> str:
-        """The verdict on the frame times, as a sentence."""
+        """The verdict on the frame times, as a phrase."""
         differing = [pair for pair in self.pairs if pair.differs]
         of = f"{len(self.pairs)} trial{'s' * (len(self.pairs) > 1)}"
         whole = f"over all {change_of(self.over_all, MS)} ({interval_of(self.over_all, MS)})"
@@ -97,7 +105,7 @@ class SweepComparison:
 
     @property
     def bound(self) -> str:
-        """The number of runs that each unit bounded, by sweep, as a sentence; empty if no run names a bound."""
+        """The number of runs that each unit bounded, for each sweep, in words; "" if no run names a bound."""
         base = [bound for pair in self.pairs for bound in pair.bounds.base]
         other = [bound for pair in self.pairs for bound in pair.bounds.other]
         if not any((*base, *other)):
@@ -109,7 +117,7 @@ class SweepComparison:
         return f"bound: {bound_of_runs(other)}; was {bound_of_runs(base)}; {of}"
 
     def as_json(self) -> dict[str, Any]:
-        """Return what `trilane compare --json` prints for two sweeps."""
+        """Return the document that `trilane compare --json` prints for two sweeps."""
         return {
             "schema": SCHEMA,
             "base": self.base,
@@ -137,7 +145,10 @@ def is_sweep(name: str) -> bool:
 
 
 def compare_sweeps(base: str, other: str) -> SweepComparison:
-    """Compare the sweeps in two folders. Raises BadInputError without a common trial, or if trials are no runs."""
+    """Compare two sweeps. `base`, `other`: their folders.
+
+    Raises BadInputError if the sweeps have no finished trial of the same configuration, or if trials are not runs.
+    """
     first, second = (_configurations(Path(name)) for name in (base, other))
     found: list[_Found] = []
     left: dict[str, list[str]] = {"not_done": [], "base_alone": [], "other_alone": []}
@@ -192,7 +203,11 @@ def _compared(
 
 
 def _pair(name: str, base: Side, other: Side) -> GatedPair:
-    """Return two sides with their figures. Raises BadInputError if these have no frame time."""
+    """Return the two sides of the pair `name` with their figures.
+
+    `base`, `other`: runs of one configuration in each sweep.
+    Raises BadInputError if the runs have no frame time.
+    """
     rows = rows_of(base, other)
     if MEAN not in rows:
         raise BadInputError(base.name, "trials without a frame time", "a sweep of `run` or `predict`")
@@ -200,7 +215,11 @@ def _pair(name: str, base: Side, other: Side) -> GatedPair:
 
 
 def _configurations(folder: Path) -> dict[str, dict[int, Mapping[str, Any]]]:
-    """Return the trials' records by configuration, then by number of the repeat, in the order in which they ended."""
+    """Return the trials of the sweep in `folder`, as {configuration: {number of the repeat: record of the trial}}.
+
+    A configuration is the command and the options as JSON text. The records are in the order in which the trials ended.
+    Raises BadInputError for a trial without command or options.
+    """
     found: dict[str, dict[int, Mapping[str, Any]]] = {}
     for record in read_trials(folder).values():
         words, options = record.get("command"), record.get("options")
@@ -216,7 +235,11 @@ def _is_done(record: Mapping[str, Any] | None) -> bool:
 
 
 def _trial(sweep: str, record: Mapping[str, Any]) -> ComparedRun:
-    """Read a trial, with every frame if its run folder exists. Raises BadInputError if the trial is no run."""
+    """Read the trial with the record `record`, with every frame if its run folder exists.
+
+    `sweep`: folder of the sweep. `record`: line of the trial.
+    Raises BadInputError if the trial is not a run or a prediction.
+    """
     name, folder = str(record["id"]), record.get("folder")
     place = Path(sweep, str(folder)) if isinstance(folder, str) and Path(folder).name == folder else None
     if place is not None and (place / "report.json").is_file():
@@ -237,7 +260,10 @@ def _told(row: Difference) -> dict[str, Any]:
 
 
 def _notes(documents: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Yield remarks on other programs beside the trials, and on too few frames. `documents`: reports of all runs."""
+    """Yield remarks on other programs that ran at the same time, and on too few frames.
+
+    `documents`: reports of all runs on both sides, as JSON.
+    """
     shares = [share for document in documents if (share := document.get("other_programs") or 0.0) > MOST_OTHERS]
     if shares:
         runs = f"{len(shares)} of {len(documents)} runs"

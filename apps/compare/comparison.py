@@ -1,7 +1,8 @@
-"""A comparison of sides with a base, as data and in words. Rule: table, JSON and page show only its content.
+"""A comparison of one or more sides with a base, as data and in words.
 
-The verdict is a sentence. It names the change of the frame time, then what explains the change, the most telling first:
-stages that take longer or shorter, units that wait more or less, and settings with a known effect.
+Rule: table, JSON and page show only the content of a comparison. The verdict is a sentence. It names the change of the
+frame time, then the reasons for the change. Stages that take longer or shorter come first, then units that wait more or
+less, then settings with a known effect.
 """
 
 from __future__ import annotations
@@ -67,10 +68,11 @@ IN_THOUSANDS: Final = 10_000
 
 
 class Bounds(NamedTuple):
-    """The `bound` of each run on both sides, as in report.json; None if it is unknown.
+    """The bounds of the runs on both sides, as the key `bound` of report.json; None for a run with an unknown bound.
 
-    `outcome`: whether the bounding unit changed. It is certain only if no bound has rivals. A report without the key
-    `rivals` is certain if the unit has more than half of the path.
+    `base`, `other`: bounds on each side, in the order of the runs.
+    `outcome`: finding whether the bounding unit changed. A change is certain only if no bound has rivals. If a report
+    lacks the key `rivals`, its bound is certain if the unit has more than half of the path.
     """
 
     base: tuple[Mapping[str, Any] | None, ...]
@@ -89,12 +91,12 @@ class Bounds(NamedTuple):
         return Finding.DIFFERS if len(base) == len(other) == 1 and is_sure else Finding.UNKNOWN
 
     def as_json(self) -> dict[str, Any]:
-        """Return the value of `bound` in an entry of `comparisons` or, for two sweeps, of `trials`."""
+        """Return the key `bound` for an entry of `comparisons` in the JSON or, for two sweeps, of `trials`."""
         return {**self._asdict(), "outcome": str(self.outcome)}
 
 
 def bounds_of(base: Side, other: Side) -> Bounds:
-    """Return the bounds in the reports of both sides."""
+    """Return the bounds in the reports of the sides `base` and `other`."""
     return Bounds(*(tuple(told.document.get("bound") for told in side.runs) for side in (base, other)))
 
 
@@ -105,9 +107,14 @@ def _is_sure(unit: Mapping[str, Any]) -> bool:
 
 @dataclass(frozen=True)
 class Comparison:
-    """One side compared with the base.
+    """The comparison of the side `other` with the side `base`.
 
+    `rows`: difference of each figure.
     `differing`: figures that differ significantly, corrected for testing all figures at once.
+    `changes`: settings and facts of the machine that changed.
+    `verdict`: as `verdict` returns it.
+    `bounds`: bounds of the runs on both sides.
+    `notes`: remarks for the user.
     """
 
     base: Side
@@ -121,7 +128,7 @@ class Comparison:
 
     @property
     def unsure(self) -> tuple[str, ...]:
-        """A sentence for each run that cannot be trusted."""
+        """Sentences about the runs that cannot be trusted, one for each such run."""
         return tuple(spoilt((*self.base.runs, *self.other.runs)))
 
     def as_json(self) -> dict[str, Any]:
@@ -139,26 +146,30 @@ class Comparison:
 
     @property
     def whole(self) -> Finding:
-        """The finding about the comparison as a whole, as in the verdict."""
+        """The finding about the whole comparison, as the verdict states it."""
         if self.differing:
             return Finding.DIFFERS
         return Finding.SAME if self.verdict == NO_DIFFERENCE else Finding.UNKNOWN
 
     def outcome(self, figure: Figure) -> Finding:
-        """Return the finding for one of the `rows`."""
+        """Return the finding about `figure`, a key of `rows`."""
         row = self.rows[figure]
         return row.outcome(differs=figure in self.differing, margin=margin_of(figure, row))
 
 
 def compare(base: Side, others: Sequence[Side]) -> list[Comparison]:
-    """Compare each of `others` with `base`."""
+    """Return the comparison of each of the sides `others` with the side `base`, in order.
+
+    Raises BadInputError for a side that has no time in common with `base`.
+    """
     return [_compared(base, other) for other in others]
 
 
 def document(comparisons: Sequence[Comparison]) -> dict[str, Any]:
     """Return the document of `trilane compare --json`.
 
-    If several sides are compared, `verdict` names each side. Each of `changes` names its side as `run`.
+    `comparisons`: one or more, with the same base. If there are several, `verdict` names each side. Each entry of
+    `changes` names its side as `run`.
     """
     several = len(comparisons) > 1
     return {
@@ -186,7 +197,11 @@ def _compared(base: Side, other: Side) -> Comparison:
 
 
 def _differing(rows: Rows, figures: Sequence[Figure]) -> tuple[Figure, ...]:
-    """Return the `figures` that differ. All are tested together, except figures without scatter, which need no test."""
+    """Return those of `figures` that differ significantly.
+
+    All figures with scatter are tested together. A figure without scatter needs no test.
+    `rows`: difference of each figure.
+    """
     tested = {figure: rows[figure].probability or 0.0 for figure in figures if rows[figure].probability is not None}
     uncertain = [figure for figure in tested if rows[figure].deviation]
     fallen = dict(zip(uncertain, rejected([tested[figure] for figure in uncertain]), strict=True))
@@ -194,7 +209,7 @@ def _differing(rows: Rows, figures: Sequence[Figure]) -> tuple[Figure, ...]:
 
 
 def _stages(report: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Return the names of the stages, by unit. `report`: report as JSON."""
+    """Return the names of the stages of each unit, by the unit's name. `report`: report as JSON."""
     found: dict[str, list[str]] = {}
     for name, row in report["stages"].items():
         found.setdefault(row["unit"], []).append(name)
@@ -210,14 +225,14 @@ def _notes(base: Side, other: Side) -> list[str]:
 
 
 def spoilt(runs: Sequence[ComparedRun]) -> Iterator[str]:
-    """Yield a sentence for each run that cannot be trusted. Predictions and imported times are not judged."""
+    """Yield a sentence for each of `runs` that cannot be trusted. Predictions and imported times are not judged."""
     for told in runs:
         if told.kind in (RunKind.RUN, RunKind.REPORT) and not (trust := trust_of(told.document)).trusted:
             yield f"{told.name} is {trust.said}"
 
 
 def _about(told: ComparedRun) -> Iterator[str]:
-    """Yield remarks on what is known of a run: kind of data, number of frames, end of the journal."""
+    """Yield remarks on the data of the run `told`: kind of data, number of frames, end of the journal."""
     if told.kind is RunKind.REPORT:
         yield "a report without a journal, so only summaries are compared, each as uncertain as the mean frame time"
     if told.kind is RunKind.TIMES:
@@ -260,10 +275,13 @@ def verdict(
     changes: Sequence[Change],
     stages: Mapping[str, Sequence[str]],
 ) -> str:
-    """Return the verdict: `no difference`, or a sentence, which begins with `cannot tell` if nothing is certain.
+    """Return the verdict: `no difference`, or a sentence. The sentence begins with `cannot tell` if nothing is certain.
 
-    `named`: figures of `rows` that the verdict rests on. `differing`: figures that differ, tested together. `changes`:
-    changes of configuration and machine. `stages`: names of each unit's stages.
+    `rows`: difference of each figure.
+    `named`: figures that decide the verdict.
+    `differing`: figures that differ, tested together.
+    `changes`: changes of configuration and machine.
+    `stages`: names of the stages of each unit.
     """
     if not differing:
         return _not_told(rows, named, changes, stages)
@@ -285,7 +303,9 @@ def _not_told(
 ) -> str:
     """Return the verdict if no figure surely differs: `no difference` or `cannot tell`.
 
-    It rests on counted instructions alone if every stage has them and no setting changed, otherwise on times.
+    If every stage has counted instructions and no setting changed, only the instructions decide. Otherwise, times
+    decide.
+    `rows`, `named`, `changes`, `stages`: as in `verdict`.
     """
     counted = [figure for figure in named if figure.measure == INSTRUCTIONS]
     is_counted = len(counted) == sum(map(len, stages.values())) and not changes
@@ -307,7 +327,10 @@ def _not_told(
 
 
 def _programs(found: Rows) -> Iterator[str]:
-    """Yield stages that execute more or fewer instructions, then stages whose instructions take longer or shorter."""
+    """Yield phrases about stages whose number of instructions, or time of an instruction, differs.
+
+    All phrases about the number of instructions come first. `found`: rows that differ.
+    """
     for figure, row in found.items():
         if figure.measure == INSTRUCTIONS:
             sign = 1 if row.change > 0 else -1
@@ -319,9 +342,10 @@ def _programs(found: Rows) -> Iterator[str]:
 
 
 def _heads(found: Rows) -> Iterator[str]:
-    """Yield the change of the mean frame time or, if only a percentile differs, of the first such percentile.
+    """Yield the change of the frame time or, if the frame time does not differ, of the latency.
 
-    If the frame time does not differ, yield the same of the latency.
+    The change of the mean is preferred. If only percentiles differ, the first of them is named. `found`: rows that
+    differ.
     """
     for measure in (FRAME_TIME, LATENCY):
         mine = {figure: row for figure, row in found.items() if figure.measure == measure}
@@ -334,9 +358,12 @@ def _heads(found: Rows) -> Iterator[str]:
 
 
 def _works(found: Rows, rows: Rows, changes: Sequence[Change]) -> Iterator[str]:
-    """Yield stages that take longer or shorter, the largest change in ms first.
+    """Yield a phrase for each stage that takes longer or shorter, the largest change in ms first, `MOST_NAMED` at most.
 
-    Stages with counted instructions are left out: `_programs` names them.
+    Stages whose instructions differ are left out, because `_programs` names them.
+    `found`: rows that differ.
+    `rows`: all rows.
+    `changes`: changes of settings, which may explain the change of a stage.
     """
     by_stage: dict[str, tuple[Figure, Difference]] = {}
     counted = {figure.of for figure in found if figure.measure in (INSTRUCTIONS, INSTRUCTION_TIME)}
@@ -355,9 +382,13 @@ def _works(found: Rows, rows: Rows, changes: Sequence[Change]) -> Iterator[str]:
 
 
 def _waits(found: Rows, rows: Rows, stages: Mapping[str, Sequence[str]]) -> Iterator[str]:
-    """Yield units that wait more if frames take longer, or wait less if frames take less time.
+    """Yield phrases for units that wait more if frames take longer, or less if frames take less time.
 
-    Longer waits come first, then units that were busier.
+    If the frame time does not differ, both kinds are yielded. Increases come first. Within increases and decreases, the
+    units that were busiest in the base come first. At most `MOST_NAMED` units are named.
+    `found`: rows that differ.
+    `rows`: all rows.
+    `stages`: names of the stages of each unit.
     """
     frame_time = next((row.change for figure, row in found.items() if figure.measure == FRAME_TIME), 0.0)
     telling = [
@@ -388,19 +419,31 @@ def _plain(figure: Figure, row: Difference) -> str:
 
 
 def longer(row: Difference, unit: str) -> str:
-    """Return a change in words, such as `5 % longer (4.2 to 5.8)`. `unit`: unit of the figure."""
+    """Return a change of a time in words, such as `5 % longer (4.2 to 5.8)`.
+
+    `row`: difference with the change and its interval.
+    `unit`: unit of the figure.
+    """
     word = "longer" if row.change > 0 else "shorter"
     sign = 1 if row.change > 0 else -1
     return f"{_amount(sign * row.change, row, unit)} {word}{_between(row, sign)}"
 
 
 def signed(row: Difference, unit: str) -> str:
-    """Return a change with its sign, such as `+48 % (44 to 52)`. `unit`: unit of the figure."""
+    """Return a change with its sign, such as `+48 % (44 to 52)`.
+
+    `row`: difference with the change and its interval.
+    `unit`: unit of the figure.
+    """
     return f"{_amount(row.change, row, unit, '+')}{_between(row, 1)}"
 
 
 def _between(row: Difference, sign: int) -> str:
-    """Return the interval in words; "" if it is unknown, or if both ends are written with the same digits."""
+    """Return the interval of a change, such as ` (44 to 52)`; "" if it is unknown or rounds to a single number.
+
+    `row`: difference with the interval.
+    `sign`: 1, or -1 to show the interval of the opposite change.
+    """
     if row.low is None or row.high is None:
         return ""
     scale = 100 if row.is_ratio else 1
@@ -409,14 +452,24 @@ def _between(row: Difference, sign: int) -> str:
 
 
 def _amount(value: float, row: Difference, unit: str, sign: str = "") -> str:
-    """Return a change with its unit: a ratio in percent, a share in percentage points."""
+    """Return a part of a change as text with its unit: a ratio in percent, a share in percentage points.
+
+    `value`: the part, in the unit of `row.change`.
+    `row`: difference to which the part belongs.
+    `unit`: unit of the figure.
+    `sign`: `+` to write a sign before positive numbers too, "" for a minus only.
+    """
     if row.is_ratio or unit == SHARE:
         return f"{_number(100 * value, sign)} {'%' if row.is_ratio else 'points'}"
     return f"{_number(value, sign)} {unit}".rstrip()
 
 
 def _number(value: float, sign: str = "") -> str:
-    """Return a number with three digits, and without an exponent for large numbers."""
+    """Return a number as text with three significant digits; from 1000 on, rounded to an integer, without exponent.
+
+    `value`: the number.
+    `sign`: as in `_amount`.
+    """
     return f"{value:{sign}.3g}" if abs(value) < WITHOUT_FRACTION else f"{value:{sign}.0f}"
 
 
@@ -428,7 +481,11 @@ def name_of(figure: Figure) -> str:
 
 
 def value_of(value: float, unit: str) -> str:
-    """Return a value with its unit; a share is in percent."""
+    """Return a value of a figure as text with its unit; a share is in percent.
+
+    `value`: the value.
+    `unit`: unit of the figure.
+    """
     if unit == BYTES:
         return f"{value:,.0f} {unit}"
     if unit == "" and abs(value) >= IN_THOUSANDS:
@@ -437,12 +494,15 @@ def value_of(value: float, unit: str) -> str:
 
 
 def change_of(row: Difference, unit: str) -> str:
-    """Return the change with its unit: a ratio in percent, a share in percentage points, other changes in `unit`."""
+    """Return the change in `row` as text: a ratio in percent, a share in percentage points, other changes in `unit`."""
     return _scaled(row.change, row, unit)
 
 
 def interval_of(row: Difference, unit: str) -> str:
-    """Return the 95 % interval of the change; a dash if it is unknown."""
+    """Return the 95 % interval of the change in `row`, such as `-1.2 to +3.4`; a dash if the interval is unknown.
+
+    `unit`: unit of the figure.
+    """
     if row.low is None or row.high is None:
         return DASH
     return f"{_scaled(row.low, row, unit, with_unit=False)} to {_scaled(row.high, row, unit, with_unit=False)}"
@@ -456,7 +516,7 @@ def _scaled(value: float, row: Difference, unit: str, *, with_unit: bool = True)
 
 
 def bounds_text(bounds: Bounds) -> str:
-    """Return the bounds of the other side and the base in words; "" if none is known, as in predictions."""
+    """Return the bounds of the other side and of the base in words; "" if no bound is known, as in predictions."""
     if not any((*bounds.base, *bounds.other)):
         return ""
     changed = " changed" if bounds.outcome is Finding.DIFFERS else ""
@@ -465,7 +525,10 @@ def bounds_text(bounds: Bounds) -> str:
 
 
 def bound_of_runs(bounds: Sequence[Mapping[str, Any] | None]) -> str:
-    """Return the bound of one run in words or, for several runs, the number of runs that each unit bounded."""
+    """Return the bound of a single run in words. For several runs, return how many runs each unit bounded.
+
+    `bounds`: bound of each run, as in report.json; None if it is unknown.
+    """
     if len(bounds) == 1:
         return bound_text(bounds[0]) if bounds[0] else "not known"
     names = Counter(bound["unit"]["name"] if bound else "not known" for bound in bounds)
@@ -473,5 +536,5 @@ def bound_of_runs(bounds: Sequence[Mapping[str, Any] | None]) -> str:
 
 
 def setting(value: Any) -> str:
-    """Return the value of a setting as text; a dash if the key is missing."""
+    """Return the value of a setting as text; a dash for None, which stands for a missing setting."""
     return DASH if value is None else str(value)

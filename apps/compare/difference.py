@@ -1,11 +1,14 @@
 """The difference of a statistic between runs, with its uncertainty. Rule: lack of knowledge widens the interval.
 
-Two things make runs of one kind differ by chance. Frames scatter and drift within a run; a jackknife over stretches of
-frames measures that (Künsch, Annals of Statistics 17 (1989)). The state of the machine also differs from run to run:
-several runs on each side show it, and the deviations in `rows.py` count as further runs. A conjugate normal prior joins
-both, so Student's t applies (Gelman et al., Bayesian Data Analysis, section 3.2; Smyth, Statistical Applications in
-Genetics and Molecular Biology 3 (2004)). If a known cause explains a change of some size, a change up to that size does
-not count as a difference.
+Two things make runs of one kind differ by chance. First, frames scatter and drift within a run. A jackknife over
+stretches of frames measures this scatter [1]. Second, the state of the machine differs from run to run. Several runs on
+each side show this, and the deviations in `rows.py` count as further runs. A conjugate normal prior joins both, so
+Student's t applies [2, 3]. If a known cause explains a change of some size, a change up to that size does not count as
+a difference.
+
+[1] Künsch, Annals of Statistics 17 (1989).
+[2] Gelman et al., Bayesian Data Analysis, section 3.2.
+[3] Smyth, Statistical Applications in Genetics and Molecular Biology 3 (2004).
 """
 
 from __future__ import annotations
@@ -38,9 +41,9 @@ ALPHA = 0.01
 
 
 class Finding(StrEnum):
-    """The finding about a figure.
+    """The finding about the change of a figure.
 
-    DIFFERS: it has changed. SAME: its change is certainly below `MATTERS`. UNKNOWN: neither is certain.
+    DIFFERS: the figure has changed. SAME: the change is certainly below `MATTERS`. UNKNOWN: neither is certain.
     """
 
     DIFFERS = "differs"
@@ -52,8 +55,9 @@ class Finding(StrEnum):
 class Series:
     """One figure of every frame of a run, in order.
 
-    `frames` (n,): numbers of the frames. `values` (n,): figure of each frame; for a share, its numerator. `weights`
-    (n,): for a share, its denominator in the same unit; otherwise 1.
+    `frames`: (n,) numbers of the frames.
+    `values`: (n,) figure of each frame; for a share, its numerator.
+    `weights`: (n,) for a share, its denominator in the same unit; otherwise 1.
     """
 
     frames: I64
@@ -61,16 +65,18 @@ class Series:
     weights: F64
 
     def at(self, places: Ints | slice) -> Series:
-        """Return the part of the series at `places`, indices of frames."""
+        """Return the part of the series at `places`, which are indices into its arrays."""
         return Series(self.frames[places], self.values[places], self.weights[places])
 
 
 class Chance(NamedTuple):
-    """How much a figure differs between runs of one kind beyond the scatter of their frames; nothing in virtual time.
+    """How much a figure differs between runs of one kind, beyond the scatter of their frames.
 
-    `relative`, `absolute`: two parts of the standard deviation of one run's figure: as a share of the figure, and in
-    its unit. `freedom`: number of runs that would give equal knowledge. `explained`: largest change that a known cause
-    explains, as a logarithm for a ratio, otherwise in the figure's unit.
+    In virtual time, runs do not differ, and the defaults hold.
+    `relative`, `absolute`: two parts of the standard deviation of one run's figure. `relative` is a share of the
+    figure, `absolute` is in its unit.
+    `freedom`: number of runs that would give equal knowledge.
+    `explained`: largest change that a known cause explains, as a logarithm for a ratio, otherwise in the figure's unit.
     """
 
     relative: float = 0.0
@@ -83,12 +89,15 @@ class Difference(NamedTuple):
     """How far a statistic has changed from the base to the other side.
 
     `base`, `other`: value of each side, over all frames; for several runs, their arithmetic mean.
-    `change`: change with its 95 % interval from `low` to `high`: a share of the base if `is_ratio`, otherwise in the
-    statistic's unit. It only covers frames that all runs have. For a ratio, the geometric mean of several runs counts.
-    Therefore it may differ from the ratio of `other` and `base`.
-    `probability`: chance that runs of one kind differ by at least `change`.
-    `deviation`: standard deviation of the change, or of its logarithm if `is_ratio`. `freedom`: degrees of freedom of
-    the deviation. `explained`: as in `Chance`.
+    `change`: change from `base` to `other`. If the runs show the same frames, it covers only the frames that all runs
+    have. If `is_ratio`, it is a share of the base. For several runs, it compares geometric means, so it may differ from
+    `other` / `base` - 1. Without `is_ratio`, it is in the statistic's unit.
+    `low`, `high`: ends of the 95 % interval of `change`.
+    `probability`: probability that runs of one kind differ by at least `change`.
+    `is_ratio`: whether `change` is a share of the base.
+    `deviation`: standard deviation of the change, or of its logarithm if `is_ratio`.
+    `freedom`: degrees of freedom of the deviation.
+    `explained`: as in `Chance`.
     If the uncertainty is unknown, `low`, `high`, `probability` and `deviation` are None.
     """
 
@@ -105,14 +114,14 @@ class Difference(NamedTuple):
 
     @property
     def effect(self) -> float:
-        """The change on the scale of `deviation`: the logarithm of the ratio if `is_ratio`, otherwise the change."""
+        """The change on the scale of `deviation`: the logarithm of the ratio if `is_ratio`, otherwise `change`."""
         return log1p(self.change) if self.is_ratio else self.change
 
     def outcome(self, *, differs: bool, margin: float = MATTERS) -> Finding:
         """Return the finding about this difference.
 
-        `differs`: whether the figure differs, by a test of all figures together. `margin`: the least change that
-        matters, in the unit of `change`.
+        `differs`: whether the figure differs, by a test of all figures together.
+        `margin`: the least change that matters, in the unit of `change`.
         """
         if differs:
             return Finding.DIFFERS
@@ -126,13 +135,16 @@ def _mean(values: F64, weights: F64) -> float:
 
 
 def _typical(values: F64, _: F64) -> float:
-    """Return the mean of the middle half of `values`."""
+    """Return the mean of the middle half of `values`; weights do not count."""
     count = len(values)
     return float(np.sort(values)[count // 4 : count - count // 4].mean())
 
 
 def _quantile(share: float) -> Reduce:
-    """Return a function that computes a quantile, linear between ranks, as in the report."""
+    """Return a function that computes a quantile of values, linear between ranks, as in the report.
+
+    `share`: share of the values below the quantile.
+    """
     return lambda values, _: float(np.quantile(values, share))
 
 
@@ -150,11 +162,15 @@ STATISTICS: Final[dict[str, Reduce]] = {
 def difference(
     base: Sequence[Series], other: Sequence[Series], statistic: str, *, is_ratio: bool, chance: Chance
 ) -> Difference:
-    """Return the change of `statistic` from the runs `base` to the runs `other`, over each run's last `MOST_FRAMES`.
+    """Return the change of a statistic between two sides, over the last `MOST_FRAMES` frames of each run.
 
-    If the runs have the same frames, each frame is compared with itself: the different work in the frames of a scene
-    does not count as scatter. `is_ratio`: whether the change is a share of the base. If a value is 0, the change is a
-    plain difference in any case. `chance`: chance of the figure between runs of one kind.
+    If the runs show the same frames (see `ALIKE`), each frame is compared with itself. The differences between frames
+    of a scene are then no scatter. If a run has too few frames for the statistic, the uncertainty is unknown.
+    `base`, `other`: series of the figure in each run of a side.
+    `statistic`: key of `STATISTICS`.
+    `is_ratio`: whether the change is a share of the base. If the figure of any frame is 0 or less, the change is a
+    plain difference in any case.
+    `chance`: the `Chance` of the figure.
     """
     reduce = STATISTICS[statistic]
     sides = [[each.at(slice(-MOST_FRAMES, None)) for each in side] for side in (base, other)]
@@ -179,10 +195,13 @@ def difference(
 def settled(
     values: Sequence[Sequence[float]], effects: Sequence[F64], within: float, chance: Chance, *, is_ratio: bool
 ) -> Difference:
-    """Return the difference of two sides.
+    """Return the difference of two sides from the figures of their runs.
 
-    `values`: figure of each run, by side. `effects`: the same figures on the scale of `Difference.deviation`: for a
-    ratio, logarithms. `within`: variance of the change due to scatter within runs.
+    `values`: figure of each run, as two sequences: base, other side.
+    `effects`: the same figures on the scale of `Difference.deviation`: logarithms for a ratio.
+    `within`: variance of the change due to scatter within runs.
+    `chance`: the `Chance` of the figure.
+    `is_ratio`: whether the change is a share of the base.
     """
     first, second = (float(side.mean()) for side in effects)
     scale = 1.0 if is_ratio else max(abs(first), abs(second))
@@ -195,11 +214,12 @@ def settled(
 
 
 def combined(pairs: Sequence[Difference]) -> Difference:
-    """Return one difference for all `pairs`, at least one.
+    """Return one difference for all `pairs`, of which there is at least one.
 
-    `base` and `other` are arithmetic means. The change is the mean of the effects: for ratios, the geometric mean. Its
-    deviation follows from the pairs' deviations, as if they were independent. If the pairs scatter more (Birge's ratio
-    above 1), their scatter gives the deviation. If only some pairs are ratios, the deviation is unknown.
+    `base` and `other` are arithmetic means. The change is the mean of the effects: for ratios, the geometric mean. The
+    deviation of this mean follows from the pairs' deviations, as if the pairs were independent. If the scatter of the
+    pairs gives a larger deviation (Birge's ratio above 1), the larger deviation counts. If only some pairs are ratios,
+    the deviation is unknown.
     """
     base, other = (sum(getattr(pair, side) for pair in pairs) / len(pairs) for side in ("base", "other"))
     is_ratio = all(pair.is_ratio for pair in pairs)
@@ -218,18 +238,20 @@ def combined(pairs: Sequence[Difference]) -> Difference:
 
 
 def unsure(base: float, other: float, *, is_ratio: bool) -> Difference:
-    """Return the difference of `other` from `base` with unknown uncertainty.
+    """Return the difference of the value `other` from the value `base`, with unknown uncertainty.
 
-    `is_ratio`: whether the change is a share of the base. If a value is 0 or less, it is a plain difference.
+    `is_ratio`: whether the change is a share of the base. If a value is 0 or less, the change is a plain difference in
+    any case.
     """
     is_ratio = is_ratio and min(base, other) > 0
     return _told((base, other), log(other / base) if is_ratio else other - base, None, is_ratio=is_ratio)
 
 
 def judged(base: float, other: float, deviation: float, *, is_ratio: bool) -> Difference:
-    """Return the difference of `other` from `base` with the standard deviation `deviation`.
+    """Return the difference of the value `other` from the value `base`, with a known deviation.
 
-    If `is_ratio`, both values must be above 0, and `deviation` belongs to the logarithm of their ratio.
+    `deviation`: standard deviation of the change. If `is_ratio`, it belongs to the logarithm of the ratio.
+    `is_ratio`: whether the change is a share of the base; both values must then be above 0.
     """
     return _told((base, other), log(other / base) if is_ratio else other - base, deviation, is_ratio=is_ratio)
 
@@ -243,7 +265,11 @@ def _told(
     *,
     is_ratio: bool,
 ) -> Difference:
-    """Return the difference of two `values`. `effect`: see `Difference.effect`. `deviation`: None if unknown."""
+    """Return the difference of two values.
+
+    `values`: value of the base, value of the other side.
+    `effect`, `deviation`, `freedom`, `explained`, `is_ratio`: as in `Difference`; `deviation` is None if it is unknown.
+    """
     base, other = values
     if deviation is None:
         return Difference(base, other, _change(effect, is_ratio), None, None, None, is_ratio)
@@ -259,10 +285,10 @@ def _change(effect: float, is_ratio: bool) -> float:
 
 
 def _least_frames(statistic: str) -> int:
-    """Return the number of frames that a statistic needs.
+    """Return the least number of frames for which the uncertainty of `statistic` is known.
 
-    For a percentile, each stretch needs on average one frame beyond it: without such frames, the jackknife sees no
-    scatter.
+    For a percentile, each stretch needs on average one frame beyond the percentile. Without such frames, the jackknife
+    sees no scatter.
     """
     share = int(statistic[1:]) / 100 if statistic in ("p50", "p90", "p99") else 0.5
     return max(LEAST_FRAMES, ceil(STRETCHES / (1 - share)))
@@ -277,7 +303,10 @@ def _value(series: Series, reduce: Reduce) -> float:
 
 
 def _common(runs: Sequence[Series]) -> I64 | None:
-    """Return the frames that all `runs` have; None if they are less than the share `ALIKE` of a run's frames."""
+    """Return the numbers of the frames that all `runs` have.
+
+    None is returned if these are less than the share `ALIKE` of the frames of the longest run.
+    """
     common = runs[0].frames
     for each in runs[1:]:
         common = np.intersect1d(common, each.frames)
@@ -285,9 +314,11 @@ def _common(runs: Sequence[Series]) -> I64 | None:
 
 
 def _left_out(series: Series, reduce: Reduce, is_ratio: bool) -> F64:
-    """Return the statistic of all frames, then of all frames but each stretch in turn, (1 + `STRETCHES`,).
+    """Return a statistic of all frames, then of all frames without each stretch in turn, (1 + `STRETCHES`,) float64.
 
-    If `is_ratio`, return logarithms.
+    `series`: figure of each frame.
+    `reduce`: function that computes the statistic.
+    `is_ratio`: whether to return logarithms.
     """
     edges = np.linspace(0, len(series.values), STRETCHES + 1).astype(int)
     places = np.arange(len(series.values))
@@ -299,17 +330,18 @@ def _left_out(series: Series, reduce: Reduce, is_ratio: bool) -> F64:
 def _jackknife(values: F64) -> float:
     """Return the variance of a statistic, or of its change between two sides, by the jackknife.
 
-    `values[i]`: the statistic or change without the frames of stretch i. `values` has shape (`STRETCHES`,).
+    `values`: (`STRETCHES`,) statistic or change; the value at index i is computed without the frames of stretch i.
     """
     return float((len(values) - 1) / len(values) * ((values - values.mean()) ** 2).sum())
 
 
 def rejected(probabilities: Sequence[float], alpha: float = ALPHA) -> list[bool]:
-    """Return, for each hypothesis "no difference", whether it is rejected.
+    """Return, for each hypothesis "no difference", whether the hypothesis is rejected.
 
-    `probabilities`: probability of the observation under each hypothesis. The chance of any false rejection is at most
-    `alpha`, even if the hypotheses depend on each other: Holm, "A simple sequentially rejective multiple test
-    procedure", Scandinavian Journal of Statistics 6 (1979).
+    The probability of any false rejection is at most `alpha`, even if the hypotheses depend on each other. The method
+    is Holm, "A simple sequentially rejective multiple test procedure", Scandinavian Journal of Statistics 6 (1979).
+    `probabilities`: probability of the observation under each hypothesis.
+    `alpha`: largest probability of any false rejection.
     """
     order = sorted(range(len(probabilities)), key=probabilities.__getitem__)
     fallen = [False] * len(probabilities)

@@ -1,4 +1,4 @@
-"""The entries that are worth a look: the frontier of frame time against error, and its knee.
+"""Finds the best entries: the frontier of frame time against PSNR, and its knee.
 
 Rule: pure. Only a sure difference counts: intervals decide for times, `SAME_DB` decides for pictures.
 """
@@ -17,9 +17,12 @@ LEAST_OF_A_KNEE: Final = 3
 
 
 class Scored(Protocol):
-    """An entry that can be on a frontier. Less `frame_ms` and more `psnr_db` are better.
+    """An entry that can be on a frontier.
 
-    `low_ms`, `high_ms`: interval of `frame_ms`; None if unknown. `group`: only entries of one group are compared.
+    `frame_ms`: mean frame time, less is better; None if it is unknown.
+    `low_ms`, `high_ms`: interval of `frame_ms`; None if it is unknown.
+    `psnr_db`: PSNR of the pictures, more is better; None if it is unknown.
+    `group`: key of the entry's group; only entries of one group are compared.
     """
 
     @property
@@ -35,7 +38,7 @@ class Scored(Protocol):
 
 
 class _Point(NamedTuple):
-    """An entry with a frame time and a PSNR. `number`: place of the entry in the list of all entries."""
+    """An entry with a known frame time and PSNR. `number`: index of the entry in the list of all entries."""
 
     frame_ms: float
     low_ms: float
@@ -47,9 +50,10 @@ class _Point(NamedTuple):
 def frontier(entries: Sequence[Scored]) -> list[bool]:
     """Return for each entry whether it is on the frontier: no other entry of its group beats it.
 
-    An entry beats another in two ways. Either its picture is better by more than `SAME_DB`, and its mean frame time is
-    not larger. Or its picture is equal or better, and it is surely quicker: its interval ends below the other's begin.
-    An entry without a frame time or a PSNR is not on the frontier.
+    An entry A beats an entry B in either of two cases. In the first case, A has a PSNR that is larger by more than
+    `SAME_DB`, and its mean frame time is not larger. In the second case, A has a PSNR that is larger, or smaller by at
+    most `SAME_DB`, and A is surely quicker. "Surely" means: the interval of A ends below the begin of the interval of
+    B. An entry without a frame time or a PSNR is not on the frontier.
     """
     on = [False] * len(entries)
     for points in _groups(entries).values():
@@ -66,11 +70,12 @@ def frontier(entries: Sequence[Scored]) -> list[bool]:
 
 
 def knees(entries: Sequence[Scored]) -> dict[Hashable, int]:
-    """Return the knee of each group that has one, as the number of an entry. After the knee, time buys little quality.
+    """Return the index of the entry at the knee, by group. Beyond a knee, more time improves pictures only a little.
 
-    Take the points that have a better picture than all quicker points, with both axes scaled to 0..1. The knee is the
-    point farthest above the straight line from the first to the last (Satopaa et al., "Finding a Kneedle in a
-    Haystack", 2011).
+    Only points count that have a better picture than all quicker points, with both axes scaled to 0..1. The knee is the
+    point farthest above the straight line from the first point to the last. A group with fewer than `LEAST_OF_A_KNEE`
+    such points, or without a point above the line, has no knee.
+    Satopaa et al., "Finding a Kneedle in a Haystack", 2011.
     """
     found = {}
     for group, points in _groups(entries).items():
@@ -89,7 +94,7 @@ def knees(entries: Sequence[Scored]) -> dict[Hashable, int]:
 
 
 def _groups(entries: Sequence[Scored]) -> dict[Hashable, list[_Point]]:
-    """Return the points of each group, in the order of the groups' first entries."""
+    """Return the points of each group. Groups are in the order of their first points."""
     found: dict[Hashable, list[_Point]] = {}
     for number, entry in enumerate(entries):
         mean, psnr_db = entry.frame_ms, entry.psnr_db

@@ -1,12 +1,12 @@
-"""A comparison as a gate: the outcome of each limit is kept, broken, or cannot tell.
+"""A comparison as a gate: each limit is kept, broken, or its outcome is unknown.
 
 Rule: a pass needs proof. A limit is broken if a figure surely became worse, and its interval reaches beyond the limit.
-A limit is kept if the whole interval lies within it, on a quiet machine. Otherwise the gate cannot tell, and names the
-number of runs that would decide.
+A limit is kept if the whole interval lies within the limit, on a quiet machine. Otherwise, the outcome is unknown, and
+the gate states how many runs would decide, if more runs can decide.
 
-Time is weighed three ways: frame time with other programs' share taken out, each stage's time and CPU time of a job,
-and its counted instructions. Instructions repeat to 0.1 %. Therefore the limit `slower` needs no other figure if every
-stage has counts, no setting changed, and the frame time does not contradict the counts.
+Three kinds of figures are judged: the frame time, without the share of other programs; each stage's time and CPU time;
+each stage's counted instructions. Counts of instructions repeat to 0.1 %. The counts alone decide the limit `slower`
+under three conditions: every stage has counts, no setting changed, and the frame time does not contradict the counts.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ MOST_SAID: Final = 4
 
 
 class LimitOutcome(StrEnum):
-    """The outcome of a limit."""
+    """The outcome of a limit: kept, broken, or unknown."""
 
     KEPT = "kept"
     BROKEN = "broken"
@@ -59,8 +59,11 @@ class LimitOutcome(StrEnum):
 class GateMetric(NamedTuple):
     """A metric that may have a limit.
 
-    `says`: a broken limit in words. `of`: its figures, as (measure, statistic). `unit`: unit of the limit. `is_timed`:
-    whether other programs change its figures. `sign`: 1 if more is worse, -1 if less is worse.
+    `says`: phrase for a broken limit.
+    `of`: figures of the metric, as (measure, statistic).
+    `unit`: unit of the limit.
+    `is_timed`: whether other programs change its figures.
+    `sign`: 1 if more is worse, -1 if less is worse.
     """
 
     says: str
@@ -101,9 +104,12 @@ ABSENT: Final = {
 
 
 class Gate(NamedTuple):
-    """How much worse than the base a run may be in one metric.
+    """A limit: how much worse than the base a run may be in one metric.
 
-    `name`: key of METRICS. `limit`: a share, or dB. `text`: the limit as its option writes it, such as `slower=5%`.
+    `name`: key of METRICS.
+    `limit`: the largest change for the worse, as a share of the base or in dB. For a share of the frames, it is a
+    difference of shares.
+    `text`: the limit as its option writes it, such as `slower=5%`.
     """
 
     name: str
@@ -116,7 +122,12 @@ class Gate(NamedTuple):
 
 
 def read_gate(text: str, option: str = "--fail-if") -> Gate:
-    """Read a limit such as `slower=5%` or `psnr=0.5dB`. Raises BadInputError, which names the metrics or the unit."""
+    """Return the gate in a text such as `slower=5%` or `psnr=0.5dB`.
+
+    `text`: metric and limit.
+    `option`: name of the option, for errors.
+    Raises BadInputError for an unknown metric or a wrong unit; the error names the valid ones.
+    """
     name, _, value = (part.strip() for part in text.partition("="))
     if name not in METRICS:
         expected = f"METRIC=LIMIT with one of {', '.join(METRICS)}"
@@ -130,7 +141,13 @@ def read_gate(text: str, option: str = "--fail-if") -> Gate:
 
 @dataclass(frozen=True)
 class GatedPair:
-    """Two sides to judge. `rows`: their figures. `changes`: settings and facts of the machine that changed."""
+    """Two sides to judge.
+
+    `name`: name of the other side; for two sweeps, name of the configuration.
+    `base`, `other`: runs of each side.
+    `rows`: difference of each figure.
+    `changes`: settings and facts of the machine that changed.
+    """
 
     name: str
     base: Side
@@ -142,10 +159,14 @@ class GatedPair:
 class Weighed(NamedTuple):
     """One figure against its limit.
 
-    `least`, `most`: smallest and largest change for the worse, given the changes that known causes can explain. For a
-    ratio, both are logarithms. `limit`: limit on the same scale. `probability`: chance that runs of one kind are worse
-    by `least`. `outcome`: outcome of this figure alone. `runs`: number of runs on each side that would decide; inf for
-    more than `MOST_RUNS`, None if no number decides.
+    `figure`: the figure. `row`: its difference.
+    `least`, `most`: smallest and largest change for the worse that remain after known causes explain a part. For a
+    ratio, both are logarithms.
+    `limit`: limit on the same scale.
+    `probability`: probability that runs of one kind are worse by `least` or more.
+    `outcome`: outcome of this figure alone.
+    `runs`: number of runs on each side that would decide; inf for more than `MOST_RUNS`, None if no number would decide
+    or none is needed.
     """
 
     figure: Figure
@@ -159,12 +180,12 @@ class Weighed(NamedTuple):
 
     @property
     def is_near(self) -> bool:
-        """Whether `least` is at most one deviation above the limit."""
+        """Whether `least` exceeds the limit by at most one standard deviation."""
         return self.row.deviation is not None and self.least - self.row.deviation <= self.limit
 
     @property
     def said(self) -> str:
-        """The figure with its change, its interval, and its change with other programs' share taken out."""
+        """The figure in words: its change, the interval, and the change without the share of other programs."""
         unit = self.figure.unit
         change = f"{name_of(self.figure)} {change_of(self.row, unit)}"
         if self.row.deviation != 0:
@@ -178,8 +199,13 @@ class Weighed(NamedTuple):
 class JudgedLimit(NamedTuple):
     """The judgement of one limit for one pair.
 
-    `name`: name of the other side. `reason`: a sentence. `runs`: as in `Weighed`, for all figures of the limit
-    together; None also if the outcome needs no more runs.
+    `gate`: the limit.
+    `name`: name of the pair.
+    `outcome`: outcome of the limit.
+    `reason`: reason of the outcome in words.
+    `figures`: figures that were judged.
+    `runs`: number of runs on each side that would decide for all figures of the limit; inf for more than `MOST_RUNS`.
+    None if no number would decide, or if the outcome needs no more runs.
     """
 
     gate: Gate
@@ -191,7 +217,7 @@ class JudgedLimit(NamedTuple):
 
     @property
     def said(self) -> str:
-        """The judgement in one line."""
+        """The limit, the outcome and the reason in one line."""
         return f"{self.gate.text}: {self.outcome}: {self.reason}"
 
     def as_json(self) -> dict[str, Any]:
@@ -211,7 +237,12 @@ class JudgedLimit(NamedTuple):
 
 
 def whole(judged: Sequence[JudgedLimit]) -> LimitOutcome:
-    """Return the outcome of all limits: broken if one is broken, else unknown if one is unknown, else kept."""
+    """Return the outcome of all limits together.
+
+    The result is BROKEN if any limit is broken. Without a broken limit, it is UNKNOWN if the outcome of any limit is
+    unknown, otherwise KEPT.
+    `judged`: judgement of each limit.
+    """
     found = [each.outcome for each in judged]
     return next(
         (outcome for outcome in (LimitOutcome.BROKEN, LimitOutcome.UNKNOWN) if outcome in found), LimitOutcome.KEPT
@@ -219,7 +250,12 @@ def whole(judged: Sequence[JudgedLimit]) -> LimitOutcome:
 
 
 def judge(gates: Sequence[Gate], pairs: Sequence[GatedPair]) -> list[JudgedLimit]:
-    """Judge every limit for every pair. All figures are tested together, so that false alarms are rare."""
+    """Return the judgement of every limit for every pair.
+
+    The judgements are in the order of `pairs`, and for each pair in the order of `gates`. All figures are tested
+    together, so that false alarms are rare.
+    `gates`: the limits.
+    """
     asked = [(gate, pair, list(_weighed(gate, pair))) for pair in pairs for gate in gates]
     every = [each for _, _, figures in asked for each in figures if each.row.deviation]
     fallen = rejected([each.probability for each in every])
@@ -249,11 +285,16 @@ def _weighed(gate: Gate, pair: GatedPair) -> Iterator[Weighed]:
 
 
 def _is_said(figure: Figure, row: Difference, work: Difference | None, metric: GateMetric, is_quiet: bool) -> bool:
-    """Return whether `work`, the stage's typical time on its core, already says what `figure` says.
+    """Return whether `figure` adds nothing to `work`, so that the figure is not judged.
 
-    Service time says no more if it did not grow more than `work`, CPU time if it is as long as `work`. If few jobs take
-    much longer, the typical time does not show it, but the mean service time does. On a machine that is not quiet,
-    other programs make few jobs longer. Service time is not weighed there, and no limit is kept anyway.
+    Service time adds nothing if it did not grow more than `work`; CPU time, if it is as long as `work`. If few jobs
+    take much longer, the typical time does not show it, but the mean service time does. On a machine that is not quiet,
+    other programs make few jobs longer. Service time is not judged there, and no limit is kept anyway. If the metric
+    does not judge `work`, every figure adds something.
+    `row`: difference of the figure.
+    `work`: difference of the stage's typical time on its core; None if it is unknown.
+    `metric`: metric with the limit.
+    `is_quiet`: whether all runs can be trusted.
     """
     if work is None or (WORK, "typical") not in metric.of:
         return False
@@ -264,16 +305,23 @@ def _is_said(figure: Figure, row: Difference, work: Difference | None, metric: G
 
 
 def _chance_of(least: float, row: Difference) -> float:
-    """Return the one-sided probability that runs of one kind are worse by at least `least`."""
+    """Return the one-sided probability that runs of one kind are worse by `least` or more.
+
+    `row`: difference with the deviation. The probability is 1 if `least` is not above 0, or if the deviation is
+    unknown.
+    """
     if least <= 0 or row.deviation is None:
         return 1.0
     return student_tails(least / row.deviation, row.freedom) / 2 if row.deviation else 0.0
 
 
 def _settled(each: Weighed, is_sure: bool, tests: int, pair: GatedPair) -> Weighed:
-    """Return `each` with its outcome or, if that is unknown, with the number of runs that would decide.
+    """Return `each` with its outcome. If the outcome is unknown, add the number of runs that would decide.
 
-    `is_sure`: whether the figure is surely worse. `tests`: number of figures that are tested together.
+    `each`: figure against its limit.
+    `is_sure`: whether the figure is surely worse.
+    `tests`: number of figures that are tested together.
+    `pair`: pair with the runs of both sides.
     """
     row = each.row
     if row.deviation is None:
@@ -286,9 +334,12 @@ def _settled(each: Weighed, is_sure: bool, tests: int, pair: GatedPair) -> Weigh
 
 
 def runs_needed(each: Weighed, sizes: tuple[int, int], tests: int) -> float | None:
-    """Return how many runs on each side would decide (`Weighed.runs`), if further runs have the same mean and scatter.
+    """Return how many runs on each side would decide, as in `Weighed.runs`.
 
-    `sizes`: present numbers of runs on both sides. `tests`: number of figures that are tested together.
+    Further runs are assumed to have the same mean and scatter.
+    `each`: figure against its limit.
+    `sizes`: present numbers of runs: base, other side.
+    `tests`: number of figures that are tested together.
     """
     if each.row.deviation is None or (each.most >= each.limit and each.least <= 0):
         return None
@@ -328,7 +379,10 @@ def _judged(gate: Gate, pair: GatedPair, figures: tuple[Weighed, ...]) -> Judged
 
 
 def _missing(pair: GatedPair) -> list[str]:
-    """Return the stages that some run has and another lacks. Their change is unknown."""
+    """Return the names of the stages that are in some runs of `pair`, but not in all.
+
+    For such a stage, the change between the sides is unknown.
+    """
     stages = [{*run.document.get("stages", {})} for run in _runs(pair)]
     return sorted(set().union(*stages) - set[str]().union(*stages[:1]).intersection(*stages))
 
@@ -338,10 +392,12 @@ def _runs(pair: GatedPair) -> tuple[ComparedRun, ...]:
 
 
 def _decisive(gate: Gate, pair: GatedPair, figures: Sequence[Weighed]) -> list[Weighed]:
-    """Return the figures that must keep the limit: all or, for `slower`, only the counted instructions.
+    """Return the figures that must keep the limit.
 
-    Instructions are enough if every stage has them and no setting changed. A frame time that contradicts them, because
-    it is not near the limit, must keep the limit too.
+    For the limit `slower`, these are only the counted instructions, if every stage has counts and no setting changed. A
+    frame time that is not near the limit contradicts the counts, and must then keep the limit too. In all other cases,
+    these are all `figures`.
+    `gate`: the limit. `pair`: the two sides.
     """
     counted = [each for each in figures if each.figure.measure == INSTRUCTIONS]
     frames = [each for each in figures if each.figure.measure == FRAME_TIME]
@@ -370,5 +426,8 @@ def _list(figures: Sequence[Weighed]) -> str:
 
 
 def as_json(judged: Sequence[JudgedLimit]) -> Mapping[str, Any]:
-    """Return the keys that gates add to the output of `trilane compare --json`."""
+    """Return the keys that gates add to the output of `trilane compare --json`: `outcome` and `gates`.
+
+    `judged`: judgements of all limits.
+    """
     return {"outcome": str(whole(judged)), "gates": [each.as_json() for each in judged]}

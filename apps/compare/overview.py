@@ -1,8 +1,8 @@
 """Many runs, predictions and trials as one table: options, speed, error, and the source of each.
 
-Rule: figures are copied from documents, never measured or guessed. Every speed has its error beside it, or a note that
-there is none. Page, CSV and Parquet have the same columns and numbers. The size of each file is checked first. An
-unreadable file is refused by name before anything is written.
+Rule: figures are copied from documents, never measured or guessed. Beside every speed stands the error, or a note that
+the error is unknown. Page, CSV and Parquet have the same columns and numbers. The size of each file is checked before
+the file is read. An unreadable file is refused by name before anything is written.
 """
 
 from __future__ import annotations
@@ -66,10 +66,12 @@ SOURCES = ("speed_source", "interval", "error_source", "shows", "clock", "machin
 
 
 def read_entries(places: Sequence[Path]) -> list[Entry]:
-    """Read the entries of all `places`, in order. If entries have the same name, each gets its folder's name in front.
+    """Read the entries of all `places`, in order.
 
-    In a folder of runs and sweeps, a run that cannot be read becomes an entry with a `failure`.
-    Raises BadInputError for a place that cannot be read or has no entries.
+    If several entries have the same name, the name of the folder around each of them is added in front. In a folder of
+    runs and sweeps, a run that cannot be read becomes an entry with a `failure`.
+    `places`: run folders, folders of sweeps, saved predictions, or folders of runs and sweeps.
+    Raises BadInputError for a place that cannot be read or has no entries, and for more than `MOST` entries.
     """
     entries: list[Entry] = []
     for place in places:
@@ -124,10 +126,12 @@ def _document(path: Path) -> Mapping[str, Any]:
 
 
 def _names(trials: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return names for the trials of one sweep: the options in which they differ, such as `256, openvino`.
+    """Return names for the trials of one sweep: the values of the options that differ, such as `256, openvino`.
 
-    If only one option has numbers, its name is left out. If several trials would have the same name, each gets the
-    number of its repeat, or else its id. A trial without any such option is named by its id.
+    If several of these options have numbers, these options are written with their names. An option that is on or off is
+    written as `key` or `no key`. If several trials would have the same name, the number of the repeat is added to each.
+    If their names are still the same, the id is added. A trial without any such option is named by its id.
+    `trials`: last record of each trial.
     """
     options = [dict(_settings(_dict(trial.get("options")))) for trial in trials]
     keys = [key for key in dict.fromkeys(chain(*options)) if len({each.get(key) for each in options}) > 1]
@@ -184,7 +188,9 @@ def _dict(value: Any) -> dict[str, Any]:
 def _video(folder: Path, name: Any) -> Path | None:
     """Return the path of the video in a trial's run folder; the file may not exist.
 
-    `folder`: the sweep's folder. `name`: name of the run folder; None is returned if it is no text or leads outside.
+    None is returned if `name` is no text, or leads out of the sweep's folder.
+    `folder`: folder of the sweep.
+    `name`: name of the run folder from the trial's record.
     """
     if not isinstance(name, str):
         return None
@@ -194,21 +200,25 @@ def _video(folder: Path, name: Any) -> Path | None:
 
 @dataclass(frozen=True)
 class Entry:
-    """One run, prediction or trial as a row.
+    """One run, prediction or trial as a row of the table.
 
-    `name`: name of its folder, or the options in which its trial differs from others. `trial`: id of its trial.
-    `within`: name of the folder around the run folder, or of its sweep's folder.
-    `clock`: host or virtual. `machine`: the machine in one line. `facts`: facts of the machine.
-    `settings`: values by dotted key. `command`: words of the command, empty if unknown.
-    `frame_ms`, `low_ms`, `high_ms`: mean frame time and its interval, None if unknown. `interval`: `BY_SCATTER`,
-    `BY_MODEL`, or empty.
+    `name`: name of its folder, or the options in which its trial differs from others. `trial`: id of its trial, "" for
+    a run or prediction.
+    `within`: name of the folder around the run folder; for a trial, name of the sweep's folder.
+    `clock`: host or virtual. `machine`: the machine in one line. `facts`: facts about the machine.
+    `settings`: values by dotted key. `command`: words of the command, empty if it is unknown.
+    `frame_ms`, `low_ms`, `high_ms`: mean frame time and the ends of its interval, None if unknown.
+    `interval`: kind of the interval: `BY_SCATTER`, `BY_MODEL`, or "" without an interval.
+    `frames_per_s`: frame rate. `latency_ms`: mean latency. Both are None if unknown.
     `psnr_db`: mean PSNR over frames. `worst_psnr_db`, `p1_psnr_db`: worst frame and 1st percentile of a run's own
-    frames. `error_source`: origin of the PSNR, or why there is none. `error_of`: `OF_RUN` with its reference,
-    `OF_AVATAR`, or empty.
-    `failure`: why there are no figures. `verdict`: PASS or FAIL at its rate, empty if unknown. `bound`: the unit and
-    the stages that the verdict names. `trust`: "sure", "UNSURE", or empty.
+    frames. All are None if unknown.
+    `error_source`: source of the PSNR, or why the PSNR is unknown. `error_of`: `OF_RUN` with the reference pictures,
+    `OF_AVATAR`, or "" without a PSNR.
+    `failure`: why the run or trial failed, or why it cannot be read; "" for neither.
+    `verdict`: PASS or FAIL, with the target rate. `bound`: the unit and the stages that bound the run. `trust`: "sure"
+    or "UNSURE". All are "" if unknown.
     `other_programs`: share of the time of its cores that other programs had, None if unknown.
-    `video`: video of a run. `shows`: content of the pictures in words.
+    `video`: video of a run, None if the file is missing. `shows`: content of the pictures in words.
     """
 
     name: str
@@ -240,21 +250,27 @@ class Entry:
 
     @property
     def speed_source(self) -> str:
-        """The origin of the speed, measured or computed; empty without a speed."""
+        """The source of the speed, measured or computed; "" without a speed."""
         return "" if self.frame_ms is None else MEASURED if self.clock == HOST_CLOCK else COMPUTED
 
     @property
     def group(self) -> tuple[str, str, str, str]:
-        """The group of the entry. Only entries of one group are compared: their times and errors mean the same."""
+        """The key of the entry's group: clock, machine, content of the pictures, and kind of error.
+
+        Only entries of one group are compared, because only their times and errors have the same meaning.
+        """
         return self.clock, self.machine, self.shows, self.error_of
 
 
 def entry_of(
     name: str, document: Mapping[str, Any], video: Path | None = None, options: Mapping[str, Any] | None = None
 ) -> Entry:
-    """Return the entry of a report, of a prediction, or of a failed trial, which has only a `failure`.
+    """Return the entry of a run, a prediction or a trial.
 
-    `document`: content of the report or prediction. `options`: options of a trial, which are added to the settings.
+    `name`: name of the entry.
+    `document`: content of the report or prediction. For a failed trial, it has a `failure` and may lack all figures.
+    `video`: path of the video, which may be missing; None for a run without a video.
+    `options`: options of a trial, which are added to the settings; None for no trial.
     """
     times, made = _mapping(document, "frame_time_ms"), _mapping(document, "made")
     machine, config = _mapping(document, "machine"), _mapping(document, "config")
@@ -288,7 +304,10 @@ def entry_of(
 
 
 def _verdict(verdict: Mapping[str, Any]) -> dict[str, str]:
-    """Return `verdict`, `bound` and `trust` of an entry from a document's `verdict`; empty if `verdict` is empty."""
+    """Return the fields `verdict`, `bound` and `trust` of an entry; no fields if `verdict` is empty.
+
+    `verdict`: key `verdict` of a report or prediction.
+    """
     if not verdict:
         return {}
     bound = _mapping(verdict, "bound")
@@ -299,16 +318,22 @@ def _verdict(verdict: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _interval(times: Mapping[str, Any]) -> tuple[float | None, float | None]:
-    """Return the ends of the interval of the mean frame time: from a run's own frames, or else from a model."""
+    """Return the lower and upper end of the interval of the mean frame time, ms; (None, None) if it is unknown.
+
+    The interval from a run's own frames is preferred to the interval of a model.
+    `times`: key `frame_time_ms` of a report or prediction.
+    """
     names = ("mean_low", "mean_high") if "mean_low" in times else ("low", "high")
     low, high = (_time(times.get(name)) for name in names)
     return (None, None) if low is None or high is None else (low, high)
 
 
 def _shows(scene: Mapping[str, Any]) -> str:
-    """Return the content of the pictures of `scene` in words. Two scenes with the same words show the same pictures.
+    """Return the content of the pictures of `scene` in words. Scenes with the same words show the same pictures.
 
-    The size of the tensor and the network do not change these words. Unusual content is named with its key.
+    The size of the tensor and the network do not change these words. Content that differs from the defaults is named
+    with its key.
+    `scene`: key `scene` of a document's `config`.
     """
     output, camera = _mapping(scene, "output"), _mapping(scene, "camera")
     bodies = [body for body in _sequence(scene.get("avatars")) if isinstance(body, Mapping)]
@@ -318,7 +343,10 @@ def _shows(scene: Mapping[str, Any]) -> str:
 
 
 def _unusual(scene: Mapping[str, Any]) -> Iterator[str]:
-    """Yield key and value of the settings of `scene` that differ from the defaults, such as `frames 60`."""
+    """Yield key and value of the settings of `scene` that differ from the defaults, such as `frames 60`.
+
+    Settings in `HOW_DRAWN` and `WITHOUT_KEY` are left out.
+    """
     usual = dict(_settings(Scene().model_dump(mode="json")))
     for key, value in _settings(scene):
         plain = re.sub(r"^avatars\[\d+\]", "avatars[0]", key)
@@ -327,9 +355,11 @@ def _unusual(scene: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _error(document: Mapping[str, Any]) -> tuple[float | None, str, str]:
-    """Return `psnr_db`, `error_source` and `error_of` of an entry.
+    """Return the fields `psnr_db`, `error_source` and `error_of` of an entry.
 
-    The PSNR is the run's own if the run was checked, otherwise the PSNR of its worst avatar.
+    If the frames of a run were checked, the PSNR is that of the run. Otherwise, it is the PSNR of the worst avatar, or
+    None if the PSNR of any avatar is unknown.
+    `document`: report or prediction.
     """
     check = _mapping(document, "check")
     if (own := _number(check.get("psnr_db"))) is not None:
@@ -347,7 +377,10 @@ def _error(document: Mapping[str, Any]) -> tuple[float | None, str, str]:
 
 
 def _settings(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield (dotted key, value as text) for each leaf of `config`, without `NOT_SETTINGS`."""
+    """Yield (dotted key, value as text) for each value in the nested mapping `config`, without `NOT_SETTINGS`.
+
+    `prefix`: start of the dotted keys.
+    """
     for key, value in config.items():
         if not prefix and key in NOT_SETTINGS:
             continue
@@ -378,12 +411,15 @@ def _sequence(value: Any) -> list[Any]:
 
 
 def _text(value: Any) -> str:
-    """Return `value` as text that UTF-8 can hold: a lone surrogate, as in a file name without UTF-8, becomes `?`."""
+    """Return `value` as text that UTF-8 can encode. A lone surrogate, as in a file name without UTF-8, becomes `?`."""
     return str(value).encode("utf-8", "replace").decode("utf-8")
 
 
 def _number(value: Any) -> float | None:
-    """Return `value` as a finite float; None if it is no number, NaN, infinite, or an integer beyond a float."""
+    """Return `value` as a finite float.
+
+    None is returned for a value that is no number, not finite, or too large for a float.
+    """
     if not isinstance(value, int | float) or isinstance(value, bool):
         return None
     try:
@@ -394,19 +430,23 @@ def _number(value: Any) -> float | None:
 
 
 def _time(value: Any) -> float | None:
-    """Return `value` as a float if it is a number above 0, otherwise None."""
+    """Return `value` as a float if it is a finite number above 0, otherwise None."""
     number = _number(value)
     return number if number is not None and number > 0 else None
 
 
 def varied(entries: list[Entry]) -> list[str]:
-    """Return the keys of settings in which entries differ, in the order of their first appearance."""
+    """Return the keys of the settings in which `entries` differ, in the order of their first appearance."""
     keys = dict.fromkeys(key for entry in entries for key in entry.settings)
     return [key for key in keys if len({entry.settings[key] for entry in entries if key in entry.settings}) > 1]
 
 
 def told_choices(entries: Sequence[Entry]) -> Iterator[str]:
-    """Yield a sentence about each group with two or more known entries: its knee, or its quickest and best entries."""
+    """Yield a sentence about each group with two or more entries that have a frame time and a PSNR.
+
+    The sentence names the knee of the group. For a group without a knee, it names the quickest entry and the one with
+    the best picture.
+    """
     at = knees(entries)
     known: dict[Hashable, dict[int, tuple[float, float, str]]] = {}
     for number, entry in enumerate(entries):
@@ -434,12 +474,12 @@ def told_choices(entries: Sequence[Entry]) -> Iterator[str]:
 
 
 def columns(entries: Sequence[Entry]) -> list[str]:
-    """Return the table's columns: `name`, the settings that vary, `FIGURES`, `SOURCES`."""
+    """Return the names of the table's columns: `name`, the settings in which `entries` differ, `FIGURES`, `SOURCES`."""
     return ["name", *varied(list(entries)), *FIGURES, *SOURCES]
 
 
 def table_rows(entries: Sequence[Entry]) -> list[dict[str, Any]]:
-    """Return a row for each entry; a cell without a value is None."""
+    """Return a row for each entry: values by the names of the `columns`; None for a missing value."""
     settings = varied(list(entries))
     return [
         {
@@ -454,7 +494,10 @@ def table_rows(entries: Sequence[Entry]) -> list[dict[str, Any]]:
 
 
 def write_csv(target: Path, entries: Sequence[Entry]) -> None:
-    """Write the table as CSV. Raises BadInputError if `target` cannot be written."""
+    """Write the table of `entries` as CSV into the file `target`.
+
+    Raises BadInputError if `target` cannot be written.
+    """
     with write_atomically(target) as draft, draft.open("w", encoding="utf-8", newline="") as file:
         writer = csv.DictWriter(file, columns(entries))
         writer.writeheader()
@@ -462,7 +505,7 @@ def write_csv(target: Path, entries: Sequence[Entry]) -> None:
 
 
 def write_parquet(target: Path, entries: Sequence[Entry]) -> None:
-    """Write the table as Parquet.
+    """Write the table of `entries` as Parquet into the file `target`.
 
     Raises MissingPartError without pyarrow, BadInputError if `target` cannot be written.
     """

@@ -1,8 +1,8 @@
 """The overview and the comparison, each as one self-contained HTML file that loads nothing. All text is escaped.
 
-The overview has a drawing, the table, and stills of the videos. Its only script is a file of this folder, and the
-page's policy names the digest. An unreadable video gives no still. The drawing shows the table's numbers. No two things
-differ by colour alone.
+The overview has a drawing, the table, and stills of the videos. The drawing shows the table's numbers. An unreadable
+video gives no still. No two things differ by colour alone. The only script of the page is a file of this folder, and
+the page's policy allows only this script, by its digest.
 
 The comparison runs no script. Each change is also drawn: a dot with its 95 % interval, on one scale for figures of the
 same kind.
@@ -65,7 +65,11 @@ BAR_WIDTH, BAR_HEIGHT, BAR_MARGIN = 160, 18, 6  # of the drawing of a change, pi
 
 
 def overview_page(title: str, entries: Sequence[Entry]) -> str:
-    """Return the HTML document of an overview. `entries`: one or more."""
+    """Return the HTML document of an overview.
+
+    `title`: title of the page.
+    `entries`: entries of the table, one or more.
+    """
     script = _beside("overview_page.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
@@ -74,7 +78,13 @@ def overview_page(title: str, entries: Sequence[Entry]) -> str:
 
 
 def _document(title: str, style: str, policy: str, body: str) -> str:
-    """Return an HTML document. `style`: file beside this module. `policy`: what the page may load and run."""
+    """Return an HTML document.
+
+    `title`: title of the page.
+    `style`: name of the file beside this module that has the styles.
+    `policy`: content security policy: what the page may load and run.
+    `body`: HTML after the heading.
+    """
     return (
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{escape(policy)}">\n'
@@ -154,7 +164,10 @@ def _cell(name: str, value: Any) -> str:
 
 
 def _stills(entries: Sequence[Entry]) -> Iterator[str]:
-    """Yield the section of stills: two selectable stills over each other, then all stills."""
+    """Yield the section of stills: a left and a right still to select and compare, then all stills.
+
+    Nothing is yielded if no entry has a readable video.
+    """
     filmed = [entry for entry in entries if entry.video is not None]
     pictures = [(entry, still(entry.video)) for entry in filmed[:MOST_STILLS] if entry.video is not None]
     found = [(entry, base64.b64encode(data).decode()) for entry, data in pictures if data is not None]
@@ -206,8 +219,11 @@ def _facts(machine: Any) -> str:
 class Dot(NamedTuple):
     """A dot at the frame time `x` and the PSNR `y`.
 
-    `low`, `high`: interval of `x`. `on`: whether the dot is on the frontier. `group`: number of its group, which has a
-    marker. `is_knee`: whether the dot is the knee of its group.
+    `label`: name of the entry.
+    `x`: frame time, ms. `low`, `high`: ends of its interval, None if they are unknown. `y`: PSNR, dB.
+    `on`: whether the dot is on the frontier.
+    `group`: number of its group, which decides the marker.
+    `is_knee`: whether the dot is the knee of its group.
     """
 
     label: str
@@ -238,7 +254,10 @@ def marker_name(group: int) -> str:
 
 
 def scatter(dots: Sequence[Dot], x_title: str, y_title: str) -> str:
-    """Return an SVG drawing of the dots, with intervals as lines and frontiers as steps; "" without dots."""
+    """Return an SVG drawing of `dots`, with intervals as lines and frontiers as steps; "" without dots.
+
+    `x_title`, `y_title`: titles of the axes.
+    """
     if not dots:
         return ""
     xs = [value for dot in dots for value in (dot.x, dot.low, dot.high) if value is not None]
@@ -261,9 +280,10 @@ def scatter(dots: Sequence[Dot], x_title: str, y_title: str) -> str:
 
 
 class _Axis:
-    """An axis that maps values to pixels, with a margin of a twentieth on both sides and ticks at round numbers.
+    """An axis of a drawing. It maps values to pixels, with a margin of 1/20 of the range on both sides.
 
-    `low`, `high`: range of the values. `first`, `last`: pixels of the axis's ends.
+    `low`, `high`: range of the values.
+    `first`, `last`: pixels of the axis's ends.
     """
 
     def __init__(self, low: float, high: float, first: float, last: float) -> None:
@@ -298,7 +318,11 @@ def _grid(across: _Axis, up: _Axis) -> Iterator[str]:
 
 
 def _steps(dots: Sequence[Dot], across: _Axis, up: _Axis) -> Iterator[str]:
-    """Yield the frontier of each group as steps: the best PSNR up to each frame time."""
+    """Yield, for each group, its frontier as an SVG path with steps: the best PSNR up to each frame time.
+
+    `dots`: dots of all groups.
+    `across`, `up`: axes of the frame time and of the PSNR.
+    """
     for group in sorted({dot.group for dot in dots}):
         points = sorted((dot.x, dot.y) for dot in dots if dot.on and dot.group == group)
         bests = accumulate((y for _, y in points), max)
@@ -323,7 +347,12 @@ def _dot(dot: Dot, across: _Axis, up: _Axis) -> str:
 
 
 def _names(dots: Sequence[Dot], across: _Axis, up: _Axis) -> Iterator[str]:
-    """Yield the names of knees, then of other dots on the frontier. A name that would overlap another is left out."""
+    """Yield SVG texts with the names of knees, then of other dots on the frontier.
+
+    A name that would overlap another name is left out.
+    `dots`: dots of all groups.
+    `across`, `up`: axes of the frame time and of the PSNR.
+    """
     taken: list[tuple[float, float, float]] = []  # left, right, base line
     named = sorted((dot for dot in dots if dot.on or dot.is_knee), key=lambda dot: not dot.is_knee)
     for dot in named:
@@ -339,7 +368,10 @@ def _names(dots: Sequence[Dot], across: _Axis, up: _Axis) -> Iterator[str]:
 
 
 def still(video: Path) -> bytes | None:
-    """Return a frame from about the middle of `video` as JPEG, at most `STILL_WIDTH` wide; None if unreadable."""
+    """Return a frame near the middle of `video` as a JPEG, at most `STILL_WIDTH` pixels wide.
+
+    None is returned if the video cannot be read.
+    """
     try:
         with av.open(str(video)) as container:
             stream = container.streams.video[0]
@@ -357,7 +389,10 @@ def still(video: Path) -> bytes | None:
 
 
 def comparison_page(comparisons: Sequence[Comparison]) -> str:
-    """Return the HTML document of a comparison. `comparisons`: one or more, with the same base."""
+    """Return the HTML document of a comparison.
+
+    `comparisons`: one or more, with the same base.
+    """
     title = f"Compared with {comparisons[0].base.name}"
     parts = "\n".join(part for comparison in comparisons for part in _section(comparison))
     body = f'{parts}\n<p class="note">{escape(METHOD)}</p>'
@@ -423,7 +458,7 @@ def _scale_of(row: Difference, unit: str) -> tuple[bool, str]:
 
 
 def _scales(comparison: Comparison) -> dict[tuple[bool, str], float]:
-    """Return, by kind of change (`_scale_of`), the largest change to draw.
+    """Return the change at the right edge of the drawing, for each kind of change (`_scale_of`).
 
     Every change fits in, and so do the intervals of figures that differ. Other intervals may be cut.
     """
@@ -438,6 +473,7 @@ def _scales(comparison: Comparison) -> dict[tuple[bool, str], float]:
 def _bar(row: Difference, scale: float) -> str:
     """Return a table cell with a drawing: a dot at the change, a line for its interval, and a line at no change.
 
+    `row`: difference to draw.
     `scale`: change at the right edge.
     """
 

@@ -1,7 +1,8 @@
-"""The figures of two sides as rows, each with its random variation. Rule: a table names each measure's statistics.
+"""The figures of two sides as rows, each with its random variation.
 
-In runs with a journal, every figure comes from the frames. A report alone or a prediction only has summaries. Each
-summary gets the uncertainty of the mean frame time, because no other one is known.
+Rule: `MEASURES` names the statistics of each measure. If all runs have a journal, the differences come from the frames.
+Otherwise, they come from the summaries in reports and predictions. Means, medians and shares then get the uncertainty
+of the mean frame time, because no other uncertainty is known.
 
 `Noise` says how much more a figure differs between runs of one kind than their frames show. "Runs of one kind" are runs
 of the same configuration.
@@ -79,10 +80,14 @@ Documents = Sequence[Mapping[str, Any]]
 
 
 class Figure(NamedTuple):
-    """The subject of a row.
+    """The subject of one row of a comparison.
 
-    `measure`: what is measured. `of`: stage, unit or avatar, or empty. `cause`: cause of idle time, or empty.
-    `statistic`: as in `MEASURES`. `unit`: unit of the value, such as ms or share.
+    `measure`: what is measured.
+    `of`: stage, unit, or avatar with the key of its accuracy. For lost and dropped frames, it is the cause; "" means
+    the whole run.
+    `cause`: cause of idle time, "" for other measures.
+    `statistic`: as in `MEASURES`.
+    `unit`: unit of the value, such as ms or share.
     """
 
     measure: str
@@ -96,7 +101,7 @@ Rows = dict[Figure, Difference]
 
 
 def rows_of(base: Side, other: Side) -> Rows:
-    """Return the difference of every figure that all runs of both sides have."""
+    """Return the difference of every figure that all runs of the sides `base` and `other` have."""
     noise = _noise(base, other)
     is_known = all(told.frames is not None for told in (*base.runs, *other.runs))
     rows = dict(_of_frames(base, other, noise) if is_known else _of_summaries(base, other, noise))
@@ -108,8 +113,8 @@ def rows_of(base: Side, other: Side) -> Rows:
 def named(rows: Rows) -> list[Figure]:
     """Return the figures that decide a verdict, without those that only explain it.
 
-    For a stage, its number of instructions and the time of one instruction decide. Without counted instructions, its
-    time on the core decides; if this time is unknown too, its service time.
+    For a stage, the number of instructions and the time of one instruction decide. If instructions are not counted, the
+    stage's time on its core decides. If this time is unknown too, the service time decides.
     """
     counted, worked = ({figure.of for figure in rows if figure.measure == each} for each in (INSTRUCTION_TIME, WORK))
 
@@ -126,7 +131,7 @@ def named(rows: Rows) -> list[Figure]:
 
 
 def margin_of(figure: Figure, row: Difference) -> float:
-    """Return the least change that matters, in the unit of the row's `change`."""
+    """Return the least change that matters for `figure`, in the unit of `row.change`."""
     if row.is_ratio or figure.unit == SHARE:
         return MATTERS
     return max(MATTERS * max(abs(row.base), abs(row.other)), WAIT_FLOOR_MS if figure.unit == MS else 0.0)
@@ -143,7 +148,7 @@ def _noise(base: Side, other: Side) -> Noise:
 
 
 def _shared(base: Side, other: Side) -> list[Key]:
-    """Return the keys of the series that all runs have; none if a run has no frames."""
+    """Return the keys of the series that all runs of both sides have; none if a run has no frames."""
     first, *rest = [told.frames.series if told.frames else {} for side in (base, other) for told in side.runs]
     return [key for key in first if all(key in each for each in rest)]
 
@@ -178,8 +183,10 @@ def _chance(measure: str, of: str, statistic: str, noise: Noise) -> Chance:
 def _of_summaries(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figure, Difference]]:
     """Yield each figure that the summaries of all runs have, with its difference.
 
-    Means, medians and shares scatter within a run like the mean frame time. If this scatter is unknown, the figures
-    have an unknown uncertainty. All other statistics always have an unknown uncertainty.
+    Means, medians and shares scatter within a run like the mean frame time. If the scatter of the mean frame time is
+    unknown, their uncertainty is unknown too. The uncertainty of all other statistics is always unknown.
+    `base`, `other`: runs of each side.
+    `noise`: noise between the runs of the two sides.
     """
     sides = [[_summaries(told.document) for told in side.runs] for side in (base, other)]
     within = _relative_variance(base, other)
@@ -199,9 +206,11 @@ def _of_summaries(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figur
 
 
 def _relative_variance(base: Side, other: Side) -> float | None:
-    """Return the variance of the logarithm of the ratio of mean frame times, from the intervals in the documents.
+    """Return the variance of log(other / base), where `other` and `base` stand for the mean frame times of both sides.
 
-    None if a document has no interval; 0 for predictions of one chip, which share the model's error.
+    Only scatter within runs counts. The variance comes from the intervals in the documents. It is 0 for predictions of
+    one chip, because they share the model's error. A run in virtual time without an interval adds 0. None is returned
+    if any other document has no interval.
     """
     runs = [*base.runs, *other.runs]
     if all(
@@ -250,7 +259,12 @@ def _statistics(measure: str, of: str, times: Mapping[str, Any], names: Sequence
 
 
 def _of_counts(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figure, Difference]]:
-    """Yield the lost and dropped frames by cause, as shares of the requested frames."""
+    """Yield the lost and dropped frames by cause, as shares of the requested frames, with their differences.
+
+    Nothing is yielded if a document has no counts of frames.
+    `base`, `other`: runs of each side.
+    `noise`: noise between the runs of the two sides.
+    """
     if any("frames" not in told.document for told in (*base.runs, *other.runs)):
         return
     sides = [[told.document["frames"] for told in side.runs] for side in (base, other)]
@@ -266,7 +280,10 @@ def _of_counts(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figure, 
 
 
 def _of_errors(base: Side, other: Side) -> Iterator[tuple[Figure, Difference]]:
-    """Yield the avatars' accuracy. It was measured once and does not scatter, so every change counts."""
+    """Yield the figures of the avatars' accuracy with their differences.
+
+    The accuracy was measured once and does not scatter, so every change counts.
+    """
     first, second = (dict(_numbers("", side.runs[0].document.get("accuracy", {}))) for side in (base, other))
     for name, value in first.items():
         if name in second:
@@ -275,10 +292,13 @@ def _of_errors(base: Side, other: Side) -> Iterator[tuple[Figure, Difference]]:
 
 
 def exact_rows(base: Side, other: Side, key: str, unit: str) -> Rows:
-    """Return the differences of the numbers under `key` of the reports, without scatter within a run.
+    """Return the differences of the float values under one key of the reports, without scatter within a run.
 
-    Empty if a report has none, or if the reports differ in lists and texts under `key`, such as the checked frames.
-    `unit`: unit of the numbers.
+    The result is empty if a report lacks the key. It is also empty if the reports differ in integers, lists and texts
+    under the key, such as the checked frames.
+    `base`, `other`: runs of each side.
+    `key`: key of the reports.
+    `unit`: unit of the values.
     """
     sides = [[told.document.get(key) or {} for told in side.runs] for side in (base, other)]
     every = [found for side in sides for found in side]
@@ -309,18 +329,21 @@ def _numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
 
 
 class Noise(NamedTuple):
-    """The differences between runs of one kind that their frames do not show.
+    """The noise: how runs of one kind differ in addition to what their frames show.
 
-    Times on the host clock depend on facts that a process cannot see: the place of its memory, the state of caches,
-    other programs on its cores, and other machines that share the hardware. (Mytkowicz et al., "Producing wrong data
-    without doing anything obviously wrong!", ASPLOS 2009; Kalibera & Jones, "Rigorous benchmarking in reasonable time",
-    ISMM 2013.) In virtual time there is no such noise. Only the clock decides how long a held job lasts. Counted
-    instructions hardly depend on the machine.
+    Times on the host clock depend on facts that a process cannot see [1, 2]. Examples are the place of its memory, the
+    state of caches, other programs on its cores, and other machines on the same hardware. In virtual time, this noise
+    does not exist. The length of a held job depends only on the clock. Counted instructions hardly depend on the
+    machine.
 
-    `is_real`: whether a run was on the host clock. `others`: changes that the different share of other programs
-    explains: of times on the clock, of a stage's time on its core (logarithms), and of shares of the time. `slower`:
-    change that the speed of its cores explains, by stage, as a logarithm. `held`: stages whose jobs have a set length
-    in all runs.
+    [1] Mytkowicz et al., "Producing wrong data without doing anything obviously wrong!", ASPLOS 2009.
+    [2] Kalibera and Jones, "Rigorous benchmarking in reasonable time", ISMM 2013.
+
+    `is_real`: whether a run was on the host clock.
+    `others`: three changes that different shares of other programs explain. The first is for times on the clock and the
+    second for a stage's time on its core, both as logarithms. The third is for shares of the time.
+    `slower`: change that the speed of a stage's cores explains, by stage, as a logarithm.
+    `held`: stages whose jobs have a set length in all runs.
     """
 
     is_real: bool
@@ -329,19 +352,29 @@ class Noise(NamedTuple):
     held: frozenset[str] = frozenset()
 
     def of_time(self, statistic: str = "mean") -> Chance:
-        """Return the `Chance` of times on the clock. The speed of the cores explains no change: only stages show it."""
+        """Return the `Chance` of times on the clock. `statistic`: as in `MEASURES`.
+
+        The speed of the cores explains no change here, because it is known only for stages.
+        """
         return self._chance(TAILS.get(statistic, 1.0) * WALL_DEVIATION, explained=self.others[0])
 
     def of_wait(self, statistic: str) -> Chance:
-        """Return the `Chance` of a wait in ms, which may be almost 0. No change is explained."""
+        """Return the `Chance` of a wait in ms, which may be almost 0. No change is explained.
+
+        `statistic`: as in `MEASURES`.
+        """
         return self._chance(TAILS.get(statistic, 1.0) * (WALL_DEVIATION + self.others[0]), WAIT_FLOOR_MS)
 
     def of_share(self) -> Chance:
-        """Return the `Chance` of shares of the time."""
+        """Return the `Chance` of a share of the time, such as a busy share."""
         return self._chance(0.0, SHARE_DEVIATION, explained=self.others[2])
 
     def of_work(self, stage: str, statistic: str) -> Chance:
-        """Return the `Chance` of a stage's time on its core. `statistic`: as in `MEASURES`."""
+        """Return the `Chance` of a stage's time on its core.
+
+        `stage`: name of the stage.
+        `statistic`: as in `MEASURES`.
+        """
         tail = TAILS.get(statistic, 1.0)
         if stage in self.held:
             return self._chance(tail * HELD_DEVIATION)
@@ -358,8 +391,8 @@ class Noise(NamedTuple):
 def noise_between(base: Documents, other: Documents, effects: Mapping[str, float]) -> Noise:
     """Return the noise between the runs of two sides.
 
-    `base`, `other`: reports of their runs, as JSON. `effects`: logarithm of the ratio of the typical times on the core,
-    by stage.
+    `base`, `other`: reports of the runs of each side, as JSON.
+    `effects`: logarithm of the ratio of the typical times on the core, other side to base, by stage.
     """
     runs = [*base, *other]
     if all(run["clock"] != HOST_CLOCK for run in runs):
@@ -373,10 +406,11 @@ def noise_between(base: Documents, other: Documents, effects: Mapping[str, float
 
 
 def relief_of(base: Side, other: Side) -> float:
-    """Return the largest change that other programs explain in the ratio of times, other to base, as a logarithm.
+    """Return the largest change that other programs explain in the ratio of times, `other` to `base`, as a logarithm.
 
-    The result is negative if other programs had more of the cores in `other`: without them, frames would take less
-    time, at most by this factor.
+    The result is negative if other programs had more of the cores in `other`: without these programs, frames would take
+    less time there. It is 0 if a side has no run on the host clock.
+    `base`, `other`: runs of each side.
     """
     sides = [[told.document for told in side.runs if told.document["clock"] == HOST_CLOCK] for side in (base, other)]
     return _wall(*map(_others, sides)) if all(sides) else 0.0
@@ -391,7 +425,10 @@ def _wall(base: Sequence[float], other: Sequence[float]) -> float:
 
 
 def _left(others: float) -> float:
-    """Return log(1 - others): the logarithm of the share of the cores that other programs left to the run."""
+    """Return the logarithm of the share of the cores that was left to a run.
+
+    `others`: share of the cores that other programs had.
+    """
     return log1p(-min(others, 1 - LEAST_LEFT))
 
 
@@ -400,10 +437,14 @@ def _held(report: Mapping[str, Any]) -> frozenset[str]:
 
 
 def _slower_cores(base: Mapping[str, Any], other: Mapping[str, Any], effects: Mapping[str, float]) -> dict[str, float]:
-    """Return, by stage, the change that the speed of its cores explains, as a logarithm.
+    """Return, by stage, the change that the speed of the stage's cores explains, as a logarithm.
 
-    It is the smallest change of all stages on these cores, if all changed in one direction. The causes may be the
-    clock, the temperature, or another machine on the same hardware. A single stage on its cores shows nothing.
+    If all stages on the same cores changed in one direction, it is the smallest of their changes. Possible causes are
+    the clock, the temperature, or another machine on the same hardware. For a single stage on its cores, and for
+    changes in both directions, it is 0. If a setting changed that may change the speed of the cores, the result is
+    empty.
+    `base`, `other`: reports of the first run of each side, as JSON.
+    `effects`: as in `noise_between`.
     """
     if any(not change.key.startswith(SAME_CORES) for change in changes(base, other)):
         return {}
@@ -423,7 +464,10 @@ def _stages_by_cores(report: Mapping[str, Any]) -> Iterable[list[str]]:
 
 
 def remarks(reports: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return remarks on other programs' share of the cores. `reports`: name of a run -> its report as JSON."""
+    """Return sentences about runs for which the share of other programs is unknown or large.
+
+    `reports`: report of each run as JSON, by the run's name.
+    """
     said = []
     for name, report in reports.items():
         others = report.get("other_programs")

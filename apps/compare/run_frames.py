@@ -1,7 +1,7 @@
-"""The frames of a run as series, from its journal. Rule: each figure belongs to a frame, in the order of presentation.
+"""The frames of a run as series, from its journal. Rule: each figure belongs to a frame.
 
-A frame's own time begins when the frame before it is presented, and ends when the frame itself is presented. The work
-of the units in that time counts for this frame.
+The frame time of a frame begins when the previous frame is presented, and ends when the frame itself is presented. The
+work of the units in that time counts for this frame.
 """
 
 from __future__ import annotations
@@ -32,7 +32,12 @@ IN_FLIGHT = 100
 
 
 class Key(NamedTuple):
-    """The subject of a series. `of`: stage or unit, or empty. `cause`: cause of idle time, or empty."""
+    """The subject of a series: what its values measure, and where.
+
+    `measure`: what is measured.
+    `of`: stage or unit, "" for the whole run.
+    `cause`: cause of idle time, "" for other measures.
+    """
 
     measure: str
     of: str = ""
@@ -43,9 +48,11 @@ class Key(NamedTuple):
 class RunFrames:
     """The frames of a run as series.
 
-    `begun`: first record of the journal. `series`: series by subject, times in ms. `ended`: last record; None if the
-    journal has no end. `presented`: number of presented frames of the whole run. `counted`: lost and dropped frames;
-    None if there are none.
+    `begun`: first record of the journal.
+    `series`: series by subject; times are in ms, times of an instruction in ns.
+    `ended`: last record; None if the journal has no end.
+    `presented`: number of presented frames of the whole run.
+    `counted`: counts of lost and dropped frames; None if the journal has no counts.
     """
 
     begun: Begun
@@ -56,12 +63,15 @@ class RunFrames:
 
     @property
     def is_whole(self) -> bool:
-        """Whether the journal has the whole run."""
+        """Whether the journal has the end of the run."""
         return self.ended is not None
 
 
 def read_frames(path: Path) -> RunFrames:
-    """Read the frames of the journal at `path`. Raises BadInputError for no journal, or fewer than two frames."""
+    """Return the frames of the journal at `path`.
+
+    Raises BadInputError for a missing or broken journal, or for fewer than two presented frames.
+    """
     frames = frames_of(read_journal(path))
     if frames is None:
         raise BadInputError(path, "fewer than two presented frames", "two or more", "run more frames")
@@ -69,7 +79,7 @@ def read_frames(path: Path) -> RunFrames:
 
 
 def frames_of(records: Iterable[Record]) -> RunFrames | None:
-    """Return the frames of a journal's `records`; None if fewer than two were presented."""
+    """Return the frames of a journal's `records`; None if fewer than two frames were presented."""
     story = _Story()
     for record in records:
         story.add(record)
@@ -90,7 +100,11 @@ def frames_of(records: Iterable[Record]) -> RunFrames | None:
 
 
 class _Story:
-    """Gathers facts from the records of a journal. Of a long run, only the last frames are kept."""
+    """Gathers facts from the records of a journal. For a long run, only facts about the last frames stay in memory.
+
+    `jobs`, `shown`: jobs and presented frames. `figures`: (frame, value) of each job, by subject. `presented`: number
+    of presented frames of the whole run. `ended`, `counted`: last records of these types, None before the first.
+    """
 
     def __init__(self) -> None:
         self.jobs: list[JobRecord] = []
@@ -102,7 +116,7 @@ class _Story:
         self._idle: list[IdleSlice] = []
 
     def idle(self) -> list[IdleSlice]:
-        """Return every idle slice of the run. Call it once, after the last record."""
+        """Return every idle slice that was kept. Call it once, after the last record."""
         return [*self._idle, *self._timeline.end()]
 
     def add(self, record: Record) -> None:
@@ -133,7 +147,7 @@ class _Story:
                 self.figures[Key(REPORTED[name], record.job.stage)].append((record.job.frame, value))
 
     def _forget(self, first: JobRecord) -> None:
-        """Forget everything before the job `first`, so that memory does not grow with the run."""
+        """Remove all facts from before the job `first`, so that memory does not grow with the run."""
         self.jobs = self.jobs[self.jobs.index(first) :]
         oldest = min(job.frame for job in self.jobs)
         self._idle = [piece for piece in self._idle if piece.end_ns >= first.begin_ns]
@@ -147,9 +161,12 @@ def _plain(frames: I64, ns: I64) -> Series:
 
 
 def _stage(name: str, jobs: Sequence[JobRecord]) -> dict[Key, Series]:
-    """Return times of a stage's jobs, by subject: `work` on the core, `service` from begin to end, `wait` before begin.
+    """Return the times of a stage's jobs as series, in ms, by subject.
 
-    The CPU time of all threads is added if the journal has it.
+    The measures are `work`, the time on the core; `service`, from begin to end; `wait`, before the begin. If every job
+    has a CPU time, the CPU time of all threads is added.
+    `name`: name of the stage.
+    `jobs`: jobs of the stage, in order.
     """
     frames = np.array([job.frame for job in jobs], np.int64)
     service = np.array([job.end_ns - job.begin_ns for job in jobs], np.int64)
@@ -167,10 +184,15 @@ def _stage(name: str, jobs: Sequence[JobRecord]) -> dict[Key, Series]:
 def _unit(
     unit: str, jobs: Sequence[JobRecord], idle: Sequence[IdleSlice], frames: I64, end_ns: I64
 ) -> dict[Key, Series]:
-    """Return the busy time, and the idle time by cause, of a unit in the frame time of each presented frame.
+    """Return the busy time and the idle time by cause of a unit, as series over the presented frames without the first.
 
-    The series hold shares: values and weights in ms. `frames` (n,): numbers of the presented frames. `end_ns` (n,):
-    times of presentation.
+    The series are shares: `values` are the times in the frame time of each frame, `weights` the frame times, both in
+    ms.
+    `unit`: name of the unit.
+    `jobs`: jobs of the unit.
+    `idle`: idle slices of all units.
+    `frames`: (n,) numbers of the presented frames.
+    `end_ns`: (n,) times of presentation.
     """
     pieces: list[tuple[int, int, dict[str, int]]] = []
     for job in jobs:
@@ -192,9 +214,11 @@ def _unit(
 
 
 def _within(pieces: Sequence[tuple[int, int, Mapping[str, int]]], state: str, edges_ns: I64) -> F64:
-    """Return the ms of `state` between neighbouring edges, (edges - 1,) float64.
+    """Return the time of `state` between neighbouring edges in ms, (n - 1,) float64.
 
-    `pieces`: begin, end, and ns by state. The time of a state in a piece counts as spread evenly over the piece.
+    The time of a state in a piece counts as spread evenly over the piece.
+    `pieces`: begin, end, and time by state of each piece, all in ns.
+    `edges_ns`: (n,) edges, ascending.
     """
     places, totals, total = [0.0], [0.0], 0
     for begin_ns, end_ns, states in pieces:
@@ -206,7 +230,10 @@ def _within(pieces: Sequence[tuple[int, int, Mapping[str, int]]], state: str, ed
 
 
 def _figures(figures: Mapping[Key, Sequence[tuple[int, float]]]) -> dict[Key, Series]:
-    """Return the metrics of stages as series. `figures`: (frame, value) of each job, by subject."""
+    """Return the metrics of stages as series, by subject.
+
+    `figures`: (frame, value) of each job, by subject.
+    """
     return {
         key: Series(
             np.array([frame for frame, _ in rows], np.int64), np.array([v for _, v in rows]), np.ones(len(rows))
@@ -216,7 +243,10 @@ def _figures(figures: Mapping[Key, Sequence[tuple[int, float]]]) -> dict[Key, Se
 
 
 def _instruction_times(series: Mapping[Key, Series]) -> dict[Key, Series]:
-    """Return the series of time on the core per instruction, ns, for each stage with counted instructions."""
+    """Return the time on the core per instruction, ns, as a series for each stage with counted instructions.
+
+    `series`: other series of the run, by subject.
+    """
     found = {}
     for key, counted in series.items():
         if key.measure == INSTRUCTIONS:

@@ -1,12 +1,12 @@
 """The runs to compare, read from disk: run folders, reports, predictions and imported times, with their settings.
 
 Rule: an error names what cannot be compared. A run folder with a journal has every frame; a report alone, or a
-prediction, has summaries. A run that was killed has no report: its journal gives the keys that a comparison reads, and
+prediction, has summaries. A run that was killed has no report. Its journal gives the keys that a comparison reads, and
 `NOT_KNOWN` names the missing keys.
 
-An imported time is compared with the imported time, or the stage of a run, of the same name. A single wall time
-is used as the frame time. The machine's state is not known, so two imported times scatter like any two runs on the host
-clock.
+An imported time is compared with the imported time, or the stage of a run, that has the same name. If a file has
+exactly one wall time, this is used as the frame time. The state of the machine is not known. Therefore two imported
+times scatter like any two runs on the host clock.
 """
 
 from __future__ import annotations
@@ -64,9 +64,9 @@ ALWAYS_DIFFERENT: Final = ("made.at", "made.command")
 
 
 class RunKind(StrEnum):
-    """How much is known of a run.
+    """The kind of data of a run.
 
-    RUN: every frame; REPORT: summaries; PREDICTION: summaries that a model computed; TIMES: imported measurements.
+    RUN: every frame. REPORT: summaries. PREDICTION: summaries that a model computed. TIMES: imported measurements.
     """
 
     RUN = "run"
@@ -79,8 +79,11 @@ class RunKind(StrEnum):
 class ComparedRun:
     """One run of a side.
 
-    `name`: name as the user gave it. `document`: JSON with the keys of a report. `frames`: frames of a run with a
-    journal. `remark`: remark for the user on a run without a report.
+    `name`: name as the user gave it.
+    `kind`: kind of its data.
+    `document`: JSON with the keys of a report.
+    `frames`: frames from the journal; None for a run without a journal.
+    `remark`: remark for the user on a run without a report, "" for a run with a report.
     """
 
     name: str
@@ -92,16 +95,17 @@ class ComparedRun:
 
 @dataclass(frozen=True)
 class Side:
-    """One run, or several runs of one configuration, on one side of a comparison."""
+    """One side of a comparison: one run, or several runs of one configuration. `name`: name as the user gave it."""
 
     name: str
     runs: tuple[ComparedRun, ...]
 
 
 def read_side(text: str) -> Side:
-    """Read the runs of a side. `text`: a path, or several paths joined by commas.
+    """Read the runs of a side.
 
-    Raises BadInputError, also if a run is named twice.
+    `text`: a path, or several paths joined by commas.
+    Raises BadInputError for an empty name, for a run that is named twice, and as `read_told` does.
     """
     names = [text] if text.strip() and _is_there(text) else text.split(",")
     for name in names:
@@ -118,8 +122,9 @@ def read_side(text: str) -> Side:
 
 
 def read_told(name: str) -> ComparedRun:
-    """Read the run, report, prediction or imported times at the path `name`, or the run that `trilane watch` finds.
+    """Read a run, report, prediction or imported times.
 
+    `name`: path of a file or run folder, or name of a run as `trilane watch` accepts it.
     Raises BadInputError for a file that is missing, cut off or of another schema.
     """
     try:
@@ -192,9 +197,10 @@ def _journal_document(frames: RunFrames, path: Path) -> dict[str, Any]:
     """Return those keys of a report that a comparison reads, from a run's journal alone.
 
     Settings come from the first record, and figures from the frames. If the run has ended, its last record gives all
-    other keys; otherwise only the bound and the efficiency so far are known.
-
-    `frames`: frames of the journal at `path`. Raises BadInputError for facts of a wrong form.
+    other keys. Otherwise, only the bound and the efficiencies so far are known.
+    `frames`: frames of the journal.
+    `path`: path of the journal.
+    Raises BadInputError for facts of a wrong form.
     """
     facts = from_json(to_json(dict(frames.begun.facts)))
     for name in FACTS:
@@ -227,7 +233,13 @@ def _journal_document(frames: RunFrames, path: Path) -> dict[str, Any]:
 
 
 def _at_the_end(frames: RunFrames, path: Path) -> dict[str, Any]:
-    """Return the last record's figures of the whole run; without a last record, the bound and efficiencies so far."""
+    """Return the figures of the whole run from the last record of a journal.
+
+    Without a last record, return only the bound and the efficiencies so far.
+    `frames`: frames of the journal.
+    `path`: path of the journal.
+    Raises BadInputError for figures of a wrong form.
+    """
     if frames.ended is None:
         begun, records = frames.begun, read_journal(path)
         return dict(reckoned(begun.graph, begun.settings, places_of(begun), records).figures)
@@ -240,7 +252,10 @@ def _at_the_end(frames: RunFrames, path: Path) -> dict[str, Any]:
 
 
 def _counts(frames: RunFrames) -> dict[str, Any]:
-    """Return the numbers of frames so far. `requested` is their sum; frames in flight do not count."""
+    """Return the numbers of frames so far, with the keys of `frames` in a report.
+
+    `requested` is the sum of presented, lost and dropped frames; frames in flight do not count.
+    """
     lost = dict(frames.counted.lost) if frames.counted else {}
     dropped = dict(frames.counted.dropped) if frames.counted else {}
     asked = frames.presented + sum(lost.values()) + sum(dropped.values())
@@ -266,7 +281,10 @@ def _unit(frames: RunFrames, unit: str, config: Mapping[str, Any]) -> dict[str, 
 
 
 class Change(NamedTuple):
-    """A dotted key with its values in the base and in the other run; None if a run lacks the key."""
+    """A setting or fact of the machine that differs between two runs.
+
+    `key`: dotted key. `base`, `other`: values in the base and in the other run; None if a run lacks the key.
+    """
 
     key: str
     base: Any
@@ -274,7 +292,10 @@ class Change(NamedTuple):
 
 
 def changes(base: Mapping[str, Any], other: Mapping[str, Any]) -> list[Change]:
-    """Return the settings and facts of the machine that differ between two runs. `base`, `other`: reports as JSON."""
+    """Return the settings and facts of the machine that differ between two runs.
+
+    `base`, `other`: reports as JSON.
+    """
     first, second = _settings(base), _settings(other)
     found = dict.fromkeys([*first, *second])
     known = [part for part in PARTS if part not in (*base.get(NOT_KNOWN, ()), *other.get(NOT_KNOWN, ()))]
@@ -319,10 +340,15 @@ Ms = Annotated[float, Field(ge=0, le=LONGEST_MS)]
 
 
 class ImportedTime(BaseModel):
-    """An imported time: the time of a job of the stage `name`.
+    """An imported time, of a stage or of a whole run.
 
-    `kind`: such as `run`, `layer` or `wall`. `count`, `sd_ms`: number and standard deviation of the single times.
-    `samples_ms`: the single times, if the file has them. `file`: file of the measurement.
+    `name`: name of the measurement, which is compared with the stage or measurement of the same name.
+    `kind`: kind of the time, such as `run`, `layer` or `wall`.
+    `count`: number of the single times. `sd_ms`: their standard deviation.
+    `mean_ms`, `p50_ms`: mean and median of the single times.
+    `samples_ms`: the single times, empty if the file does not have them.
+    `file`: file of the measurement.
+    Numbers that are unknown are None.
     """
 
     model_config = ConfigDict(extra="ignore", frozen=True)
@@ -338,7 +364,7 @@ class ImportedTime(BaseModel):
 
     @property
     def ms(self) -> float:
-        """The mean or, without one, the median; 0 for a measurement in another unit, such as cycles."""
+        """The mean or, without a mean, the median, in ms; 0 for a measurement in another unit, such as cycles."""
         return self.mean_ms or self.p50_ms or 0.0
 
     @property
@@ -350,9 +376,12 @@ class ImportedTime(BaseModel):
 
 
 def imported(document: Mapping[str, Any], path: Path) -> dict[str, Any]:
-    """Return those keys of a report that a comparison reads, from a `document` of imported times.
+    """Return those keys of a report that a comparison reads, from imported times.
 
-    `path`: its file. Raises BadInputError, which names the first wrong key.
+    `document`: content of the file with imported times.
+    `path`: path of the file.
+    Raises BadInputError for a wrong key, for a file without a time, for times of several files, and for a name that
+    occurs twice.
     """
     rows = [_imported_time(row, f"{path}: {MEASUREMENTS}.{place}") for place, row in enumerate(document[MEASUREMENTS])]
     rows = [row for row in rows if row.ms >= SHORTEST_MS]
@@ -391,14 +420,17 @@ def _imported_time(row: Any, where: str) -> ImportedTime:
 
 
 def _told_apart(rows: Sequence[ImportedTime]) -> list[ImportedTime]:
-    """Return the measurements. Where several have the same name, each gets its kind added to the name."""
+    """Return the measurements `rows`. If several have the same name, their kinds are added to their names."""
     counts = Counter(row.name for row in rows)
     longer = [row.model_copy(update={"name": f"{row.name} ({row.kind})"}) for row in rows]
     return [long if counts[row.name] > 1 else row for row, long in zip(rows, longer, strict=True)]
 
 
 def _frames(rows: Sequence[ImportedTime]) -> ImportedTime | None:
-    """Return the measurement that is used as the frame time: the wall time; None for no or several wall times."""
+    """Return the measurement of `rows` that is used as the frame time: the wall time.
+
+    None is returned if `rows` have no wall time or several.
+    """
     found = [row for row in rows if row.kind == WALL]
     return found[0] if len(found) == 1 else None
 

@@ -1,9 +1,9 @@
-"""Where the dashboard's server listens, and which requests it refuses. Rule: every refusal is counted.
+"""Where the dashboard's server listens, and which requests the server refuses. Rule: every refusal is counted.
 
 The server accepts only requests from this machine, to this address, with the token of this run. A page of another site
 may know the port. Its requests are refused for their Origin header, or for a Host header with another host name. The
 files of the page contain no secret and need no token. The socket listens before the server starts, so the printed
-address accepts requests at once.
+address accepts connections at once.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ Asgi = Callable[[Scope, Receive, Send], Awaitable[None]]
 
 
 class Refusal(StrEnum):
-    """The reason for which the server refused a request. The values are labels of a metric."""
+    """The reason for which the server refused a request, a message or a client. The values are labels of a metric."""
 
     WRONG_TOKEN = "wrong_token"  # noqa: S105 - the name of a count
     FOREIGN_HOST = "foreign_host"
@@ -69,7 +69,11 @@ STATUS: Final = {
 
 @dataclass(frozen=True)
 class ServerAddress:
-    """The listening socket of a server, and the token that requests must contain."""
+    """The address of a server.
+
+    `listener`: socket that listens.
+    `token`: secret that requests for the paths in `SECRET_PATHS` must contain.
+    """
 
     listener: socket.socket
     token: str
@@ -87,16 +91,17 @@ class ServerAddress:
 
 
 def require_server() -> None:
-    """Raise MissingPartError if a package of the extra `dashboard` is missing."""
+    """Raise MissingPartError if one of the `PACKAGES` that the server needs is missing."""
     for package in PACKAGES:
         if not machine.here.has_package(package):
             raise MissingPartError(f"the dashboard needs the package {package}", install_line("dashboard"))
 
 
 def listen(port: int | None) -> ServerAddress:
-    """Return a socket that listens on `port`, for this machine only, with a new token. Raises BadInputError.
+    """Return the address of a new socket that listens for connections from this machine only, with a new token.
 
-    `port`: None takes any free port.
+    `port`: port to listen on; None for any free port.
+    Raises BadInputError if the port is in use or not allowed.
     """
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM | socket.SOCK_CLOEXEC)
     try:
@@ -113,7 +118,7 @@ def listen(port: int | None) -> ServerAddress:
 
 
 class Refusals:
-    """Counts all refusals of a server by reason; a reason that never occurred has the count 0."""
+    """Counts all refusals of a server by reason. A reason that never occurred has the count 0."""
 
     def __init__(self) -> None:
         self._counts: Counter[Refusal] = Counter(dict.fromkeys(Refusal, 0))
@@ -122,17 +127,20 @@ class Refusals:
         self._counts[why] += 1
 
     def as_json(self) -> dict[str, int]:
-        """Return the count of each reason, by the reason's value."""
+        """Return the count of each reason, by the value of its `Refusal`."""
         return {why.value: count for why, count in self._counts.items()}
 
 
 def hosts(port: int) -> tuple[str, str]:
-    """Return the accepted values of the Host header."""
+    """Return the two values of the Host header that a server on `port` accepts."""
     return f"{ADDRESS}:{port}", f"localhost:{port}"
 
 
 def headers(port: int) -> dict[str, str]:
-    """Return the headers of every answer: no foreign or inline content, no caching, no referrer."""
+    """Return the headers that every answer of a server on `port` has.
+
+    They forbid foreign content, inline code, caching and referrers.
+    """
     sockets = " ".join(f"ws://{host}" for host in hosts(port))
     policy = (
         "default-src 'none'; script-src 'self'; style-src 'self'; font-src 'self'; img-src 'self' blob:; "
@@ -151,7 +159,7 @@ def headers(port: int) -> dict[str, str]:
 
 
 def refusal_of_head(scope: Mapping[str, Any]) -> Refusal | None:
-    """Return the refusal of a request for its HTTP version, the size of its head, or a body; None if all is right.
+    """Return why a request is refused for its HTTP version, the size of its head, or a body; None if it is allowed.
 
     `scope`: ASGI scope of the request.
     """
@@ -164,7 +172,13 @@ def refusal_of_head(scope: Mapping[str, Any]) -> Refusal | None:
 
 
 class Guard:
-    """ASGI middleware that refuses requests by `refusal_of`, counts refusals, and adds `headers` to every answer."""
+    """ASGI middleware that refuses requests, counts the refusals, and adds `headers` to every answer.
+
+    `app`: application that answers the allowed requests.
+    `port`: port of the server.
+    `token`: token that secret paths need.
+    `refusals`: counts of refusals, to which the guard adds.
+    """
 
     def __init__(self, app: Asgi, port: int, token: str, refusals: Refusals) -> None:
         self._app, self._hosts, self._token, self._refusals = app, hosts(port), token, refusals
@@ -182,7 +196,10 @@ class Guard:
         await self._refuse(scope, receive, self._with_headers(send, is_refused=True), why)
 
     def refusal_of(self, scope: Mapping[str, Any]) -> Refusal | None:
-        """Return the reason for which the request is refused; None if it is allowed. `scope`: ASGI scope."""
+        """Return the reason for which a request is refused; None if the request is allowed.
+
+        `scope`: ASGI scope of the request.
+        """
         given = [(name.lower(), value.decode("latin-1")) for name, value in scope["headers"]]
         if [value for name, value in given if name == b"host"] not in [[host] for host in self._hosts]:
             return Refusal.FOREIGN_HOST

@@ -1,8 +1,8 @@
 """The dashboard's HTTP server: the page's files, a WebSocket, metrics and the trace.
 
-Rule: this module decides nothing about the run. A client gets one picture for each request: the newest one that it has
-not had. All other messages go to all clients at once. A client that does not receive or answer in time loses its
-connection.
+Rule: this module decides nothing about the run. News about the run goes to all clients at once; an answer goes only to
+the client that asked. For each request for a picture, a client gets one picture: the newest one that the client has not
+had. A client that does not receive or answer in time loses its connection.
 """
 
 from __future__ import annotations
@@ -54,10 +54,14 @@ SWITCHING: Final = 101  # HTTP status of an accepted WebSocket
 
 
 class DashboardApp:
-    """The server's application. It shows `view` on `port` to clients that send `token`.
+    """The server's application.
+
+    `view`: run to show.
+    `port`: port on which the server listens.
+    `token`: secret that clients must send.
 
     `asgi`: the ASGI application. `refusals`: counts of refused requests. `stop`: function that ends the server, set by
-    `server`. The app calls it when one of its own tasks has failed.
+    `server`. The application calls `stop` if one of its own tasks fails.
     """
 
     def __init__(self, view: RunView, port: int, token: str) -> None:
@@ -77,7 +81,7 @@ class DashboardApp:
         self.asgi: Asgi = Guard(app, port, token, self.refusals)
 
     async def finish(self) -> None:
-        """Send the remaining messages to all clients, and give the clients LAST_S seconds to receive them."""
+        """Send the remaining messages to all clients, and wait LAST_S seconds so that clients can receive them."""
         await self._tell_newest()
         await asyncio.sleep(LAST_S)
 
@@ -94,7 +98,7 @@ class DashboardApp:
             await asyncio.gather(*tasks, return_exceptions=True)
 
     def _stop_if_failed(self, task: asyncio.Task[None]) -> None:
-        """Print the traceback and end the server if `task` failed. Otherwise the page would stop without a reason."""
+        """Print the traceback and end the server if `task` failed, so that the page does not stop without a reason."""
         if not task.cancelled() and (error := task.exception()) is not None:
             traceback.print_exception(error)
             self.stop()
@@ -134,7 +138,7 @@ class DashboardApp:
             await socket.close(1008)
 
     async def _listen(self, socket: WebSocket, client: Client) -> None:
-        """Carry out the client's messages until the client disconnects or has sent MOST_FAULTS malformed ones."""
+        """Carry out the messages of `client` until it disconnects or has sent MOST_FAULTS malformed messages."""
         while client.faults < MOST_FAULTS:
             event = await socket.receive()
             if event["type"] == "websocket.disconnect":
@@ -196,7 +200,7 @@ class DashboardApp:
 
 
 def server(app: DashboardApp) -> Any:
-    """Return a uvicorn server for `app`. Its method `serve(sockets=[...])` returns after `should_exit` is set.
+    """Return a uvicorn server for `app`. Its coroutine `serve(sockets=[...])` returns after `should_exit` is set.
 
     Requests that uvicorn itself refuses are counted in `app.refusals`.
     """

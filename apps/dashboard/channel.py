@@ -1,8 +1,9 @@
-"""Messages between a run's process and its server's process, in msgpack. Rule: only types in MESSAGES exist.
+"""Messages between the process of a run and the process of its server, in msgpack.
 
-A message is an array: the index of its type in MESSAGES, followed by its fields. It is one packet on a pair of sockets
-that only these two processes have. Neither process waits for the other: a message that cannot be sent at once is lost.
-`ServerLink` starts and ends the server's process. If that process ends by itself, the run goes on without a server.
+Rule: only messages of the types in MESSAGES exist. A message is an array: the index of its type in MESSAGES, followed
+by its fields. Each message is one packet on a pair of sockets, which only these two processes have. Neither process
+waits for the other: a message that cannot be sent at once is lost. `ServerLink` starts and ends the server's process.
+If that process ends by itself, the run goes on without a server.
 """
 
 from __future__ import annotations
@@ -30,7 +31,11 @@ SERVER_ENDED: Final = "the dashboard's server has ended; the run goes on without
 
 
 class Opened(NamedTuple):
-    """The first message to the server: the `token` that clients need, and the size of pictures in pixels."""
+    """The first message to the server.
+
+    `token`: secret that clients must send.
+    `height`, `width`: size of pictures in pixels.
+    """
 
     token: str
     height: int
@@ -38,9 +43,11 @@ class Opened(NamedTuple):
 
 
 class RunBegins(NamedTuple):
-    """A message to the server: a run begins and writes its journal into `folder`.
+    """A message to the server: a run begins.
 
-    `facts`: fields of the run's `RunFacts`. `controls`: fields of each `Control`.
+    `folder`: folder into which the run writes its journal.
+    `facts`: fields of the run's `RunFacts`, by name.
+    `controls`: fields of each `Control`, by name.
     """
 
     folder: str
@@ -51,8 +58,9 @@ class RunBegins(NamedTuple):
 class StateIs(NamedTuple):
     """A message to the server: the state of the run has changed.
 
-    `state`: running, paused, restarting, ended or failed. `why`: reason in words, or "". The server itself shows
-    `starting` until the first frame.
+    `state`: running, paused, restarting, ended or failed. Until the first frame, the page shows a running run as
+    `starting`.
+    `why`: reason in words, "" without a reason.
     """
 
     state: str
@@ -60,9 +68,10 @@ class StateIs(NamedTuple):
 
 
 class ChangesRefused(NamedTuple):
-    """A message to the server: the run refuses a request. `why`: reason in words.
+    """A message to the server: the run refuses a request.
 
     `control`: name of the control, `restart` for several controls, "" for a new run that did not begin.
+    `why`: reason in words.
     """
 
     control: str
@@ -70,14 +79,21 @@ class ChangesRefused(NamedTuple):
 
 
 class ControlAsked(NamedTuple):
-    """A message to the run: the page requests `value` for `control`."""
+    """A message to the run: the page requests a use of one control.
+
+    `control`: name of the control.
+    `value`: requested value, None for a control without a value.
+    """
 
     control: str
     value: str | float | None
 
 
 class ChangesAsked(NamedTuple):
-    """A message to the run: the page requests a new run. `values`: requested values of controls, by name."""
+    """A message to the run: the page requests a new run.
+
+    `values`: requested values of controls, by the control's name.
+    """
 
     values: Mapping[str, str]
 
@@ -117,7 +133,11 @@ def unpacked(data: bytes) -> Message:
 
 
 class ChannelEnd:
-    """One end of a pair of sockets. `fd` becomes readable when a message arrives or the other end is closed."""
+    """One end of a channel between the run and its server.
+
+    `end`: socket of this end.
+    `fd`: file descriptor that becomes readable when a message arrives or the other end is closed.
+    """
 
     def __init__(self, end: socket.socket) -> None:
         self._end = end
@@ -128,7 +148,7 @@ class ChannelEnd:
         return self._end.fileno()
 
     def send(self, message: Message) -> bool:
-        """Send `message` and return whether it was sent. It is not if the other end is closed, or its buffer full."""
+        """Return whether `message` was sent. It is not sent if the other end is closed or has a full buffer."""
         try:
             self._end.send(packed(message))
         except OSError:
@@ -136,7 +156,10 @@ class ChannelEnd:
         return True
 
     def receive(self) -> Message | None:
-        """Return the next message, or None if none has arrived. Raises EOFError if the other end is closed."""
+        """Return the next message; None if no message has arrived.
+
+        Raises EOFError if the other end is closed, UnexpectedValue for a packet that is no message.
+        """
         try:
             data = self._end.recv(MOST_BYTES)
         except BlockingIOError:
@@ -153,16 +176,20 @@ class ChannelEnd:
 
 
 def channel_pair() -> tuple[ChannelEnd, socket.socket]:
-    """Return this process's end of a new pair of sockets, and the socket for the other process."""
+    """Return the two ends of a new channel: this process's end, and the socket for the other process."""
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     return ChannelEnd(ours), theirs
 
 
 class ServerLink:
-    """Starts a server process and connects the run to it. `window`: file through which the server sees pictures.
+    """Starts a server process and connects the run to it.
 
-    `place`: address of the server. `height`, `width`: size of pictures in pixels. `hear`: function that gets each
-    request of the page, on a thread of its own. `tell`: function that gets sentences for a person.
+    `place`: address of the server.
+    `height`, `width`: size of pictures in pixels.
+    `hear`: function that gets each request of the page, on a thread of its own.
+    `tell`: function that gets sentences for a person.
+
+    `window`: file through which the server sees the pictures of the run.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
 """Shows any moment of a finished run, from its journal and its video.
 
-Rule: the journal is read once, into unnamed temporary files, because a run may last for days. Pictures are decoded on
-request and not kept.
+Rule: the journal is read once, into unnamed temporary files, because the journal may be larger than the memory.
+Pictures are decoded on request and not kept.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ PIECE_ROWS = 4096
 
 
 class FinishedView:
-    """The `RunView` of the finished run in `folder`. Raises BadInputError."""
+    """The `RunView` of the finished run in `folder`. Raises BadInputError for a missing or broken journal."""
 
     def __init__(self, folder: Path) -> None:
         self._run = _read_run(folder)
@@ -115,7 +115,7 @@ class FinishedView:
 
 
 def _read_run(folder: Path) -> _FinishedRun:
-    """Read the run in `folder`. Raises BadInputError for a folder without a journal, or with an unreadable one."""
+    """Return the finished run in `folder`. Raises BadInputError for a missing or broken journal."""
     journal = journal_in(folder)
     if journal is None:
         raise BadInputError(folder, f"no {NAME}", "the folder of a run", "`trilane run` writes one into runs/")
@@ -131,11 +131,14 @@ def _read_run(folder: Path) -> _FinishedRun:
 
 
 class _FinishedRun:
-    """A finished run as tables in temporary files. `_read_run` fills them; all times are ms since the first step.
+    """A finished run as tables in temporary files. `_read_run` fills the tables.
 
-    `begun`: first record of the journal. `facts`: facts for the page. `end_ms`: time of the last step.
-    `jobs`, `idle`, `presented`: jobs, idle slices, and presented frames. `figures`: figures at regular times.
-    `metrics`: figures of the whole run in OpenMetrics. `notes`: messages, each after its time.
+    `begun`: first record of the journal.
+    `facts`: facts for the page.
+
+    `end_ms`: time of the last step. `jobs`, `idle`, `presented`: tables of jobs, idle slices and presented frames.
+    `figures`: table of the places of stored figures, at regular times. `metrics`: figures of the whole run in
+    OpenMetrics. `notes`: last messages for a person, each as (time, text). All times are ms since the first step.
     """
 
     def __init__(self, begun: Begun, facts: RunFacts) -> None:
@@ -152,7 +155,7 @@ class _FinishedRun:
         self.notes: list[tuple[float, str]] = []
 
     def add(self, record: Record) -> None:
-        """Add the next record of the journal."""
+        """Add the next record of the journal after `begun`."""
         self._timeline.add(record)
         self._meter.add(record)
         self._is_whole = isinstance(record, Ended)
@@ -173,14 +176,20 @@ class _FinishedRun:
             table.complete()
 
     def figures_at(self, t_ms: float) -> Mapping[str, Any]:
-        """Return the newest stored figures from before `t_ms`, or else the first ones."""
+        """Return the message with the newest figures that were stored up to `t_ms`.
+
+        If all stored figures are later, return the first of them.
+        """
         row = self.figures.last_before(t_ms)
         row = self.figures.near(t_ms, FIGURES_EVERY_MS, 1)[0] if row is None else row
         figures: Mapping[str, Any] = json.loads(self._written.read(int(row["offset"]), int(row["size"])))
         return figures
 
     def slices_near(self, t_ms: float, span_ms: float) -> Message:
-        """Return the message with the jobs and idle slices from `t_ms` - `span_ms` to `t_ms` + `span_ms`."""
+        """Return the message with the jobs and idle slices from `t_ms` - `span_ms` to `t_ms` + `span_ms`.
+
+        If there are more than `MOST_JOBS` jobs or `MOST_IDLE` idle slices, the nearest to `t_ms` are returned.
+        """
         jobs = [
             (int(r["unit"]), int(r["stage"]), int(r["frame"]), float(r["begin"]), float(r["end"]), float(r["wait"]))
             for r in self.jobs.near(t_ms, span_ms, MOST_JOBS)
@@ -218,8 +227,9 @@ class _FinishedRun:
 
 
 class _RunPictures:
-    """Pictures from the video of a run. The file `path` may be missing. A lock serialises the calls of several threads.
+    """Pictures from the video of a run. Several threads may call `jpeg`: a lock lets one call at a time decode.
 
+    `path`: file of the video, which may be missing.
     `fps`: frames a second of the scene; frame n is shown from second n / `fps` on.
     """
 
@@ -236,7 +246,10 @@ class _RunPictures:
         return self._container is None
 
     def jpeg(self, frame: int) -> bytes | None:
-        """Return the picture that was shown at the time of frame `frame`, as a JPEG; None if there is none."""
+        """Return the picture that was shown at the time of the frame number `frame`, as a JPEG.
+
+        None is returned if the video is missing or has no such picture.
+        """
         if self._container is None:
             return None
         one = 1 / Fraction(self._fps).limit_denominator(1001) / self._stream.time_base
@@ -263,11 +276,12 @@ class _Piece(NamedTuple):
 
 
 class TimeTable:
-    """A table in a temporary file, whose rows have a begin and an end and are found by time.
+    """A table in a temporary file. Each row has a begin and an end, and rows are found by time.
 
-    The file consists of pieces of PIECE_ROWS rows. Memory holds only the offset, earliest begin and latest end of each
-    piece. Rows need not be sorted, but searches are faster if rows of similar times are added together.
-    `dtype`: type of a row, with the fields `begin` and `end` in any unit of time.
+    The file consists of pieces of PIECE_ROWS rows. Memory holds only the offset, the number of rows, the earliest begin
+    and the latest end of each piece. Rows need not be sorted exactly, but `near` is faster if rows of similar times are
+    added together.
+    `dtype`: type of a row, with the fields `begin` and `end` in one unit of time.
     """
 
     def __init__(self, dtype: np.dtype[Any]) -> None:
@@ -294,7 +308,8 @@ class TimeTable:
     def near(self, time: float, reach: float, most: int) -> NDArray[Any]:
         """Return the rows that overlap the interval from `time - reach` to `time + reach`, sorted by begin.
 
-        If there are more than `most`, only the nearest to `time` are returned.
+        `time`: middle of the interval. `reach`: half its length.
+        `most`: largest number of rows to return; if there are more, the rows nearest to `time` are returned.
         """
         low, high = time - reach, time + reach
         touching = [piece for piece in self._pieces if piece.begin <= high and piece.end >= low]
@@ -311,7 +326,10 @@ class TimeTable:
         return rows[np.argsort(rows["begin"], kind="stable")]
 
     def last_before(self, time: float) -> np.void | None:
-        """Return the row with the latest end that is not after `time`; None if there is no such row."""
+        """Return the row with the latest end that is not after `time`; None if the table has no such row.
+
+        Only the last piece with such a row is searched. Therefore rows must be added about in the order of their ends.
+        """
         for piece in reversed(self._pieces):
             rows = self._read(piece)
             ended = rows[rows["end"] <= time]
@@ -321,7 +339,7 @@ class TimeTable:
         return None
 
     def close(self) -> None:
-        """Remove the file. Call no other method afterwards."""
+        """Close the temporary file, which removes it. Call no other method afterwards."""
         self._file.close()
 
     def _read(self, piece: _Piece) -> NDArray[Any]:
@@ -335,7 +353,7 @@ def _away(time: float, begin: float, end: float) -> float:
 
 
 class _TextStore:
-    """Texts in a temporary file. `add` returns the offset and the length of a text, which `read` takes."""
+    """Stores texts in a temporary file. `add` returns the offset and length of a text in bytes; `read` takes both."""
 
     def __init__(self) -> None:
         self._file: IO[bytes] = tempfile.TemporaryFile(prefix="trilane-", buffering=0)  # noqa: SIM115 - `close` closes it
@@ -349,5 +367,5 @@ class _TextStore:
         return os.pread(self._file.fileno(), size, offset)
 
     def close(self) -> None:
-        """Remove the file."""
+        """Close the temporary file, which removes it."""
         self._file.close()

@@ -1,8 +1,9 @@
 """Runs a scene or a pipeline file under a dashboard, with a new run for each configuration that the page requests.
 
 Rule: this process runs the pipeline by the code of `trilane run`. The page's server is another process, and neither
-waits for the other. Some settings change during the run. Any other change is checked like a command line. After that,
-the run ends cleanly, and a new run starts with its own folder. A pipeline file has only one run.
+waits for the other. Some settings change during the run. A request to change any other setting is checked like a
+command line. If the request is accepted, the run ends cleanly, and a new run starts with its own folder. A pipeline
+file has only one run.
 """
 
 from __future__ import annotations
@@ -58,12 +59,13 @@ RESTART: Final = "restart"
 def run_live(
     options: RunOptions, hooks: OpenHooks, command: tuple[str, ...], port: int | None, tell: Callable[[str], None]
 ) -> RunOutcome:
-    """Run `options`, followed by each configuration that the page requests, and return the last outcome.
+    """Run a scene under a dashboard, and each configuration that the page requests. Return the outcome of the last run.
 
     `options`: options of the first run. If they state a number of frames, each run ends after this number. Otherwise,
     the last run ends by an interrupt.
     `hooks`, `command`: as in `run_asked`. `port`: as in `listen`.
-    `tell`: function that gets the page's address, and other sentences for a person. Raises the errors of `run_asked`.
+    `tell`: function that gets the page's address, and other sentences for a person.
+    Raises the errors of `run_asked` and `listen`.
     """
     with early_processes() as (starter, gl):
         first = prepare(options.changed(baseline_frames=0), gl, command)
@@ -82,10 +84,14 @@ def run_live(
 
 
 class _Runs:
-    """Executes successive runs. `link`: link to the server, which the caller sets before the first run.
+    """Executes successive runs.
 
-    `prepare`: function that checks the options of a run. `gl`: function from `early_processes`.
-    `run`: function that runs a prepared run. `tell`: as in `run_live`.
+    `prepare`: function that checks the options of a run.
+    `gl`: function that returns the facts about OpenGL, from `early_processes`.
+    `run`: function that runs a prepared run.
+    `tell`: as in `run_live`.
+
+    `link`: link to the server; set it before the first run. `director`: carries out the page's requests.
     """
 
     link: ServerLink
@@ -102,10 +108,10 @@ class _Runs:
         self.director = Director(prepare, lambda message: self.link.send(message))
 
     def run_all(self, first: Prepared) -> RunOutcome:
-        """Run `first`, followed by each requested run, and return the last outcome. A failed run is the last one.
+        """Run `first`, followed by each run that the page requests. Return the outcome of the last run.
 
-        After a run without a presented frame, the requested run or else the previous configuration follows. Raises
-        TrilaneError if there is neither.
+        A run that ends early is the last run. If a run presents no frame, the requested run follows. Without a request,
+        the previous configuration runs again. Raises TrilaneError if there is no previous configuration either.
         """
         now, before = first, None
         while True:
@@ -140,14 +146,19 @@ class _Runs:
 
 
 def _numbered(folder: Path, number: int) -> Path:
-    """Return the folder of run `number`, counted from 1: `folder` itself for the first run, else with a number."""
+    """Return the folder for the run with number `number`, counted from 1.
+
+    The first run gets `folder` itself. Later runs get a folder beside it, with the number at the end of the name.
+    """
     return folder if number == 1 else folder.with_name(f"{folder.name}-{number}")
 
 
 class Director:
-    """Carries out the page's requests in successive runs. One thread calls `do`, another calls all other methods.
+    """Carries out the page's requests in successive runs.
 
-    `prepare`: function that checks the options of a run. `send`: function that sends a message to the server.
+    One thread calls `do`; another thread calls all other methods.
+    `prepare`: function that checks the options of a run.
+    `send`: function that sends a message to the server.
     """
 
     def __init__(self, prepare: Callable[[RunOptions], Prepared], send: Callable[[Message], None]) -> None:
@@ -164,7 +175,12 @@ class Director:
             return self._controls
 
     def show(self, machine: Mapping[str, Any], folder: Path, checked: Checked) -> None:
-        """Tell the server that a run begins. `machine`: as in report.json. `folder`: folder with the run's journal."""
+        """Tell the server that a run begins.
+
+        `machine`: facts about the machine, as in report.json.
+        `folder`: folder with the run's journal.
+        `checked`: checked configuration of the run.
+        """
         assert self._now is not None
         options = self._now.options
         facts = facts_of_checked(run_name(folder), checked, options, machine)
@@ -174,13 +190,13 @@ class Director:
         self._send(StateIs(RUNNING, ""))
 
     def take_next(self) -> Prepared | None:
-        """Return and forget the run that the page requested next; None if there is no such run."""
+        """Return and forget the run that the page requested; None without a request since the last call."""
         with self._lock:
             taken, self._next = self._next, None
             return taken
 
     def do(self, asked: ControlAsked | ChangesAsked) -> None:
-        """Carry out a request of the page. The server has already checked name and value."""
+        """Carry out the request `asked` of the page. The server has already checked all names and values in it."""
         with self._lock:
             controls = self._controls
         if controls is None:
@@ -213,7 +229,10 @@ class Director:
 
 
 def choices_of(config: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
-    """Return the choices of each control in OF_A_NEW_RUN, by name. `config`: present values, which are choices too."""
+    """Return the valid values of each control in OF_A_NEW_RUN, by the control's name.
+
+    `config`: present value of each control, which is always valid.
+    """
     found = {"runtime": installed(), "avatar": (*AVATARS, *_neighbours(str(config["avatar"])))}
     choices = {}
     for name in OF_A_NEW_RUN:
@@ -223,14 +242,20 @@ def choices_of(config: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
 
 
 def reasons_against(options: RunOptions) -> dict[str, str]:
-    """Return the reasons for which controls in OF_A_NEW_RUN are disabled in a run with `options`, by name."""
+    """Return why controls in OF_A_NEW_RUN are disabled in a run with `options`, by the control's name.
+
+    Enabled controls are not in the result.
+    """
     if options.pace:
         return {"performance_profile": "the run is held to a chip's pace, which is capped already"}
     return {}
 
 
 def _neighbours(avatar: str) -> Iterator[str]:
-    """Yield the avatars' folders beside `avatar`, if `avatar` is a folder and not a built-in name."""
+    """Yield the paths of the first `MOST_AVATARS` avatars in the folder around `avatar`, in alphabetical order.
+
+    Yield nothing if `avatar` is a built-in name or no folder.
+    """
     folder = Path(avatar)
     if avatar not in AVATARS and folder.is_dir():
         yield from [str(manifest.parent) for manifest in sorted(folder.parent.glob(f"*/{MANIFEST}"))[:MOST_AVATARS]]
@@ -243,9 +268,11 @@ NO_PICTURE: Final = (2, 2)
 def run_file_live(
     options: RunOptions, hooks: OpenHooks, command: tuple[str, ...], port: int | None, tell: Callable[[str], None]
 ) -> RunOutcome:
-    """Run the pipeline file of `options` for its number of frames, else until an interrupt; return the outcome.
+    """Run a pipeline file under a dashboard, and return the outcome.
 
-    The page can only hold the run, step it and kill units. Other parameters and errors: as in `run_live`.
+    The page can only hold the run, step it and kill units.
+    `options`: options of the run, with the pipeline file. Without a number of frames, the run ends by an interrupt.
+    `hooks`, `command`, `port`, `tell`, and the errors raised: as in `run_live`.
     """
     from trilane.apps.run.run_file import run_file
 
@@ -268,10 +295,11 @@ def run_file_live(
 
 
 class FileWatch:
-    """The page as the viewer (`trilane.apps.run.run_file.Watch`) of a pipeline file's run.
+    """Shows a pipeline file's run on the page, and passes the page's requests to the run.
 
-    `link`: function that makes the link to the page's server. It takes height and width of pictures in pixels, and a
-    function that gets each request of the page, on a thread of its own.
+    It is a viewer as `trilane.apps.run.run_file.Watch` describes.
+    `link`: function that makes the link to the page's server. Its first arguments are the height and width of pictures
+    in pixels. Its last argument is a function that gets each request of the page, on a thread of its own.
     """
 
     def __init__(self, link: Callable[[int, int, Callable[[ControlAsked | ChangesAsked], None]], ServerLink]) -> None:
@@ -292,12 +320,19 @@ class FileWatch:
         return link.window
 
     def ends(self, state: str, why: str) -> None:
-        """Tell the page that the run is over. `state`: ended or failed. `why`: reason of a failure, or ""."""
+        """Tell the page that the run is over.
+
+        `state`: ended or failed.
+        `why`: reason of a failure, "" without a failure.
+        """
         if self._link is not None:
             self._link.send(StateIs(state, why))
 
     def do(self, asked: ControlAsked | ChangesAsked) -> None:
-        """Carry out a request of the page. The server has already checked it. Requests for a new run are ignored."""
+        """Carry out the request `asked` of the page. Requests for a new run are ignored.
+
+        The server has already checked the request.
+        """
         if isinstance(asked, ChangesAsked):
             return
         if asked.control in HOLDS:

@@ -73,7 +73,13 @@ MS: Final = 1e-6  # milliseconds in a nanosecond
 
 
 async def serve(listener: socket.socket, channel: ChannelEnd, window_fd: int) -> None:
-    """Serve until the run's process closes its end of `channel`. `window_fd`: file descriptor of the window."""
+    """Serve until the run's process closes its end of `channel`.
+
+    `listener`: socket that listens for clients.
+    `channel`: this process's end of the channel to the run.
+    `window_fd`: file descriptor of the window with the pictures.
+    Raises EOFError if the run ends before its first message, UnexpectedValue if the first message is not `Opened`.
+    """
     opened = await _first(channel)
     window = LiveWindow(window_fd, opened.height, opened.width)
     os.close(window_fd)
@@ -115,7 +121,10 @@ def _hear(channel: ChannelEnd, view: LiveView, run_is_over: asyncio.Event) -> No
 
 
 def main() -> None:
-    """Run `python -m trilane.apps.dashboard.live_server LISTENER CHANNEL WINDOW`, with three file descriptors."""
+    """Run the server process: `python -m trilane.apps.dashboard.live_server LISTENER CHANNEL WINDOW`.
+
+    The three arguments are inherited file descriptors.
+    """
     listener_fd, channel_fd, window_fd = map(int, sys.argv[1:])
     channel = ChannelEnd(socket.socket(fileno=channel_fd))
     with socket.socket(fileno=listener_fd) as listener:
@@ -126,9 +135,12 @@ def main() -> None:
 
 
 class _Course:
-    """The timeline and figures of one live run. `begun`: first record of its journal.
+    """The timeline and figures of one live run.
 
-    `jobs`, `idle`, `notes`: the newest ones, for clients that join later.
+    `begun`: first record of its journal.
+
+    `timeline`, `meter`: rows and figures so far. `jobs`, `idle`, `notes`: the newest rows and notes, for clients that
+    join later.
     """
 
     def __init__(self, begun: Begun) -> None:
@@ -143,7 +155,7 @@ class _Course:
         self.meter.add(record)
 
     def fresh(self) -> Iterable[Message]:
-        """Return messages with the jobs, idle slices and notes since the last call; also store these rows."""
+        """Return messages with the jobs, idle slices and notes since the last call, and store these rows."""
         jobs, idle, said = self.timeline.take()
         notes = [note(t_ms, text) for t_ms, text in said]
         self.jobs.extend(jobs)
@@ -153,10 +165,10 @@ class _Course:
 
 
 class LiveView:
-    """The `RunView` of successive live runs, which messages to `hear` announce.
+    """The `RunView` of successive live runs. `hear` takes the messages that announce each run.
 
-    `window`: window that has the pictures and steers the camera. `ask`: function that sends a request to the run, and
-    returns whether it was sent.
+    `window`: window that has the pictures and steers the camera.
+    `ask`: function that sends a request to the run, and returns whether the request was sent.
     """
 
     def __init__(self, window: LiveWindow, ask: Callable[[ControlAsked | ChangesAsked], bool]) -> None:
@@ -245,7 +257,10 @@ class LiveView:
         return self._new_run(asked.changes)
 
     def _new_run(self, changes: Mapping[str, str]) -> dict[str, str]:
-        """Request a run with `changes`, values by control. Return the reasons of refusals by control."""
+        """Request a new run with `changes`, values by control. Return the reason for each refusal, by control.
+
+        If a change is refused, nothing is requested. The result is empty if the request was sent.
+        """
         of_another_kind = {name: NO_NEW_RUN for name in changes if name not in OF_A_NEW_RUN}
         refused = of_another_kind | {name: why for name, word in changes.items() if (why := self._refusal(name, word))}
         if refused:
@@ -258,7 +273,7 @@ class LiveView:
         return control.refusal(value) if control else f"found {name!r}, expected one of {', '.join(self._controls)}"
 
     def _hand_over(self, asked: ControlAsked | ChangesAsked) -> str:
-        """Send a request to the run. Return the reason if this was not possible, else ACCEPTED."""
+        """Send the request `asked` to the run. Return ACCEPTED, or in words why the request was not sent."""
         now_s = time.monotonic()
         if len(self._asked_s) == ASKED_A_SECOND and now_s - self._asked_s[0] < 1.0:
             return f"more than {ASKED_A_SECOND} things were asked for within a second"
@@ -277,7 +292,7 @@ class LiveView:
         return None if folder is None else folder / "trace.pftrace"
 
     async def _read_on(self) -> None:
-        """Read new records of the run's journal, for at most about READ_S."""
+        """Add new records of the run's journal to the figures, for about READ_S seconds at most."""
         if self._followed is None and self._folder is not None:
             with suppress(BadInputError):  # the journal does not exist yet, or the run just renames its folder
                 self._followed = FollowedRun(_place_of(self._folder))
@@ -317,18 +332,18 @@ class LiveView:
 
     @property
     def _is_starting(self) -> bool:
-        """Return whether the run goes on and has presented no frame yet."""
+        """Return whether the run is going on but has presented no frame yet."""
         return self._state == RUNNING and (self._course is None or not self._course.meter.has_frames)
 
     def _values(self, facts: RunFacts) -> dict[str, Any]:
-        """Return the present value of each control that has a value."""
+        """Return the present value of each control that has a value, by the control's name."""
         camera = self._steering
         return {**facts.config, "orbit": [camera.azimuth_deg, camera.elevation_deg], "zoom": camera.zoom}
 
     def _steer(self, name: str, value: Value) -> None:
-        """Steer the camera by the control `name`.
+        """Steer the camera by `value` of the control `name`; the control `recentre` undoes all steering.
 
-        The picture follows a drag: a drag to the right moves the camera to the left, and a drag down lifts it.
+        The picture follows a drag: a drag to the right moves the camera to the left, and a drag down lifts the camera.
         """
         azimuth, elevation, zoom = self._steering
         if isinstance(value, list):
@@ -341,15 +356,15 @@ class LiveView:
         self._is_news = True
 
     def _now_ns(self) -> int | None:
-        """Return the time for which to compute figures, ns: the present time.
+        """Return the present time in ns, for which to compute figures; None for the time of the last record.
 
-        None means the time of the last record. It is returned if the run is over, or if its journal is not fully read.
+        None is returned if the run is over, or if its journal is not fully read.
         """
         return None if self._is_behind or self._state in ("ended", "failed") else time.monotonic_ns()
 
 
 def _place_of(folder: Path) -> Path:
-    """Return the place of a run's files: `folder`, or the folder with the final name if the run is complete."""
+    """Return the folder that has the run's files now: `folder`, or the folder with the final name after a rename."""
     complete = folder.with_name(run_name(folder))
     return folder if folder.is_dir() or not complete.is_dir() else complete
 

@@ -1,7 +1,7 @@
 """Facts about a run for the page that do not change during the run, and the controls of the page.
 
-Rule: unknown facts are null, nothing is guessed, and the words are those of report.json. Only the row of a control
-states its valid values.
+Rule: unknown facts are null, nothing is guessed, and the words are those of report.json. The valid values of a control
+are stated only in its `Control`.
 """
 
 from __future__ import annotations
@@ -35,11 +35,14 @@ Value = str | float | list[float] | None
 class RunFacts:
     """Facts about a run for the page that do not change during the run.
 
-    `name`: name of the run folder. `scene`: name of the scene. `clock`: host or virtual. `machine`: line for people.
+    `name`: name of the run folder. `scene`: name of the scene. `clock`: host or virtual.
+    `machine`: processor, cores and OpenGL driver in one line, for people.
     `fps`: frames a second of the scene. `output`: (width, height) of pictures in pixels.
-    `config`: present value of each control. `plan`: as in report.json, with `notes`.
-    `placement`, `accuracy`: as in report.json. `bound`: the keys BOUND of report.json, for a finished run.
-    `verdict`: verdict of a finished run, with its lines.
+    `config`: value of each control at the begin of the run, by name.
+    `plan`: key `plan` of report.json, with the report's `notes`.
+    `placement`, `accuracy`: as in report.json; `placement` is None if it is unknown.
+    `bound`: the keys `BOUND` of report.json, for a finished run; None if they are unknown.
+    `verdict`: verdict of a finished run, with its lines; None if it is unknown.
     """
 
     name: str
@@ -57,12 +60,12 @@ class RunFacts:
 
     @classmethod
     def of_row(cls, row: Mapping[str, Any]) -> RunFacts:
-        """Return the facts from the mapping `row` that `asdict` made for a message."""
+        """Return the facts from `row`, a mapping by field that was sent in a message."""
         width, height = row["output"]
         return cls(**{**row, "output": (width, height)})
 
     def hello(self) -> dict[str, Any]:
-        """Return the facts for the message `hello`."""
+        """Return the part of the message `hello` with facts about the run."""
         return {
             "name": self.name,
             "scene": self.scene,
@@ -73,16 +76,22 @@ class RunFacts:
         }
 
     def state(self, state: str, why: str = "") -> dict[str, Any]:
-        """Return the message `state`, with the state of the run, its reason `why`, and facts about the run."""
+        """Return the message `state`, which also has facts about the run.
+
+        `state`: state of the run, such as running.
+        `why`: reason of the state in words, "" without a reason.
+        """
         facts = {"plan": self.plan, "placement": self.placement, "accuracy": self.accuracy, "bound": self.bound}
         facts["verdict"] = self.verdict
         return {"type": "state", "is": state, "why": why, "config": self.config, **facts}
 
 
 def config_in_force(config: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the present value of each control in OF_A_NEW_RUN, spelt as in its choices.
+    """Return the present value of each control in OF_A_NEW_RUN, by name, spelt as in its choices.
 
-    `config`: block `config` of report.json. `options`: given options by name, for values that `config` lacks.
+    For a pipeline file, return only `policy` and `edge`.
+    `config`: block `config` of report.json.
+    `options`: given options by name, for values that `config` lacks.
     """
     if "pipeline" in config:  # a pipeline file has no controls that need a new run
         return {name: str(config[name]) for name in ("policy", "edge")}
@@ -105,7 +114,13 @@ BOUND: Final = ("bottleneck", "bound", "efficiency", "core_efficiency", "machine
 
 
 def facts_of_checked(name: str, checked: Checked, options: RunOptions, machine: Mapping[str, Any]) -> RunFacts:
-    """Return the facts of a scene's run that begins. `name`: name of its folder. `machine`: as in report.json."""
+    """Return the facts of a scene's run that begins.
+
+    `name`: name of the run folder.
+    `checked`: checked configuration of the run.
+    `options`: options of the run.
+    `machine`: block `machine` of report.json.
+    """
     # Imports stand in functions here and below: a live run's server needs neither module, and starts sooner without.
     from trilane.apps.run.report_facts import config_facts
 
@@ -127,7 +142,11 @@ def facts_of_checked(name: str, checked: Checked, options: RunOptions, machine: 
 
 
 def facts_of_file(name: str, config: Mapping[str, Any], machine: Mapping[str, Any]) -> RunFacts:
-    """Return the facts of a pipeline file's run that begins. `config`, `machine`: blocks of report.json."""
+    """Return the facts of a pipeline file's run that begins.
+
+    `name`: name of the run folder.
+    `config`, `machine`: blocks of report.json.
+    """
     scene = config["scene"]
     output = _output(scene)
     return RunFacts(
@@ -145,7 +164,11 @@ def facts_of_file(name: str, config: Mapping[str, Any], machine: Mapping[str, An
 
 
 def facts_of_report(name: str, report: Report) -> RunFacts:
-    """Return the facts of a finished run from its report. `name`: name of the run folder."""
+    """Return the facts of a finished run.
+
+    `name`: name of the run folder.
+    `report`: report of the run.
+    """
     from trilane.apps.run.verdict_facts import verdict_of
 
     document = report.as_json()
@@ -168,14 +191,18 @@ def facts_of_report(name: str, report: Report) -> RunFacts:
 
 
 def _output(scene: Mapping[str, Any]) -> tuple[int, int]:
-    """Return (width, height) of pictures in pixels; 640x480 if `scene`, a block of report.json, has no size."""
+    """Return (width, height) of pictures in pixels; (640, 480) if no size is stated.
+
+    `scene`: block `scene` of `config` in report.json.
+    """
     output = scene.get("output") or {}
     return output.get("width", 640), output.get("height", 480)
 
 
 def facts_of_folder(folder: Path, begun: Begun) -> RunFacts:
-    """Return the facts of the run in `folder`, from its report, or else from `begun`, the journal's first record.
+    """Return the facts of the run in `folder`, from its report or, without a report, from its journal.
 
+    `begun`: first record of the journal.
     Raises BadInputError for a report that cannot be read.
     """
     if (folder / "report.json").is_file():
@@ -203,9 +230,12 @@ def facts_of_folder(folder: Path, begun: Begun) -> RunFacts:
 class Control:
     """A control of the page.
 
-    `kind`: action, choice, number or drag. `live`: whether a use of the control changes the running run; otherwise it
-    starts a new run. `choices`: valid values of a choice. `min`, `max`: range of a number, or of both numbers of a
-    drag. `why_not`: reason for which the control is disabled, "" if it is enabled.
+    `name`: name of the control.
+    `kind`: action, choice, number or drag.
+    `live`: whether a use of the control changes the running run; otherwise, it starts a new run.
+    `choices`: valid values of a choice, empty for other kinds.
+    `min`, `max`: range of a number, or of both numbers of a drag; None for other kinds.
+    `why_not`: reason for which the control is disabled, "" if it is enabled.
     """
 
     name: str
@@ -217,7 +247,7 @@ class Control:
     why_not: str = ""
 
     def refusal(self, value: Value) -> str:
-        """Return the reason for which the control cannot get `value`; "" if it can."""
+        """Return why the control cannot have `value`, in words; "" if the control can have it."""
         if self.why_not:
             return self.why_not
         if self.kind == ACTION:
@@ -241,16 +271,18 @@ class Control:
 
 
 def control_of(row: Mapping[str, Any]) -> Control:
-    """Return the control from the mapping `row` that `asdict` made for a message."""
+    """Return the control from `row`, a mapping by field that was sent in a message."""
     return Control(**{**row, "choices": tuple(row["choices"])})
 
 
 def controls_of_run(
     units: Sequence[str], choices: Mapping[str, Sequence[str]], why_not: Mapping[str, str]
 ) -> tuple[Control, ...]:
-    """Return the controls of a scene's run with these `units`.
+    """Return the controls of a scene's run.
 
-    `choices`, `why_not`: these fields of each control in OF_A_NEW_RUN, by the control's name.
+    `units`: names of the units that can be killed.
+    `choices`: valid values of each control in OF_A_NEW_RUN, by the control's name.
+    `why_not`: reason why a control in OF_A_NEW_RUN is disabled, by the control's name; other controls are enabled.
     """
     camera = (
         Control("orbit", DRAG, True, min=-MOST_DRAG_DEG, max=MOST_DRAG_DEG),
@@ -266,7 +298,10 @@ def controls_of_run(
 
 
 def controls_of_file(units: Sequence[str]) -> tuple[Control, ...]:
-    """Return the controls of a pipeline file's run, which has no camera to steer."""
+    """Return the controls of a pipeline file's run, which has no camera to steer.
+
+    `units`: names of the units that can be killed.
+    """
     return (
         Control("play", ACTION, True),
         Control("pause", ACTION, True),

@@ -1,13 +1,14 @@
 """The interface of a server to a live run (`live_server.py`) or a finished run (`finished_view.py`), and its messages.
 
-Rule: a view answers at once or awaits; it never blocks the loop that all clients share. Times are milliseconds since
-the run's first step. Units and stages are their numbers in the message `hello`. The page and /metrics get the same
-figures.
+Rule: a view answers at once or awaits; it never blocks the event loop, which all clients share. Times are milliseconds
+since the run's first step. Units and stages are given by their index in the message `hello`. The page and /metrics get
+the same figures.
 
 A message is one byte, its kind, and a payload. Kind 1 is JSON in UTF-8, in both directions. Kind 2 is a picture for the
-page: number of the frame (uint32), its time in the scene and its age (float64, ms), all little-endian, and a JPEG.
-Every message of a page is checked. No page delays other pages: each has its own queue, which a task sends. The server
-drops and counts a page whose queue is full, or that receives nothing for SEND_S.
+page. Its payload has the number of the frame (uint32), the frame's time in the scene and its age (float64, ms), and a
+JPEG. All numbers are little-endian. Every message of a page is checked. No page delays other pages: each has its own
+queue, which a task sends. The server drops and counts a page whose queue is full, or that receives nothing for SEND_S
+seconds.
 """
 
 from __future__ import annotations
@@ -55,10 +56,13 @@ class Socket(Protocol):
 
 
 class Client:
-    """A page that shows a run. `gone`: function that is called once, when the server drops the page.
+    """A page that shows a run.
 
-    `asks_picture`: whether the page waits for a picture. `had_frame`: number of the newest frame that the page got.
-    `faults`: number of its malformed messages.
+    `socket`: the server's end of the WebSocket to the page.
+    `gone`: function that is called once, when the server drops the page.
+
+    `asks_picture`: whether the page waits for a picture. `had_frame`: number of the newest frame that the page got, -1
+    before the first. `faults`: number of malformed messages that the page has sent.
     """
 
     def __init__(self, socket: Socket, gone: Callable[[], None]) -> None:
@@ -77,7 +81,7 @@ class Client:
             self._drop()
 
     async def send_all(self) -> None:
-        """Send the queued messages until the client is dropped or disconnects."""
+        """Send the queued messages until the server drops the client or the task is cancelled."""
         sender = asyncio.ensure_future(self._send())
         dropped = asyncio.ensure_future(self._dropped.wait())
         try:
@@ -104,7 +108,7 @@ class Client:
 
 
 class Clients:
-    """All pages of a server."""
+    """All pages that are connected to a server."""
 
     def __init__(self) -> None:
         self._live: set[Client] = set()
@@ -137,19 +141,19 @@ class Clients:
 
 
 class _PageMessage(BaseModel):
-    """A message of a page. Unknown keys and other types are errors."""
+    """A message of a page. A message with an unknown key, or a value of another type, is an error."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
 
 class PictureAsked(_PageMessage):
-    """The page requests the newest picture that it has not had."""
+    """The page requests the newest picture that the page has not had."""
 
     type: Literal["picture"]
 
 
 class ControlSaid(_PageMessage):
-    """The page requests `value` for the control `name`; the control may refuse it."""
+    """The page requests `value` for the control `name`. The control may refuse the value."""
 
     type: Literal["control"]
     name: str = Field(max_length=40)
@@ -162,7 +166,7 @@ class ControlSaid(_PageMessage):
 
 
 class ChangesSaid(_PageMessage):
-    """The page requests a new run with all `changes`, the values of controls by their names."""
+    """The page requests a new run. `changes`: requested values of controls, by the control's name."""
 
     type: Literal["restart"]
     changes: dict[Annotated[str, Field(max_length=40)], Annotated[str, Field(max_length=LONGEST_VALUE)]] = Field(
@@ -183,11 +187,11 @@ _MESSAGES: TypeAdapter[Heard] = TypeAdapter(Annotated[Heard, Field(discriminator
 
 
 class MalformedError(ValueError):
-    """A client sent bytes that are no message."""
+    """The bytes that a client sent are no message."""
 
 
 def heard(data: bytes) -> Heard:
-    """Return the client's message in the bytes `data`. Raises MalformedError."""
+    """Return the client's message in the bytes `data`. Raises MalformedError for bytes that are no message."""
     if data[:1] != bytes([JSON_KIND]):
         raise MalformedError("a kind that no client sends")
     try:
@@ -203,9 +207,12 @@ def said(message: Mapping[str, Any]) -> bytes:
 
 
 def shown(frame: int, media_ms: float, age_ms: float, jpeg: bytes) -> bytes:
-    """Return a picture as bytes for the page, kind 2. `frame`: number of its frame. `jpeg`: the picture.
+    """Return a picture as bytes for the page, kind 2.
 
-    `media_ms`: time of the frame in the scene. `age_ms`: time since its pose was sampled.
+    `frame`: number of its frame.
+    `media_ms`: time of the frame in the scene.
+    `age_ms`: time since the pose of the frame was sampled.
+    `jpeg`: the picture as a JPEG.
     """
     return _PICTURE.pack(PICTURE_KIND, frame & 0xFFFFFFFF, media_ms, age_ms) + jpeg
 
@@ -225,31 +232,37 @@ class RunView(Protocol):
     """The interface of a server to one run, or to successive runs. docs/dashboard.md describes the messages."""
 
     def greeting(self) -> Iterable[Message]:
-        """Return the first messages to a client: the hello, the state, and recent events."""
+        """Return the first messages to a client: the hello, the state, recent slices, notes and figures."""
 
     async def news(self, *, is_watched: bool) -> Iterable[Message]:
         """Return messages to all clients about everything since the last call.
 
-        `is_watched`: whether there are clients. Without clients, the result is empty.
+        `is_watched`: whether the server has clients. Without clients, the result is empty.
         """
 
     async def picture(self, client: Client) -> bytes | None:
-        """Return the newest picture as `shown` makes it; None if `client` has had it, or there is none yet.
+        """Return the newest picture in the form of `shown`, and update `client.had_frame`.
 
-        Updates `client.had_frame`.
+        None is returned if `client` has had the newest picture, or if there is no picture yet.
         """
 
     def control(self, asked: ControlSaid) -> str:
-        """Carry out a request for a control, or begin to. Return the reason for a refusal, or "" without a refusal."""
+        """Carry out the request `asked` for one control, or begin to.
+
+        Return why the request is refused, in words; "" for an accepted request.
+        """
 
     def restart(self, asked: ChangesSaid) -> Mapping[str, str]:
-        """Request a new run with all changes. If one is refused, do nothing and return the reasons by control."""
+        """Request a new run with all changes in `asked`. Return the reason for each refusal, by control.
+
+        If a change is refused, no run is requested. The result is empty if the run is requested.
+        """
 
     async def seek(self, client: Client, to: Seek) -> Iterable[Message]:
         """Return messages to `client` about the part `to` of a finished run."""
 
     def metrics(self) -> str:
-        """Return the run's figures in OpenMetrics, without the end mark; "" if there are none yet."""
+        """Return the run's figures in OpenMetrics, without the end mark; "" if no figures exist yet."""
 
     @property
     def trace(self) -> Path | None:
@@ -257,9 +270,11 @@ class RunView(Protocol):
 
 
 class TimelineRows:
-    """Collects jobs, idle slices and notes of a run, which `take` returns once.
+    """Collects the jobs, idle slices and notes of a run. `take` returns each of them once.
 
-    `begun`: first record of the journal. `now_ms`: time of the last step, ms since the first step.
+    `begun`: first record of the journal.
+
+    `now_ms`: time of the last step, ms since the first step.
     """
 
     def __init__(self, begun: Begun) -> None:
@@ -290,7 +305,7 @@ class TimelineRows:
         self._add_idle(self._timeline.end())
 
     def take(self) -> tuple[list[JobRow], list[IdleRow], list[tuple[float, str]]]:
-        """Return the jobs, idle slices and notes since the last call. A note is a text after its time in ms."""
+        """Return three lists since the last call: jobs, idle slices, and notes. A note is (time in ms, text)."""
         taken = self._jobs, self._idle, self._notes
         self._jobs, self._idle, self._notes = [], [], []
         return taken
@@ -301,14 +316,21 @@ class TimelineRows:
             self._idle.append((unit, cause, self._ms(piece.begin_ns), self._ms(piece.end_ns)))
 
     def _ms(self, now_ns: int) -> float:
-        """Return the time since the first step in ms, rounded to a microsecond. The first call sets the first step."""
+        """Return the time from the first step to `now_ns`, in ms, rounded to a microsecond.
+
+        The first call sets the time of the first step.
+        """
         if self._start_ns is None:
             self._start_ns = now_ns
         return round((now_ns - self._start_ns) * MS, 3)
 
 
 def described(graph: Graph) -> dict[str, Any]:
-    """Return the part of the message `hello` with the stages, units and edges. Their order defines their numbers."""
+    """Return the part of the message `hello` with the stages, units and edges of a pipeline.
+
+    The index in each list is the number of the stage, unit or edge in other messages.
+    `graph`: the pipeline as the scheduler knows it.
+    """
     return {
         "stages": [{"name": stage.name, "unit": stage.unit} for stage in graph.stages],
         "units": list(graph.units),
@@ -317,19 +339,24 @@ def described(graph: Graph) -> dict[str, Any]:
 
 
 def slices(jobs: Sequence[JobRow], idle: Sequence[IdleRow]) -> dict[str, Any]:
-    """Return the message with `jobs` and `idle` slices."""
+    """Return the message `slices` with the rows `jobs` and `idle`."""
     return {"type": "slices", "jobs": jobs, "idle": idle}
 
 
 def note(t_ms: float, text: str) -> dict[str, Any]:
-    """Return the message with a note for a person. `t_ms`: time of the note, ms since the first step."""
+    """Return the message `note`, a message for a person.
+
+    `t_ms`: time of the note, ms since the first step.
+    `text`: text of the note.
+    """
     return {"type": "note", "t_ms": t_ms, "text": text}
 
 
 class RunMeter:
-    """Computes the figures of a run at a moment, from the journal's records.
+    """Computes the figures of a run so far, from the journal's records.
 
-    `begun`: first record of the journal. `finds_bound`: as in `LiveFigures`.
+    `begun`: first record of the journal.
+    `finds_bound`: as in `LiveFigures`.
     """
 
     def __init__(self, begun: Begun, *, finds_bound: bool = True) -> None:
@@ -340,16 +367,19 @@ class RunMeter:
         self._figures.add(record)
 
     def message(self, now_ns: int | None = None) -> dict[str, Any]:
-        """Return the message with the figures at `now_ns`, or at the last record if `now_ns` is None."""
+        """Return the message `figures` with the figures at a time of the run's clock.
+
+        `now_ns`: the time; None for the time of the last record.
+        """
         return {"type": "figures", **self._figures.now(now_ns).as_json()}
 
     @property
     def has_frames(self) -> bool:
-        """Return whether a frame was presented."""
+        """Return whether the run has presented a frame."""
         return self._figures.has_frames
 
     def metrics(self, now_ns: int | None = None, state: RunState | None = None) -> str:
-        """Return the figures in OpenMetrics, without the end mark. `state`: as in `LiveFigures.now`."""
+        """Return the figures in OpenMetrics, without the end mark. `now_ns`, `state`: as in `LiveFigures.now`."""
         from trilane.apps.watch.metrics import openmetrics  # this module needs a package of the extra `dashboard`
 
         return openmetrics(self._figures.now(now_ns, state)).decode().removesuffix(END)

@@ -1,4 +1,4 @@
-"""Follows a live run: finds the run by name, and gives its present figures, also as OpenMetrics text.
+"""Follows a live run: finds the run by name, and computes its present figures, also as OpenMetrics text.
 
-Rule: everything comes from the run's journal, which says the same after the run as during it.
+Rule: everything comes from the run's journal, which has the same content during the run and afterwards.
 """

@@ -1,8 +1,8 @@
 """The figures of a run at one moment, as the dashboard, `trilane watch` and `/metrics` show them.
 
-Rule: plain typed data. "The window" is the last `window_s` seconds before the moment, "the run" all time since every
-unit was ready. No speed is shown without `sources`, where a figure comes from, and `accuracy`, the avatars' error. The
-bounds of a histogram never change, so that counts of different runs can be added up.
+Rule: plain typed data. "The window" is the last `window_s` seconds before the moment. "The run" is all time since every
+unit was ready. No speed is shown without the sources of the figures and the avatars' error. The bounds of a histogram
+never change, so that counts of different runs can be added up.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ BOUNDS_S = (
 
 @dataclass(frozen=True)
 class Shares:
-    """Shares of a unit's time: `busy`, and `idle` by cause. They add up to 1; all are 0 for a time of length 0."""
+    """Shares of a unit's time: `busy`, and `idle` by cause. They add up to 1. For no time at all, every share is 0."""
 
     busy: float
     idle: Mapping[str, float]
@@ -38,7 +38,7 @@ class UnitFigures:
     `jobs`: number of ended jobs in the run.
     `restarts`: number of restarts of its process in the run.
     `is_up`: whether its process is there and ready; false once the run is over.
-    `stage`, `frame`: stage and frame of its present job, "" and -1 without one.
+    `stage`, `frame`: stage and frame number of its present job; "" and -1 without a job.
     """
 
     window: Shares
@@ -52,7 +52,11 @@ class UnitFigures:
 
 @dataclass(frozen=True)
 class Moved:
-    """Bytes of one kind that a stage moved: `total` in the run, `per_job` the mean of the window's jobs."""
+    """Bytes of one kind that a stage moved.
+
+    `total`: bytes in the run.
+    `per_job`: mean bytes per job, over the jobs in the window.
+    """
 
     total: float
     per_job: float
@@ -62,8 +66,10 @@ class Moved:
 class StageFigures:
     """The figures of one stage.
 
-    `waiting`: number of frames that wait for the stage. `service_ms`: mean service time of the window's jobs, 0 without
-    jobs. `bytes`: moved bytes by kind.
+    `unit`: unit of the stage.
+    `waiting`: number of frames that wait for the stage.
+    `service_ms`: mean service time of the jobs in the window, 0 without jobs.
+    `bytes`: moved bytes by kind.
     """
 
     unit: str
@@ -74,7 +80,12 @@ class StageFigures:
 
 @dataclass(frozen=True)
 class DropCount:
-    """Number of frames that were dropped at `edge` ("producer->consumer") for `cause`."""
+    """The number of frames that were dropped at one edge for one cause.
+
+    `edge`: the edge, as "producer->consumer".
+    `cause`: cause of the drops.
+    `frames`: number of frames.
+    """
 
     edge: str
     cause: str
@@ -83,9 +94,11 @@ class DropCount:
 
 @dataclass(frozen=True)
 class FrameFigures:
-    """Numbers of frames of the run: each requested frame is presented, lost, dropped, in flight, or not begun.
+    """Numbers of frames of the run. Each requested frame is presented, lost, dropped, in flight, or not begun.
 
-    `lost`: number of lost frames by cause. `skipped`: number of presented frames that took the bypass.
+    `skipped`: number of presented frames that took the bypass.
+    `lost`: number of lost frames by cause.
+    `dropped`: number of dropped frames for each edge and cause.
     """
 
     requested: int
@@ -99,9 +112,12 @@ class FrameFigures:
 
 @dataclass(frozen=True)
 class Histogram:
-    """A histogram of times of the whole run. `counts[i]`: number of times above `bounds_s[i - 1]`, up to `bounds_s[i]`.
+    """A histogram of times of the whole run.
 
-    The last count has no bound: it counts the times above all bounds. `sum_s`: sum of the times.
+    `bounds_s`: upper bounds of the bins, ascending.
+    `counts`: number of times in each bin: `counts[i]` counts times above `bounds_s[i - 1]`, up to `bounds_s[i]`. One
+    more count at the end is for times above all bounds.
+    `sum_s`: sum of the times.
     """
 
     bounds_s: tuple[float, ...]
@@ -116,7 +132,7 @@ class Histogram:
 
 @dataclass(frozen=True)
 class Note:
-    """A message to a person, `t_ms` after the first step."""
+    """A message for a person. `t_ms`: time of the message, since the first step."""
 
     t_ms: float
     text: str
@@ -124,23 +140,25 @@ class Note:
 
 @dataclass(frozen=True)
 class MomentFigures:
-    """All figures at one moment.
+    """All figures at one moment. None is null in JSON.
 
     `t_ms`: time since the first step. `window_s`, `run_s`: lengths of the window and of the run.
     `clock`: "host" or "virtual". `is_over`: whether the journal has the run's end.
     `state`: "goes on", "finished", "killed" or "removed".
-    `run_fps`: presented frames a second, from the first presented frame to the last, as in report.json; null for fewer
+    `run_fps`: presented frames a second, from the first presented frame to the last, as in report.json; None for fewer
     than two. `fps`: `run_fps` for a finished run; otherwise presented frames a second in the window.
-    `frame_time_ms`, `latency_ms`: exact mean, p50, p90, p95, p99, max and samples, of the window.
+    `frame_time_ms`, `latency_ms`: mean, p50, p90, p95, p99 and max in the window, all exact, and `samples`, their
+    number.
     `units`, `stages`: figures by name, in the order of the pipeline.
-    `temperature_c`, `duty`: last values by place and by unit. `memory_bytes`: memory of the processes, by unit.
+    `temperature_c`: last temperatures by place. `duty`: last duties by unit, from 0 to 1.
+    `memory_bytes`: last memory of each process, by unit; `scheduler` is the scheduler's process.
     `notes`: the last few messages.
-    `bound`: what bounds the run so far, as in report.json; null before 63 frames, and if it is not computed.
-    `verdict`: verdict on the run so far, with the keys of report.json and `lines` for people; null before the second
+    `bound`: what bounds the run so far, as in report.json; None before 63 frames, and if it is not computed.
+    `verdict`: verdict on the run so far, with the keys of report.json and `lines` for people; None before the second
     presented frame.
-    `frame_times`, `latencies`: times of the whole run.
+    `frame_times`, `latencies`: histograms of the whole run.
     `began_at`: UTC, ISO 8601; "" if the journal has no such time.
-    `accuracy`: by avatar, as in report.json; empty if the journal has none.
+    `accuracy`: error by avatar, as in report.json; empty if the journal has no errors.
     `sources`: source of the figures below each key, as in report.json.
     """
 
@@ -170,22 +188,22 @@ class MomentFigures:
     sources: Mapping[str, str]
 
     def as_json(self) -> dict[str, Any]:
-        """Return the fields by name, in a form for JSON."""
+        """Return the figures as nested mappings with the names of the fields, ready for JSON."""
         return asdict(self)
 
 
 class TimeHistogram:
-    """A growing `Histogram` of times."""
+    """A histogram of times that grows; `now` returns a `Histogram`."""
 
     def __init__(self) -> None:
         self._counts = [0] * (len(BOUNDS_S) + 1)
         self._sum_ns = 0
 
     def add(self, time_ns: int) -> None:
-        """Count a time. A time equal to a bound counts as below the bound."""
+        """Count a time in ns. A time equal to a bound counts as below the bound."""
         self._counts[bisect_left(BOUNDS_S, time_ns / NS_PER_S)] += 1
         self._sum_ns += time_ns
 
     def now(self) -> Histogram:
-        """Return the histogram so far."""
+        """Return the histogram of all times that were added until now."""
         return Histogram(BOUNDS_S, tuple(self._counts), self._sum_ns / NS_PER_S)

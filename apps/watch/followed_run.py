@@ -1,4 +1,4 @@
-"""A run that is followed while it goes on or afterwards: the place of its journal, and its state.
+"""Follows a run while it goes on or afterwards: finds its journal, reads new records, and tells its state.
 
 Rule: following a run does not change it. A live run writes into the partial folder `NAME.PID.partial` (run_folder.py).
 A request for NAME finds the partial folder, and follows the run when the folder is renamed to NAME.
@@ -31,7 +31,7 @@ class RunState(StrEnum):
     """The state of a run.
 
     GOES_ON: its process lives. FINISHED: its folder has the final name. KILLED: its process died and left the partial
-    folder. REMOVED: the folder is gone; a run that ends before any frame removes its folder.
+    folder. REMOVED: its folder is gone, because a run that ends before any frame removes its folder.
     """
 
     GOES_ON = "goes on"
@@ -41,15 +41,16 @@ class RunState(StrEnum):
 
 
 def without_journal(folder: Path) -> str:
-    """Return, in words, why `folder` has no journal."""
+    """Return a phrase for what was found in place of the journal in `folder`, such as `no such folder`."""
     if (folder / NAME).is_symlink():
         return f"{NAME}, a link to a file that is not there"
     return f"no {NAME}" if folder.is_dir() else "no such folder"
 
 
 class FollowedRun:
-    """The run whose journal is in `folder`. `name`: final name of the run's folder.
+    """Follows a run by reading its journal. `name`: final name of the run folder.
 
+    `folder`: run folder, partial or complete.
     Raises BadInputError if `folder` has no journal.
     """
 
@@ -77,12 +78,18 @@ class FollowedRun:
 
     @property
     def silent_ns(self) -> int:
-        """Return how long a live run has written nothing, ns; 0 up to `SILENCE_NS`, and 0 if the run has ended."""
+        """Return how long a live run has written nothing, in ns.
+
+        The result is 0 for a silence of up to `SILENCE_NS`, and for a run that has ended.
+        """
         silent_ns = time.monotonic_ns() - self._heard_ns
         return silent_ns if silent_ns > SILENCE_NS and self.state is RunState.GOES_ON else 0
 
     def new(self) -> Iterator[Record]:
-        """Yield the records since the last call; none if the run was removed. Raises BadInputError."""
+        """Yield the records since the last call; none if the run was removed.
+
+        Raises BadInputError for a broken journal.
+        """
         self._find_again()
         if not self.folder.is_dir():
             return
@@ -95,7 +102,10 @@ class FollowedRun:
                 raise  # without a file there, the run was moved this very moment, and the next call finds it
 
     def whole(self) -> Iterator[Record]:
-        """Yield all records of a run that was not read yet. Raises BadInputError if the journal has no record."""
+        """Yield all records of the journal. Call it only if nothing was read before.
+
+        Raises BadInputError for a broken journal or one without records.
+        """
         is_empty = True
         for record in self.new():
             is_empty = False
@@ -104,7 +114,7 @@ class FollowedRun:
             raise BadInputError(self.folder, NO_RECORD, EXPECTED)
 
     def _find_again(self) -> None:
-        """Take the folder with the final name if the run has become complete and its partial folder is gone."""
+        """Follow the run into the folder with the final name, if the partial folder was renamed."""
         target = self.folder.with_name(self.name)
         if not self.folder.exists() and target.is_dir():
             self.folder = target
@@ -112,11 +122,12 @@ class FollowedRun:
 
 
 def follow(given: Path | None, *, wait: bool = False, sleep: Callable[[float], None] = time.sleep) -> FollowedRun:
-    """Return the run that `given` means. Raises BadInputError.
+    """Return the run that `given` means.
 
     `given`: folder or journal of the run, or its name below runs/; None for the newest run below runs/.
-    `wait`: whether to wait until the run has begun; otherwise a run that has not begun is an error. `sleep`: function
-    that waits for a time in seconds.
+    `wait`: whether to wait until the run has begun; without waiting, a run that has not begun is an error.
+    `sleep`: function that waits for a time in seconds.
+    Raises BadInputError if the run is not found or has no journal.
     """
     while True:
         found = _newest(RUNS.glob(f"*/{NAME}")) if given is None else folder_of(given)
@@ -128,7 +139,7 @@ def follow(given: Path | None, *, wait: bool = False, sleep: Callable[[float], N
 
 
 def _is_alive(pid: int) -> bool:
-    """Say whether the process runs. A zombie, which has ended but was not waited for by its parent, does not."""
+    """Return whether the process `pid` runs. A zombie, which has ended but is still listed, does not run."""
     try:
         return bool(psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
     except psutil.NoSuchProcess:
@@ -136,9 +147,10 @@ def _is_alive(pid: int) -> bool:
 
 
 def folder_of(given: Path) -> Path | None:
-    """Return the run's folder that `given` means (see `follow`), partial or complete; None if there is none.
+    """Return the folder of the run that `given` means (see `follow`), partial or complete; None if no such run exists.
 
-    An existing path is returned as it is, whether or not it is a run's folder.
+    For a journal, the folder around it is returned. Any other existing path is returned as it is, even if it is no run
+    folder.
     """
     if given.name == NAME:
         return given.parent
@@ -152,7 +164,11 @@ def folder_of(given: Path) -> Path | None:
 
 
 def _newest(journals: Iterator[Path], name: str = "") -> Path | None:
-    """Return the folder whose journal was written to last. `name`: take only partial folders of runs of this name."""
+    """Return the run folder whose journal was written to last; None if no journal fits.
+
+    `journals`: paths of journals.
+    `name`: final name of the run; only partial folders with this name fit. If empty, all folders fit.
+    """
     found = []
     for journal in journals:
         matched = PARTIAL.fullmatch(journal.parent.name)
@@ -178,6 +194,6 @@ def _missing(given: Path | None) -> BadInputError:
 
 
 def run_name(folder: Path) -> str:
-    """Return the final name of the run in `folder`, which may be partial."""
+    """Return the final name of the run in `folder`: the folder's name, without the end that marks a partial folder."""
     matched = PARTIAL.fullmatch(folder.name)
     return matched["name"] if matched else folder.name

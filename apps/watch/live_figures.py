@@ -1,9 +1,9 @@
-"""Figures of a run at any moment, from its growing journal.
+"""Computes the figures of a run at any moment, from its growing journal.
 
-Rule: pure, with bounded memory. All times of the last `WINDOW_NS` are kept, so that percentiles are exact; the whole
-run only has sums and counts. A unit's time follows the ledger (scheduler/ledger.py): its accounts and jobs are spans.
-Time in which a job was assigned, but neither ran nor was preempted, is overhead. `looks` gives the figures repeatedly
-until a live run ends, and once for a finished run.
+Rule: pure, with bounded memory. All times of the last `WINDOW_NS` are kept, so that their percentiles are exact. For
+the whole run, only sums and counts are kept. The time of a unit is divided as in the ledger (scheduler/ledger.py). Time
+in which a job was assigned, but neither ran nor was preempted, is overhead. `looks` yields the figures repeatedly until
+a live run ends, and once for a finished run.
 """
 
 from __future__ import annotations
@@ -78,8 +78,9 @@ PARTS = (ASSIGNED, *NAMES.values(), BUSY, PREEMPTED)
 class LiveFigures:
     """Collects the figures of a run. `add` takes the records after `begun`, in order; `now` returns the figures.
 
-    `finds_bound`: whether to find the bound of the run, which takes three times as long as all else. The end of a
-    finished run's journal has the bound already.
+    `begun`: first record of the journal.
+    `finds_bound`: whether to find the bound of the run, which takes three times as long as all else. A finished run
+    needs no search, because the last record of its journal has the bound.
     """
 
     def __init__(self, begun: Begun, *, finds_bound: bool = True) -> None:
@@ -116,16 +117,16 @@ class LiveFigures:
 
     @property
     def last_ns(self) -> int:
-        """Return the time of the last record with a time, ns; 0 before the first such record."""
+        """Return the time of the last step or of the run's end, ns; 0 before the first step."""
         return self._last_ns
 
     @property
     def is_over(self) -> bool:
-        """Say whether the run's last record was added."""
+        """Return whether the last record of the run was added."""
         return self._is_over
 
     def add(self, record: Record) -> None:
-        """Take the next record of the journal; `Begun` is not among them."""
+        """Add the next record of the journal after `begun`."""
         facts = self._timeline.add(record)
         self._adders[type(record)](record)
         for fact in facts:
@@ -138,11 +139,12 @@ class LiveFigures:
                 self._reckoning.add(fact)
 
     def now(self, now_ns: int | None = None, state: RunState | None = None) -> MomentFigures:
-        """Return the figures at the time `now_ns` of the run's clock.
+        """Return the figures at a time of the run's clock.
 
-        The time of the last record is used instead if `now_ns` is None or earlier. After the run's last step, the time
-        of that step is used. `state`: state of the run, which the journal of a killed run does not show; None to take
-        it from the journal.
+        `now_ns`: the time. If `now_ns` is None or earlier than the last record, the time of the last record is used.
+        Once the run is over, a later `now_ns` counts as the time of the run's last step.
+        `state`: state of the run, because the journal of a killed run does not show it; None to take the state from the
+        journal.
         """
         now_ns = min(max(now_ns or 0, self._last_ns), self._finished_ns)
         start_ns = now_ns if self._timeline.start_ns is None else self._timeline.start_ns
@@ -181,7 +183,7 @@ class LiveFigures:
         return replace(figures, verdict=self._verdict(figures) if self._timeline.presented > 1 else None)
 
     def _verdict(self, figures: MomentFigures) -> dict[str, Any]:
-        """Return the verdict on the run so far. If the run is over, the report in its last record decides."""
+        """Return the verdict on the run so far. For a run that is over, the figures in its last record decide."""
         document = self._report or {
             "clock": figures.clock,
             "policy": self._settings.policy,
@@ -255,7 +257,7 @@ class LiveFigures:
 
     @property
     def has_frames(self) -> bool:
-        """Whether a frame was presented."""
+        """Whether the run has presented a frame."""
         return self._timeline.presented > 0
 
     def _since_first_ms(self, now_ns: int) -> float:
@@ -291,7 +293,7 @@ class LiveFigures:
         return {name.removeprefix(prefix): value for name, value in self._sampled.items() if name.startswith(prefix)}
 
     def _sources(self, clock: str) -> dict[str, str]:
-        """Return the source of each key of the figures. If several keys fit a figure, the longest key decides."""
+        """Return the source of the figures below each key. If several keys fit a figure, the longest key decides."""
         sources = dict.fromkeys(OF_THE_RUN, COMPUTED if clock == "virtual" else MEASURED)
         sources |= {
             LEAST_KEY: COMPUTED,
@@ -304,19 +306,19 @@ class LiveFigures:
 
 
 class RunLook(NamedTuple):
-    """A run at one moment: its state and its figures. `name`: final name of its folder."""
+    """A look at a run at one moment: its final name, its state and its figures."""
 
     name: str
     state: RunState
     figures: MomentFigures
 
     def as_json(self) -> dict[str, Any]:
-        """Return the fields of `MomentFigures`, and `run`, the name of the run, in a form for JSON."""
+        """Return the fields of `MomentFigures`, and the name of the run as `run`, ready for JSON."""
         return {"run": self.name, **self.figures.as_json()}
 
 
 def looks(run: FollowedRun, pause: Callable[[], None]) -> Generator[RunLook]:
-    """Yield a look at `run` now, and after every `pause` until it has ended.
+    """Yield a look at `run` now, and after every call of `pause` until the run has ended.
 
     Raises BadInputError if the run has ended and its journal has no record.
     """
@@ -341,7 +343,7 @@ def looks(run: FollowedRun, pause: Callable[[], None]) -> Generator[RunLook]:
 def _as_reported(figures: MomentFigures, folder: Path) -> MomentFigures:
     """Return `figures` with the verdict of the report in `folder`, because a report has more facts than a journal.
 
-    Without a report, return `figures` unchanged.
+    If `folder` has no report, return `figures` unchanged.
     """
     if not (folder / "report.json").is_file():
         return figures
@@ -349,7 +351,11 @@ def _as_reported(figures: MomentFigures, folder: Path) -> MomentFigures:
 
 
 class _Span(NamedTuple):
-    """A span of a unit's time. `ns` nanoseconds of the span, at unknown places, count as `name`, one of `PARTS`."""
+    """A span of a unit's time, from `begin_ns` to `end_ns`.
+
+    `name`: the use of the time, one of `PARTS`.
+    `ns`: nanoseconds that were used so, at unknown places in the span.
+    """
 
     begin_ns: int
     end_ns: int
@@ -358,8 +364,10 @@ class _Span(NamedTuple):
 
 
 class _UnitTime:
-    """Where the time of one unit goes from `begin_ns` on. It keeps sums of all time, and spans of the last `window_ns`.
+    """Where the time of one unit goes: sums over all time, and spans of the newest `window_ns`.
 
+    `begin_ns`: time at which the count begins.
+    `window_ns`: length of the window.
     `account`: account of the ledger that is charged at the begin.
     """
 
@@ -392,7 +400,7 @@ class _UnitTime:
             self._keep(begin_ns, end_ns, PREEMPTED, min(job.preempted_ns, ran_ns))
 
     def shares(self, now_ns: int, running_since_ns: int | None) -> tuple[Shares, Shares]:
-        """Return the shares of the newest `window_ns`, and those of the whole run, both up to `now_ns`.
+        """Return two `Shares` of the unit's time, both up to `now_ns`: of the newest `window_ns`, and of the whole run.
 
         `running_since_ns`: time at which the unit got its present job; None without a job.
         """
@@ -429,7 +437,7 @@ def _shares(sums: Mapping[str, int], total_ns: int) -> Shares:
 
 
 class _Work(NamedTuple):
-    """A job of a stage: its end, its service time, and the bytes moved, by kind."""
+    """A job of a stage that has ended: its end, its service time, and its moved bytes by kind."""
 
     end_ns: int
     service_ns: int
@@ -437,7 +445,10 @@ class _Work(NamedTuple):
 
 
 class _StageBook:
-    """The jobs of a stage in the window, and the bytes that all its jobs moved, by kind."""
+    """The jobs of one stage.
+
+    `recent`: jobs in the window, in order. `bytes`: bytes that all jobs of the run moved, by kind.
+    """
 
     def __init__(self) -> None:
         self.recent: deque[_Work] = deque()

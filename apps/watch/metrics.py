@@ -1,8 +1,8 @@
 """The metrics of a run: a table of name, unit, meaning, labels and values, written as OpenMetrics text.
 
-Rule: base units; no label names a frame, a job or a process number, so the rows do not grow with the run. Busy and idle
-shares cover the last seconds (`WINDOW_NS` of live_figures.py), other gauges the moment, histograms and counters the
-whole run. The metric `trilane_source` names the source of each metric. docs/metrics.md has the same table.
+Rule: base units. No label names a frame, a job or a process number, so the number of rows does not grow with the run.
+Busy and idle shares cover the last `WINDOW_NS` (live_figures.py), all other gauges the moment. Histograms and counters
+cover the whole run. The metric `trilane_source` names the source of each metric. docs/metrics.md has the same table.
 https://prometheus.io/docs/specs/om/open_metrics_spec/
 """
 
@@ -32,7 +32,10 @@ def openmetrics(figures: MomentFigures) -> bytes:
 
 
 class _Collected:
-    """The metrics of a run, in place of prometheus_client's registry, which holds the metrics of this process."""
+    """The metrics of a followed run, in the form of a prometheus_client registry.
+
+    It stands in for the default registry, which has the metrics of this process.
+    """
 
     def __init__(self, figures: MomentFigures) -> None:
         self._figures = figures
@@ -80,9 +83,9 @@ def _sources(figures: MomentFigures) -> families.Metric:
 
 
 def _sources_of(figures: MomentFigures, key: str) -> Iterator[tuple[str, str]]:
-    """Yield (part, source) of `key`, and nothing for an empty `key`.
+    """Yield (part, source) for each source of the figures below `key`; nothing for an empty `key`.
 
-    Part "" is all of `key`. Any other part is a place or an avatar with a source of its own.
+    An empty part means all figures below `key`. Any other part is a place or an avatar with a source of its own.
     """
     for name, source in figures.sources.items():
         if key and (name == key or (name.startswith(f"{key}.") and "*" not in name)):
@@ -92,8 +95,12 @@ def _sources_of(figures: MomentFigures, key: str) -> Iterator[tuple[str, str]]:
 class Metric(NamedTuple):
     """A gauge or counter.
 
-    `unit`: end of `name`, or "" for a plain number. `labels`: names of its labels. `source`: key of
-    `MomentFigures.sources`; "" for none.
+    `name`: name of the metric.
+    `unit`: unit at the end of `name`, or "" for a plain number.
+    `help`: meaning in one sentence.
+    `labels`: names of its labels.
+    `rows`: function that returns the rows of the metric; a row has the values of the labels and the value.
+    `source`: key of `MomentFigures.sources`; "" if the metric has no source there.
     """
 
     name: str
@@ -105,7 +112,10 @@ class Metric(NamedTuple):
 
 
 class Times(NamedTuple):
-    """A histogram of times in seconds. `times`: function that takes it from the figures. `source`: see `Metric`."""
+    """A histogram of times in seconds.
+
+    `name`, `help`, `source`: as in `Metric`. `times`: function that returns the histogram from the figures.
+    """
 
     name: str
     help: str
@@ -134,7 +144,7 @@ def _psnr(figures: MomentFigures) -> Iterator[Row]:
 
 
 class Info(NamedTuple):
-    """A metric whose labels have its content; its value is always 1."""
+    """A metric whose content is in its labels; its value is always 1. `name`, `help`: as in `Metric`."""
 
     name: str
     help: str
