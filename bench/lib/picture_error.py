@@ -57,7 +57,7 @@ class PictureErrors:
 
 
 def psnr_of_frames(psnr_db: Sequence[float]) -> dict[str, float]:
-    """Return the mean (`psnr_db`), the least (`worst_psnr_db`) and the 1st percentile (`p1_psnr_db`) of the PSNR, in dB.
+    """Return the mean, the least and the 1st percentile of a PSNR: `psnr_db`, `worst_psnr_db` and `p1_psnr_db`, in dB.
 
     A mean hides single bad frames, which people see. The least value depends on the number of frames; the percentile
     hardly does. The percentile is linear between ranks. `psnr_db`: PSNR of each frame, at least one.

@@ -67,7 +67,7 @@ class StageChain:
     def run(self, frame: int, last: int | None = None) -> Packet:
         """Run frame number `frame` from the first stage to stage number `last`, and return the last stage's output.
 
-        If the bypass begins at a stage before `last` and leads beyond it, the output of that stage is returned.
+        If the frame takes the bypass past stage `last`, the output of the stage where the bypass begins is returned.
         `last`: number of the stage, from 0; None for the last stage of the chain.
         """
         self._next, self._slot_in = 0, -1
