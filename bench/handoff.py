@@ -2,8 +2,9 @@
 
 Rule: one definition holds for all variants, which run in interleaved rounds. The producer writes every byte again and
 reads the clock after the last byte. Two variants are compared with the peers. The first is a real run through the
-scheduler. Its pipeline is a chain of four stages: the second stage fills its slot, the third stage reads every byte of
-the slot, and the others do no work. The second variant has the same slot, but no scheduler between the processes.
+scheduler. The pipeline of this run is a chain of four stages. Its second stage fills a slot, and its third stage reads
+every byte of the slot; the others do no work. The second variant has the same slot, but no scheduler between the
+processes.
 """
 
 from __future__ import annotations
@@ -57,16 +58,16 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 300, rounds
 
     `rows` has a row for each variant (`way`) and size (`kib`). `frames`: number of hand-overs in all rounds. `p50_us`,
     `p99_us`: percentiles of the time until every byte can be read. `read_p50_us`, `read_p99_us`: percentiles of the
-    time until every byte was read and checked. Each is the median of the rounds' percentiles, with its 95 % interval
-    as `_low_us` and `_high_us`; with fewer than six rounds, the least and the largest. With fewer than 299 frames in a
-    round, the p99 is null. `max_us`: longest time until every byte can be read. Before each hand-over, the consumer
+    time until every byte was read and checked. Each is the median of the rounds' percentiles. The keys with `_low_us`
+    and `_high_us` have its 95 % interval; with fewer than six rounds, the least and the largest percentile. With fewer
+    than 299 frames in a round, the p99 is null. `max_us`: longest time until every byte can be read. Before each hand-over, the consumer
     waits at least 1 ms, as an idle unit does.
 
-    Trilane's variants: `slot through the scheduler`: as between two stages of a run, the message goes to the
-    scheduler's process, through its core, and on to the next unit. `slot`: the message goes directly from process to
-    process. `slot, 256 KiB of it written`: the same, but most of the slot is not written, so the caches hardly change.
-    The peers are in their best form and have no scheduler: `iceoryx2` with an event; `zeromq` without copies of its
-    own; `pipe`: bytes through multiprocessing.Pipe into an array; `pickled queue`: multiprocessing.Queue.
+    Trilane has three variants. `slot through the scheduler`: as in a run, the message goes to the scheduler's process,
+    through the scheduler's core, and on to the next unit. `slot`: the message goes directly from process to process.
+    `slot, 256 KiB of it written`: the same, but most of the slot is not written, so the caches hardly change. The peers
+    are in their best form and have no scheduler. `iceoryx2`: a sample in place and an event. `zeromq`: a frame without
+    copies of its own. `pipe`: bytes through multiprocessing.Pipe into an array. `pickled queue`: multiprocessing.Queue.
 
     `absent`: reason for each peer that is not installed. `met`: whether p50 <= 150 us and p99 <= 500 us at the largest
     size, by variant of Trilane; null without a p99. `p50_largest_over_smallest`: p50 at the largest size divided by p50

@@ -134,7 +134,8 @@ def _measure_periods(variants: dict[str, ProcessVariant], seconds: float, period
     """Return the measured times of each variant, by name, in ms.
 
     The times of a variant have the keys `startup_cold_ms`, `startup_warm_ms`, and `periods`, a list of the times of all
-    runs for each period. `seconds`: time for which each variant runs. `period`: seconds of a variant's turn.
+    runs for each period. `variants`: variants by name. `seconds`: time for which each variant runs. `period`: seconds
+    of a variant's turn.
     """
     with runners(variants) as by_name:
         cold = {name: runner.startup_ms for name, runner in by_name.items()}

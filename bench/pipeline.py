@@ -86,9 +86,9 @@ def measure(
     (dispatched, but not begun).
 
     `gain`: mean frame time of the `sequential` runs before and after, divided by `frame_ms`. `bound`: largest possible
-    gain: the frame time of those runs, divided by `alone_ms`; the frame time is the sum of `all_alone_ms`, the time of
-    all units, and `hops_ms`. `hops_ms`: frame time of a sequential run minus the times of its stages, which is the time
-    of hand-overs; null for other runs. `in_run_over_alone`: time of the unit `slowest` in this run, without the time in
+    gain, which is (`all_alone_ms` + `hops_ms` of those runs) / `alone_ms`. `all_alone_ms`: time of all units for a
+    frame in those runs. `hops_ms`: frame time of a sequential run minus the times of its stages, which is the time of
+    hand-overs; null for other runs. `in_run_over_alone`: time of the unit `slowest` in this run, without the time in
     which it had no core, divided by `alone_ms`. `gain_of_bound`: `gain` divided by `bound`. `of_bound_low`,
     `of_bound_high`: its 95 % interval; with fewer than six rounds, the least and the largest. `dropped`, `lost`:
     numbers of frames in all rounds. `accuracy`: image error of each avatar and its source, or why there are no figures.
@@ -142,7 +142,7 @@ def _folder(avatar: str) -> str:
 
 
 def _measure_rounds(checked: Checked, settings: list[Setting], rounds: int) -> list[dict[str, Any]]:
-    """Return a row of `measure` for each of `settings`, the first of which is `sequential`.
+    """Return a row of `measure` for each of `settings`. The first setting is `sequential`.
 
     One more sequential run ends the last round, because every run is compared with the sequential runs around it.
     """
@@ -304,7 +304,7 @@ def _latency_ms(runs: list[dict[str, Any]]) -> dict[str, float | None]:
 
 
 def _summary(setting: Setting, runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the row of a setting. `runs`: figures of the setting's runs.
+    """Return the row of `setting`. `runs`: figures of the setting's run in each round.
 
     The row has the medians of numbers, the most frequent names, and the sums of dropped and lost frames.
     """

@@ -59,11 +59,11 @@ def measure(
     rounds have the chosen placement, the rule's placement, and the `finalists` fastest of the others. `is_chosen`,
     `is_rule`: whether the placement is the chosen one, or the rule's.
 
-    `sizes` has a row for each size and number of cores: `chosen`, `best`, `rule`: the chosen placement, the fastest
-    placement and the rule's placement, in words. `how`: reason of the choice: the run's own trial, or the prediction.
-    `chosen_over_best`: frame time of the chosen placement divided by the frame time of the best other placement, as the
-    median over the further rounds; up to 1, the chosen placement is the best. `low`, `high`: its 95 % interval; with
-    fewer than six rounds, the least and the largest. `rule_over_chosen`: frame time of the rule's placement divided by
+    `sizes` has a row for each size and number of cores. `chosen`, `best`, `rule`: the chosen, the fastest and the
+    rule's placement, in words. `how`: reason of the choice: the run's own trial, or the prediction.
+    `chosen_over_best`: frame time of the chosen placement divided by the frame time of the best other placement. It is
+    the median over the further rounds; up to 1, the chosen placement is the best. `low`, `high`: its 95 % interval;
+    with fewer than six rounds, the least and the largest. `rule_over_chosen`: frame time of the rule's placement divided by
     the frame time of the chosen placement. `rule_low`, `rule_high`: its 95 % interval. `rank_correlation`: Spearman's
     rank correlation of the predicted and the tried times of all placements. `predicted_over_tried`, `predicted_least`,
     `predicted_largest`: median, least and largest ratio of these times. `others`: share of the cores that other

@@ -94,8 +94,8 @@ def measure(
     largest PSNR of fixed minus PSNR of planned. `worst_loss_db`: the same for the worst frame of each plan; null
     without a truth. `sources`: source of the figures. `driver`: facts about the OpenGL driver. `config`: settings.
 
-    Raises BadInputError for an option out of range or a scene that cannot be read, MissingPartError if a library is not
-    installed, TrilaneError if a run fails.
+    Raises BadInputError for an option out of range or a wrong scene, MissingPartError if a library is not installed,
+    TrilaneError if a run fails.
     """
     _check(frames, pictures)
     require_metrics()
@@ -152,7 +152,7 @@ class _Scene:
     def __init__(self, name: str, frames: int, runtime: str, *, video: bool) -> None:
         """Configure both plans.
 
-        `frames`: largest number of frames of a run. `runtime`: runtime of the networks. `video`: whether a video is
+        `name`: name or file of the scene. `frames`: largest number of frames of a run. `runtime`: runtime of the networks. `video`: whether a video is
         encoded. Raises BadInputError for a scene that cannot be read, MissingPartError if a library is not installed.
         """
         asked = RunOptions(scene=name, runtime=runtime, hud=False)
@@ -230,8 +230,8 @@ def by_frame(
     camera of the scene.
     The entry of a plan has the keys of `psnr_of_frames`, over the frames with a visible avatar, and `worst_frame`, the
     number of the worst frame. The entry of `planned` has two further keys. `changes`: number of frames whose tensor
-    has another shape than that of the previous frame. `worst_change_db`: least PSNR of these frames; None if there are
-    none. If no frame shows an avatar, the result is None.
+    has another shape than that of the previous frame. `worst_change_db`: least PSNR of these frames; None if the shape
+    never changes. If no frame shows an avatar, the result is None.
     """
     errors: dict[str, dict[int, float]] = {plan: {} for plan in chains}
     tensors: dict[int, str] = {}

@@ -33,8 +33,8 @@ UNEQUAL = 1e-3  # largest share of bytes that may differ, by one step: variants 
 def measure(size: int = 512, channels: int = 16, repeats: int = 40, threads: int = 1) -> dict[str, Any]:
     """Measure the time to draw one tensor and read it back to host memory, in ms, by variant.
 
-    `raster_ms`: median time of the variant that a run uses on this driver; with a software driver, the CPU unit skins
-    the body, and only the rest counts. `packed_ms`, `split_ms`: median times of the packed pass and of the split
+    `raster_ms`: median time of the stage raster as in a run on this driver. With a software driver, the CPU unit skins
+    the body, and the time of skinning does not count. `packed_ms`, `split_ms`: median times of the packed pass and of the split
     passes. `ratios`: `split_over_packed`, the second of these times divided by the first. `rows`: median, minimum and
     90th percentile of each variant (`way`) over `repeats` draws. `covered`: share of the pixels that the body covers.
     `driver`: facts about the OpenGL driver. `config`: settings of the bench.

@@ -1,8 +1,8 @@
 """What are the highest rates of this machine's cores, in INT8, in FP32, and from memory?
 
 Rule: there are two peaks for INT8, and each figure names the peak that it means. The first is the best rate that the
-installed runtimes reach on this machine, on layers that suit them. The second is the peak of the instruction set: the
-documented multiply-accumulates a cycle, times the clock measured under INT8 load, times the number of cores.
+installed runtimes reach on this machine, on layers that suit them. The second is the peak of the instruction set. It is
+the product of the documented multiply-accumulates a cycle, the clock under INT8 load, and the number of cores.
 """
 
 from __future__ import annotations

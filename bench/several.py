@@ -114,8 +114,8 @@ class _CrowdFixture:
     def compare(self, view: _View) -> list[tuple[float, float, float, float, float]]:
         """Return a tuple of five numbers for each avatar that is visible in `view`.
 
-        The numbers are the PSNR with neighbours, the PSNR without neighbours, the mean and the largest difference of
-        the two pictures in bytes, and the height of the avatar's cell in tensor pixels.
+        The first two are the PSNR in dB with and without neighbours. The next two are the mean and the largest
+        difference of the two pictures in bytes. The last is the height of the avatar's cell in tensor pixels.
         """
         everyone = self._picture(view, range(len(view.joints)))
         rows = []

@@ -35,8 +35,8 @@ def run_asked(
     entered when a run begins, or when a long check has a message.
     `command`: words of the command line.
     Raises BadInputError for wrong input and MissingPartError for an absent part, both before the run begins. Raises
-    TrilaneError if no frame was presented or a file could not be written, and KeyboardInterrupt if a signal ended the
-    run before its first frame.
+    TrilaneError if no frame was presented, or if a file could not be written. Raises KeyboardInterrupt if a signal
+    ended the run before its first frame.
     """
     from trilane.pipeline.pipeline_file import is_pipeline_file
 

@@ -319,8 +319,9 @@ def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str
 
 
 def _port(file: PipelineFile, name: str, each: PortInput, types: PortTypes) -> str:
-    """Return the name of the port that input `each` of stage `name` reads. `types`: types of all ports.
+    """Return the name of the port that input `each` of stage `name` reads.
 
+    `file`: pipeline file, which errors name. `types`: types of all ports.
     Raises BadInputError if the input names a port that does not exist, or names none although there are several.
     """
     ports = types[each.stage]
@@ -347,8 +348,8 @@ TAKEN: Final = (*OF_THE_RUN, "runtime", "changes", "out")
 class Watch(Protocol):
     """A viewer that shows a run and steers the run.
 
-    A watched run lasts until the viewer ends it, unless the options or the file limit its frames by `frames` (the
-    option) or `arrivals` (the key).
+    A watched run lasts until the viewer ends it. The option `frames` and the key `arrivals` of the file limit the
+    number of its frames.
     `controls`: requests of the viewer to the run.
     """
 
@@ -476,7 +477,7 @@ def _written(file: PipelineFile, work: Path, fps: float, result: RunResult) -> t
 
     Return (facts for the report, `result`). If a file of the run folder is incomplete, the returned `result` has a
     failure that says so.
-    `fps`: rate of the videos, in frames a second.
+    `file`: pipeline file of the run. `fps`: rate of the videos, in frames a second.
     Raises BadInputError for a broken journal, or for a path of a video that cannot be written.
     """
     segments = segments_of(file)

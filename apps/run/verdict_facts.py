@@ -47,9 +47,9 @@ NO_TRUTH: Final = "nothing to compare with: a pipeline of your own has no true p
 
 
 def verdict_of(report: Report, folder: str = "") -> Verdict:
-    """Return the verdict of the run with the given report.
+    """Return the verdict of a run.
 
-    `folder`: path of the run folder, which appears in commands that the verdict proposes; "" if unknown.
+    `report`: report of the run. `folder`: path of the run folder, which appears in commands that the verdict proposes; "" if unknown.
     """
     return judged(facts_of(report.as_json(), folder))
 

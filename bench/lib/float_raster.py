@@ -128,8 +128,8 @@ def _fragments(
 ) -> tuple[NDArray[np.int64], F64, NDArray[np.int64], F64]:
     """Return (pixel, depth, triangle, share) of all fragments: a fragment is one pixel that one triangle covers.
 
-    For P fragments, the arrays are the index of the pixel in row-major order (P,), z/w (P,), the number of the triangle
-    (P,), and the shares of the triangle's corners in the point (P,3).
+    Each array has a row for each of P fragments. `pixel` (P,): index of the pixel in row-major order. `depth` (P,): z/w
+    of the point. `triangle` (P,): number of the triangle. `share` (P,3): shares of the triangle's corners in the point.
     `corners`: result of `_target_corners` for the corners of each triangle, (F,3,4). `shape`, `cull`: see `rasterise`.
     """
     low, size = _boxes(corners, shape)

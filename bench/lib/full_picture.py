@@ -1,9 +1,10 @@
 """Pictures by the plan `full`, in which everything is modelled, and true pictures. Other plans are compared with both.
 
 Rule: the plan `full` is a second, slow implementation, as far as possible. The body has every weight and every blend
-shape in float64. A tensor pixel is the unrounded mean of SAMPLES x SAMPLES reads of the neural texture. Each avatar has a tensor of its own, whose size is near the size that its network was trained for. The tensor lies on
-the picture's grid: a pixel of the tensor covers a square of pixels of the picture, or the other way round. The network
-is in FP32. The network's picture is blended in linear light, in float64, over the run's own background.
+shape in float64. A tensor pixel is the unrounded mean of SAMPLES x SAMPLES reads of the neural texture. Each avatar has
+a tensor of its own, whose size is near the size that its network was trained for. The tensor lies on the picture's
+grid: a pixel of the tensor covers a square of pixels of the picture, or the other way round. The network is in FP32.
+The network's picture is blended in linear light, in float64, over the run's own background.
 
 A true picture shows the clothed body itself, drawn like a training sample. An avatar's network was trained to paint
 this picture. Therefore the true picture shows how good every plan is, including `full`. Only bundled avatars have true

@@ -3,8 +3,9 @@
 Rule: all pictures count alike, also pictures without a visible avatar. The PSNR over several pictures follows from the
 mean square error over all their pixels. Box figures only count the pixels in the boxes around avatars.
 
-Sources: Wang et al., "Image Quality Assessment", IEEE TIP 13 (2004), by scikit-image; Andersson et al., "FLIP: A
-Difference Evaluator for Alternating Images", HPG 2020, by its authors' flip-evaluator, at 67 pixels a degree.
+SSIM: Wang et al., "Image Quality Assessment", IEEE TIP 13 (2004), computed by scikit-image. FLIP: Andersson et al.,
+"FLIP: A Difference Evaluator for Alternating Images", HPG 2020, computed by the authors' package flip-evaluator, at 67
+pixels a degree.
 """
 
 from __future__ import annotations
