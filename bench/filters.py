@@ -39,13 +39,17 @@ def measure(sizes: tuple[int, ...] = (64, 128, 256, 512), repeats: int = 20) -> 
 
     `sizes`: sides of the tensors, pixels. `repeats`: number of timed draws of each filter.
 
-    `rows` has a row for each size and filter: `side`: side of the tensor, pixels. `filter`: name of the filter.
-    `raster_ms`: median time of a draw. `steps_mean`: mean absolute difference from the tensor of the filter `linear`,
-    in bytes, over the body's pixels. `psnr_db`: PSNR of the network's picture against ground truth; the network was
-    trained with `linear`.
+    `rows` has a row for each size and filter:
+    `side`: side of the tensor, pixels.
+    `filter`: name of the filter.
+    `raster_ms`: median time of a draw.
+    `steps_mean`: mean absolute difference from the tensor of the filter `linear`, in bytes, over the body's pixels.
+    `psnr_db`: PSNR of the network's picture against ground truth; the network was trained with `linear`.
 
-    Further keys: `sources`: source of the rows. `driver`: facts about the OpenGL driver. `config`: settings of the
-    bench.
+    Further keys:
+    `sources`: source of the rows.
+    `driver`: facts about the OpenGL driver.
+    `config`: settings of the bench.
 
     Raises BadInputError for an option out of range, MissingPartError if a library is not installed.
     """

@@ -56,23 +56,33 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 300, rounds
     `frames`: number of hand-overs of each variant and size in a round.
     `rounds`: number of rounds, in which all variants take part.
 
-    `rows` has a row for each variant (`way`) and size (`kib`). `frames`: number of hand-overs in all rounds. `p50_us`,
-    `p99_us`: percentiles of the time until every byte can be read. `read_p50_us`, `read_p99_us`: percentiles of the
-    time until every byte was read and checked. Each is the median of the rounds' percentiles. The keys with `_low_us`
-    and `_high_us` have its 95 % interval; with fewer than six rounds, the least and the largest percentile. With fewer
-    than 299 frames in a round, the p99 is null. `max_us`: longest time until every byte can be read. Before each hand-over, the consumer
-    waits at least 1 ms, as an idle unit does.
+    `rows` has a row for each variant (`way`) and size (`kib`).
+    `frames`: number of hand-overs in all rounds.
+    `p50_us`, `p99_us`: percentiles of the time until every byte can be read.
+    `read_p50_us`, `read_p99_us`: percentiles of the time until every byte was read and checked.
+    `max_us`: longest time until every byte can be read.
+    Each percentile is the median of the rounds' percentiles. The keys with `_low_us` and `_high_us` have its 95 %
+    interval; with fewer than six rounds, the least and the largest percentile. With fewer than 299 frames in a round,
+    the p99 is null. Before each hand-over, the consumer waits at least 1 ms, as an idle unit does.
 
-    Trilane has three variants. `slot through the scheduler`: as in a run, the message goes to the scheduler's process,
-    through the scheduler's core, and on to the next unit. `slot`: the message goes directly from process to process.
-    `slot, 256 KiB of it written`: the same, but most of the slot is not written, so the caches hardly change. The peers
-    are in their best form and have no scheduler. `iceoryx2`: a sample in place and an event. `zeromq`: a frame without
-    copies of its own. `pipe`: bytes through multiprocessing.Pipe into an array. `pickled queue`: multiprocessing.Queue.
+    Trilane has three variants.
+    `slot through the scheduler`: as in a run, the message goes to the scheduler's process, through the scheduler's
+    core, and on to the next unit.
+    `slot`: the message goes directly from process to process.
+    `slot, 256 KiB of it written`: the same, but most of the slot is not written, so the caches hardly change.
 
-    `absent`: reason for each peer that is not installed. `met`: whether p50 <= 150 us and p99 <= 500 us at the largest
-    size, by variant of Trilane; null without a p99. `p50_largest_over_smallest`: p50 at the largest size divided by p50
-    at the smallest, by variant of Trilane. `slower_us`: p50 of the peer minus p50 of `slot through the scheduler`, in
-    the same round; by peer and size, the interval of its median. `read_slower_us`: the same, until every byte was read.
+    The peers are in their best form, and have no scheduler.
+    `iceoryx2`: a sample is written in place, and an event wakes the consumer.
+    `zeromq`: the bytes are a ZeroMQ frame, which pyzmq itself does not copy.
+    `pipe`: the bytes go through multiprocessing.Pipe into an array.
+    `pickled queue`: the array goes through multiprocessing.Queue.
+
+    `absent`: reason for each peer that is not installed.
+    `met`: whether p50 <= 150 us and p99 <= 500 us at the largest size, by variant of Trilane; null without a p99.
+    `p50_largest_over_smallest`: p50 at the largest size divided by p50 at the smallest, by variant of Trilane.
+    `slower_us`: p50 of the peer minus p50 of `slot through the scheduler`, in the same round; by peer and size, the
+    interval of its median.
+    `read_slower_us`: the same, until every byte was read.
     `slower_than_slot_us`, `read_slower_than_slot_us`: the same, with `slot` in place of `slot through the scheduler`.
     `ahead`, `read_ahead`: whether the peer is slower than `slot through the scheduler` at every size, that is, whether
     all intervals lie above 0.
@@ -242,7 +252,7 @@ def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, in
 
 
 def _through_pipeline(size: int, frames: int) -> Times:
-    """Run `handoff_pipeline`, and return the times from the end of raster to the begin and to the end of infer, in µs.
+    """Run `handoff_pipeline`, and return (times from raster's end to infer's begin, times to infer's end), in µs.
 
     `size`: size of the slot in KiB. `frames`: number of frames. Raises TrilaneError if the run fails.
     """

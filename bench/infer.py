@@ -47,17 +47,26 @@ def measure(
 ) -> dict[str, Any]:
     """Measure how long each network takes on each runtime. Times are for one frame.
 
-    `rows` has a row for each network and runtime. A row has the network's settings, and: `parameters`: number of
-    parameters. `gmac`: 1e9 multiply-accumulates of a frame. `runtime`, `batch`: name of the runtime, and frames that it
-    infers at once; ONNX Runtime in FP32 always infers one frame at once. `startup_cold_ms`, `startup_warm_ms`: time to
-    import libraries and load the network, with an empty and with a filled cache. `frames`: number of inferred frames.
-    `min_ms`, `mean_ms`, `p50_ms`, `p90_ms`, `p99_ms`, `max_ms`: times over all periods. `periods`: least, mean and
-    largest time of each period. `temperature_c`: temperature of the machine's sensor; null if it cannot be read.
+    `rows` has a row for each network and runtime. A row has the network's settings, and:
+    `parameters`: number of parameters.
+    `gmac`: 1e9 multiply-accumulates of a frame.
+    `runtime`, `batch`: name of the runtime, and frames that it infers at once; ONNX Runtime in FP32 always infers one
+    frame at once.
+    `startup_cold_ms`, `startup_warm_ms`: time to import libraries and load the network, with an empty and with a filled
+    cache.
+    `frames`: number of inferred frames.
+    `min_ms`, `mean_ms`, `p50_ms`, `p90_ms`, `p99_ms`, `max_ms`: times over all periods.
+    `periods`: least, mean and largest time of each period.
+    `temperature_c`: temperature of the machine's sensor; null if it cannot be read.
 
-    Rows of INT8 networks also have: `int8_over_fp32`: speed divided by the speed of ONNX Runtime in FP32; null if there
-    is no float network. `share_of_roofline`: rate divided by the rate of the runtimes' best INT8 layer.
-    `share_of_instruction_peak`: rate divided by the peak of the instruction set; null if this peak is unknown. Both
-    peaks are measured just before; `roofline` has them. `config` has the settings of the bench.
+    Rows of INT8 networks also have:
+    `int8_over_fp32`: speed divided by the speed of ONNX Runtime in FP32; null if there is no float network.
+    `share_of_roofline`: rate divided by the rate of the runtimes' best INT8 layer.
+    `share_of_instruction_peak`: rate divided by the peak of the instruction set; null if this peak is unknown.
+
+    Further keys:
+    `roofline`: result of the bench `roofline`, which measures both peaks before the networks run.
+    `config`: settings of the bench.
 
     Raises BadInputError for an option out of range, or a network or avatar that cannot be read. Raises MissingPartError
     if a library is not installed, and TrilaneError if a process fails.

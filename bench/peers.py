@@ -53,9 +53,11 @@ def measure(
     `openvino_of_instruction_peak`: share of the peak of the instruction set; null if this peak is unknown.
 
     `low`, `high`: 95 % interval of each ratio's median; with fewer than six rounds, the least and the largest ratio.
-    `peaks`: the two peaks in words. `rows`: median time and number of runs of each variant (`way`). Each variant runs
-    for `seconds` in each round. `gmac`: 1e9 multiply-accumulates of the network. `roofline`: result of the bench
-    `roofline`. `config`: settings of the bench.
+    `peaks`: the two peaks in words.
+    `rows`: median time and number of runs of each variant (`way`). Each variant runs for `seconds` in each round.
+    `gmac`: 1e9 multiply-accumulates of the network.
+    `roofline`: result of the bench `roofline`.
+    `config`: settings of the bench.
 
     Raises BadInputError for a wrong size, MissingPartError without OpenVINO or PyTorch, TrilaneError if a variant's
     process fails.
@@ -127,7 +129,13 @@ def _variants(integer: Path, plain: Path, threads: int) -> dict[str, ProcessVari
 def _measure_rounds(
     variants: dict[str, ProcessVariant], integer: Path, threads: int, rounds: int, seconds: int
 ) -> dict[str, list[list[float]]]:
-    """Return the times of each variant's runs, ms, by round; for `benchmark_app`, only its own median."""
+    """Return the times of all runs in ms, by round, by variant.
+
+    For `benchmark_app`, each round has a single time, which is the median that the tool itself measures.
+    `variants`: variants of inference by name. `integer`: ONNX file for `benchmark_app`. `threads`: number of threads.
+    `rounds`: number of rounds. `seconds`: time for which each variant runs in a round.
+    Raises TrilaneError if a process fails, MissingPartError if `benchmark_app` is not installed.
+    """
     times: dict[str, list[list[float]]] = {name: [] for name in (*variants, APP)}
     with runners(variants) as by_name:
         for _ in range(rounds):
@@ -138,7 +146,11 @@ def _measure_rounds(
 
 
 def _benchmark_app(network: Path, threads: int, seconds: int) -> float:
-    """Return the median latency that OpenVINO's tool measures, ms, with one request at a time."""
+    """Return the median latency in ms that OpenVINO's tool `benchmark_app` measures, with one request at a time.
+
+    `network`: ONNX file. `threads`: number of threads. `seconds`: time for which the tool runs.
+    Raises MissingPartError if the tool is not installed, TrilaneError if it fails.
+    """
     tool = machine.here.program(APP, first=Path(sys.executable).parent)
     if tool is None:
         raise MissingPartError(f"{APP} is not there", extra="openvino")

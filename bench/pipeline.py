@@ -76,29 +76,38 @@ def measure(
 ) -> dict[str, Any]:
     """Measure the avatar's pipeline for each avatar, size, number of cores, policy and edge.
 
-    `rows` has a row for each of these settings. Its figures are medians over the `rounds`. `frame_ms`, `fps`: frame
-    time and rate. `latency_p50_ms`, `latency_p99_ms`: percentiles of the latency, over the presented frames of all
-    rounds; with fewer than 299 frames, the p99 is null. `efficiency`: CPU time of the slowest unit for a frame, divided
-    by the frame time. `slowest`: unit that takes longest for a frame in the `sequential` runs before and after.
-    `alone_ms`: this time, without the time in which the unit had no core. `busiest`: unit with the most work in this
-    run. `idle`: share of time without a job, between the first and the last job of `busiest`. The causes of this share
-    are `starved` (no input), `undispatched` (input, but no free slot, or not dispatched yet) and `overhead`
-    (dispatched, but not begun).
+    `rows` has a row for each of these settings. Its figures are medians over the `rounds`.
+    `frame_ms`, `fps`: frame time and rate.
+    `latency_p50_ms`, `latency_p99_ms`: percentiles of the latency, over the presented frames of all rounds; with fewer
+    than 299 frames, the p99 is null.
+    `efficiency`: CPU time of the slowest unit for a frame, divided by the frame time.
+    `slowest`: unit that takes longest for a frame in the `sequential` runs before and after.
+    `alone_ms`: this time, without the time in which the unit had no core.
+    `busiest`: unit with the most work in this run.
+    `idle`: share of time without a job, between the first and the last job of `busiest`. The causes of this share are
+    `starved` (no input), `undispatched` (input, but no free slot, or not dispatched yet) and `overhead` (dispatched,
+    but not begun).
 
-    `gain`: mean frame time of the `sequential` runs before and after, divided by `frame_ms`. `bound`: largest possible
-    gain, which is (`all_alone_ms` + `hops_ms` of those runs) / `alone_ms`. `all_alone_ms`: time of all units for a
-    frame in those runs. `hops_ms`: frame time of a sequential run minus the times of its stages, which is the time of
-    hand-overs; null for other runs. `in_run_over_alone`: time of the unit `slowest` in this run, without the time in
-    which it had no core, divided by `alone_ms`. `gain_of_bound`: `gain` divided by `bound`. `of_bound_low`,
-    `of_bound_high`: its 95 % interval; with fewer than six rounds, the least and the largest. `dropped`, `lost`:
-    numbers of frames in all rounds. `accuracy`: image error of each avatar and its source, or why there are no figures.
+    `gain`: mean frame time of the `sequential` runs before and after, divided by `frame_ms`.
+    `bound`: largest possible gain, which is (`all_alone_ms` + `hops_ms` of those runs) / `alone_ms`.
+    `all_alone_ms`: time of all units for a frame in those runs.
+    `hops_ms`: frame time of a sequential run minus the times of its stages, which is the time of hand-overs; null for
+    other runs.
+    `in_run_over_alone`: time of the unit `slowest` in this run, without the time in which it had no core, divided by
+    `alone_ms`.
+    `gain_of_bound`: `gain` divided by `bound`.
+    `of_bound_low`, `of_bound_high`: its 95 % interval; with fewer than six rounds, the least and the largest.
+    `dropped`, `lost`: numbers of frames in all rounds.
+    `accuracy`: image error of each avatar and its source, or why there are no figures.
 
     If `beside` names a second avatar, of the size `beside_size`, two `pipelined` runs go on at once on the same cores.
-    Each has its own scheduler and units. In this case, `rows` has a row for each run. `frame_ms`: mean frame time while
-    both ran. `isolated_ms`: time of the stages for a frame, in sequential runs before and after. `virtual_ms`: frame
-    time that the virtual clock computes from these times. `ratio`: measured frame time divided by the computed one;
-    `ratio_low`, `ratio_high`: its 95 % interval. `strangers`: time for which stages had no core in the sequential runs,
-    divided by the time for which they worked. If it is above a few hundredths, the ratio says nothing.
+    Each has its own scheduler and units. In this case, `rows` has a row for each run.
+    `frame_ms`: mean frame time while both ran.
+    `isolated_ms`: time of the stages for a frame, in sequential runs before and after.
+    `virtual_ms`: frame time that the virtual clock computes from these times.
+    `ratio`: measured frame time divided by the computed one; `ratio_low`, `ratio_high`: its 95 % interval.
+    `strangers`: time for which stages had no core in the sequential runs, divided by the time for which they worked. If
+    it is above a few hundredths, the ratio says nothing.
 
     Raises BadInputError for an option out of range, MissingPartError if a library is not installed, TrilaneError if a
     run fails.

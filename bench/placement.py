@@ -53,26 +53,34 @@ def measure(
 ) -> dict[str, Any]:
     """Measure the frame times of all placements, and compare the chosen placement with the others.
 
-    `rows` has a row for each size, number of cores and placement: `predicted_ms`: predicted frame time. `tried_ms`:
-    median frame time of `rounds` rounds with all placements; a placement runs 16 frames in a round, and the last 10
-    count. `frame_ms`: median frame time of the `further` rounds; null for a placement without further rounds. These
-    rounds have the chosen placement, the rule's placement, and the `finalists` fastest of the others. `is_chosen`,
-    `is_rule`: whether the placement is the chosen one, or the rule's.
+    `rows` has a row for each size, number of cores and placement:
+    `predicted_ms`: predicted frame time.
+    `tried_ms`: median frame time of `rounds` rounds with all placements; a placement runs 16 frames in a round, and the
+    last 10 count.
+    `frame_ms`: median frame time of the `further` rounds; null for a placement without further rounds. These rounds
+    have the chosen placement, the rule's placement, and the `finalists` fastest of the others.
+    `is_chosen`, `is_rule`: whether the placement is the chosen one, or the rule's.
 
-    `sizes` has a row for each size and number of cores. `chosen`, `best`, `rule`: the chosen, the fastest and the
-    rule's placement, in words. `how`: reason of the choice: the run's own trial, or the prediction.
+    `sizes` has a row for each size and number of cores.
+    `chosen`, `best`, `rule`: the chosen, the fastest and the rule's placement, in words.
+    `how`: reason of the choice: the run's own trial, or the prediction.
     `chosen_over_best`: frame time of the chosen placement divided by the frame time of the best other placement. It is
-    the median over the further rounds; up to 1, the chosen placement is the best. `low`, `high`: its 95 % interval;
-    with fewer than six rounds, the least and the largest. `rule_over_chosen`: frame time of the rule's placement divided by
-    the frame time of the chosen placement. `rule_low`, `rule_high`: its 95 % interval. `rank_correlation`: Spearman's
-    rank correlation of the predicted and the tried times of all placements. `predicted_over_tried`, `predicted_least`,
-    `predicted_largest`: median, least and largest ratio of these times. `others`: share of the cores that other
-    programs had in the further rounds; above a tenth, the row says little. `run_ms`, `efficiency`,
-    `machine_efficiency`: medians of `runs` whole runs of `frames` frames with the chosen placement. `rule_run_ms`,
-    `rule_machine_efficiency`: the same with the rule's placement. `took_s`: time of a run's rehearsal and trial.
+    the median over the further rounds; up to 1, the chosen placement is the best.
+    `low`, `high`: its 95 % interval; with fewer than six rounds, the least and the largest.
+    `rule_over_chosen`: frame time of the rule's placement divided by the frame time of the chosen placement.
+    `rule_low`, `rule_high`: its 95 % interval.
+    `rank_correlation`: Spearman's rank correlation of the predicted and the tried times of all placements.
+    `predicted_over_tried`, `predicted_least`, `predicted_largest`: median, least and largest ratio of these times.
+    `others`: share of the cores that other programs had in the further rounds; above a tenth, the row says little.
+    `run_ms`, `efficiency`, `machine_efficiency`: medians of `runs` whole runs of `frames` frames with the chosen
+    placement.
+    `rule_run_ms`, `rule_machine_efficiency`: the same with the rule's placement.
+    `took_s`: time of a run's rehearsal and trial.
 
-    `times`: measured times of the rehearsal. `virtual`: frame times for other numbers of cores, which the scheduler
-    computes in virtual time with the profile `host`. `config`: settings of the bench.
+    `times`: measured times of the rehearsal.
+    `virtual`: frame times for other numbers of cores, which the scheduler computes in virtual time with the profile
+    `host`.
+    `config`: settings of the bench.
 
     Raises BadInputError for an option out of range, MissingPartError if a library is not installed, TrilaneError if a
     run fails.

@@ -80,19 +80,28 @@ def measure(
 ) -> dict[str, Any]:
     """Compare a planned run with a run of a fixed tensor in each scene, by speed and by image error.
 
-    `scenes` has an entry for each scene: `name`: name of the scene. `fixed_ms`, `planned_ms`: median frame times.
-    `speedup`: fixed frame time divided by planned frame time, as the median over the rounds. `speedup_low`,
-    `speedup_high`: its 95 % interval; with fewer than six rounds, the least and the largest. `placements`: cores of the
-    units and the reason for them, by plan. `psnr_fixed_db`, `psnr_planned_db`, `ssim_*`, `flip_*`: image errors against
-    the plan `full`; PSNR follows from the mean square over all compared frames. The same keys after `box_`: errors in
-    the avatars' rectangles; null if no avatar is in view. `truth`: the same errors, also of the plan `full`, against
-    the clothed body that a bundled avatar was trained on; null for other avatars. `network`: source of the network of
-    `full`. `tensors`: sizes of planned tensors. `by_frame`: errors of single frames against the truth; null without a
-    truth.
+    `scenes` has an entry for each scene:
+    `name`: name of the scene.
+    `fixed_ms`, `planned_ms`: median frame times.
+    `speedup`: fixed frame time divided by planned frame time, as the median over the rounds.
+    `speedup_low`, `speedup_high`: its 95 % interval; with fewer than six rounds, the least and the largest.
+    `placements`: cores of the units and the reason for them, by plan.
+    `psnr_fixed_db`, `psnr_planned_db`, `ssim_*`, `flip_*`: image errors against the plan `full`; PSNR follows from the
+    mean square over all compared frames. The same keys after `box_`: errors in the avatars' rectangles; null if no
+    avatar is in view.
+    `truth`: the same errors, also of the plan `full`, against the clothed body that a bundled avatar was trained on;
+    null for other avatars.
+    `network`: source of the network of `full`.
+    `tensors`: sizes of planned tensors.
+    `by_frame`: errors of single frames against the truth; null without a truth.
 
-    Further keys, over all scenes: `median_speedup`, `least_speedup`: median and least speedup. `largest_loss_db`:
-    largest PSNR of fixed minus PSNR of planned. `worst_loss_db`: the same for the worst frame of each plan; null
-    without a truth. `sources`: source of the figures. `driver`: facts about the OpenGL driver. `config`: settings.
+    Further keys, over all scenes:
+    `median_speedup`, `least_speedup`: median and least speedup.
+    `largest_loss_db`: largest PSNR of fixed minus PSNR of planned.
+    `worst_loss_db`: the same for the worst frame of each plan; null without a truth.
+    `sources`: source of the figures.
+    `driver`: facts about the OpenGL driver.
+    `config`: settings.
 
     Raises BadInputError for an option out of range or a wrong scene, MissingPartError if a library is not installed,
     TrilaneError if a run fails.
@@ -152,8 +161,9 @@ class _Scene:
     def __init__(self, name: str, frames: int, runtime: str, *, video: bool) -> None:
         """Configure both plans.
 
-        `name`: name or file of the scene. `frames`: largest number of frames of a run. `runtime`: runtime of the networks. `video`: whether a video is
-        encoded. Raises BadInputError for a scene that cannot be read, MissingPartError if a library is not installed.
+        `name`: name or file of the scene. `frames`: largest number of frames of a run. `runtime`: runtime of the
+        networks. `video`: whether a video is encoded.
+        Raises BadInputError for a scene that cannot be read, MissingPartError if a library is not installed.
         """
         asked = RunOptions(scene=name, runtime=runtime, hud=False)
         checked = in_frames(configure(asked, Path.cwd()).changed(record=video), frames)

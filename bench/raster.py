@@ -34,10 +34,13 @@ def measure(size: int = 512, channels: int = 16, repeats: int = 40, threads: int
     """Measure the time to draw one tensor and read it back to host memory, in ms, by variant.
 
     `raster_ms`: median time of the stage raster as in a run on this driver. With a software driver, the CPU unit skins
-    the body, and the time of skinning does not count. `packed_ms`, `split_ms`: median times of the packed pass and of the split
-    passes. `ratios`: `split_over_packed`, the second of these times divided by the first. `rows`: median, minimum and
-    90th percentile of each variant (`way`) over `repeats` draws. `covered`: share of the pixels that the body covers.
-    `driver`: facts about the OpenGL driver. `config`: settings of the bench.
+    the body, and the time of skinning does not count.
+    `packed_ms`, `split_ms`: median times of the packed pass and of the split passes.
+    `ratios`: `split_over_packed`, the second of these times divided by the first.
+    `rows`: median, minimum and 90th percentile of each variant (`way`) over `repeats` draws.
+    `covered`: share of the pixels that the body covers.
+    `driver`: facts about the OpenGL driver.
+    `config`: settings of the bench.
 
     Raises BadInputError for an option out of range, MissingPartError if a library is not installed, TrilaneError if the
     variants give different bytes.

@@ -34,15 +34,21 @@ def measure(
 ) -> dict[str, Any]:
     """Measure how long each variant takes to move pixels, by size and number of channels.
 
-    `rows` has a row for each variant, size and number of channels: `kind`: readback or upload. `size`: side of the
-    square tensor or picture. `channels`: number of channels. `way`: name of the variant. `lag`: how many frames later
-    the bytes arrive. `move`: time to move the bytes with an idle GPU; for an upload, also to copy them to another
-    framebuffer. `turn`, only for readbacks: time to draw the tensor and move the bytes. Times have median, minimum and
-    90th percentile in ms.
+    `rows` has a row for each variant, size and number of channels:
+    `kind`: readback or upload.
+    `size`: side of the square tensor or picture.
+    `channels`: number of channels.
+    `way`: name of the variant.
+    `lag`: how many frames later the bytes arrive.
+    `move`: time to move the bytes with an idle GPU; for an upload, also to copy them to another framebuffer.
+    `turn`, only for readbacks: time to draw the tensor and move the bytes.
+    Each time has median, minimum and 90th percentile in ms.
 
     `fastest`: variant with the smallest sum of medians, by kind. On a hardware driver, the medians of `turn` count for
-    readbacks; in all other cases, the medians of `move` count. `driver`: facts about the OpenGL driver. `time_source`:
-    clock of the times. `config`: settings of the bench.
+    readbacks; in all other cases, the medians of `move` count.
+    `driver`: facts about the OpenGL driver.
+    `time_source`: clock of the times.
+    `config`: settings of the bench.
 
     Raises MissingPartError without OpenGL, TrilaneError if the variants give different bytes.
     """

@@ -41,13 +41,17 @@ COPY_BYTES = 128 << 20
 
 
 def measure(threads: int = 0) -> dict[str, Any]:
-    """Measure the best rates of this machine with `threads` threads; 0 means one for each core that it may use.
+    """Measure the best rates of this machine with `threads` threads; 0: one for each core that this process may use.
 
-    Rates are in 1e9 multiply-accumulates a second. `threads`: number of threads. `int8_gmac_s`: rate of the best INT8
-    layer of the runtimes. `int8_instruction_gmac_s`: peak of the instruction set; null if unknown.
-    `layer_of_instruction`: `int8_gmac_s` divided by this peak; null if unknown. `fp32_gmac_s`: rate of an FP32 matrix
-    product. `memory_gb_s`: bytes that one thread reads and writes, in 1e9 bytes a second. `instructions`: derivation of
-    the instruction set's peak, or `absent` with the reason. `rows`: rate of each INT8 layer that was tried.
+    Rates are in 1e9 multiply-accumulates a second.
+    `threads`: number of threads.
+    `int8_gmac_s`: rate of the best INT8 layer of the runtimes.
+    `int8_instruction_gmac_s`: peak of the instruction set; null if unknown.
+    `layer_of_instruction`: `int8_gmac_s` divided by this peak; null if unknown.
+    `fp32_gmac_s`: rate of an FP32 matrix product.
+    `memory_gb_s`: bytes that one thread reads and writes, in 1e9 bytes a second.
+    `instructions`: derivation of the instruction set's peak, or `absent` with the reason.
+    `rows`: rate of each INT8 layer that was tried.
     """
     threads = threads or len(machine.here.cores())
     rows = _int8_rows(threads)

@@ -49,19 +49,26 @@ def measure(
 ) -> dict[str, Any]:
     """Measure one run of the avatar's pipeline for each scenario and each `judge`.
 
-    The judge evaluates the run: `trilane`, or `loadgen` of MLCommons. Scenarios: `single-stream`: the next query comes
-    after each answer. `multi-stream`: the same, with `samples` frames in a query. `server`: `rate` queries a second
-    come at random moments, and each is late after `limit_ms`. `offline`: all queries come at once.
+    The judge evaluates the run: `trilane`, or `loadgen` of MLCommons. There are four scenarios:
+    `single-stream`: the next query comes after each answer.
+    `multi-stream`: the same, with `samples` frames in a query.
+    `server`: `rate` queries a second come at random moments, and each is late after `limit_ms`.
+    `offline`: all queries come at once.
 
-    `rows` has a row for each run: `scenario`, `judge`. `verdict`: VALID or INVALID. A run is valid if it lasted
-    `seconds`, had as many queries as its percentile needs and, for a server, had few enough late answers. `because`:
-    reasons why the run is invalid, by the judge `trilane`. `queries`, `seconds`, `rate`: number of queries, duration,
-    and queries a second. `p50_ms`, `max_ms`: median and largest latency of the queries. `percentile`: share of the
-    queries that is judged. `percentile_ms`: latency that this share of all queries does not exceed; null for too few
-    queries.
+    `rows` has a row for each run:
+    `scenario`, `judge`: scenario and judge of the run.
+    `verdict`: VALID or INVALID. A run is valid if it lasted `seconds`, had as many queries as its percentile needs and,
+    for a server, had few enough late answers.
+    `because`: reasons why the run is invalid, by the judge `trilane`.
+    `queries`, `seconds`, `rate`: number of queries, duration, and queries a second.
+    `p50_ms`, `max_ms`: median and largest latency of the queries.
+    `percentile`: share of the queries that is judged.
+    `percentile_ms`: latency that this share of all queries does not exceed; null for too few queries.
 
-    Further keys: `summaries`: LoadGen's summaries. `accuracy`: image error of the avatar. `config`: settings of the
-    bench.
+    Further keys:
+    `summaries`: LoadGen's summaries.
+    `accuracy`: image error of the avatar.
+    `config`: settings of the bench.
 
     Raises BadInputError for an option out of range, MissingPartError if a library is not installed, TrilaneError if a
     run fails.

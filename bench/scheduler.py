@@ -49,21 +49,28 @@ def measure(minutes: float = 15.0, rounds: int = 7, seeds: int = 10, events: str
     `seeds`: number of seeds for which repeats of a run are compared.
     `events`: run folder, or events.jsonl, to replay; "" for no replay.
 
-    Variants: `trilane` makes its report; `trilane, no report` does not; `trilane, recorded` also keeps a recording.
-    `simpy` is a model of SimPy's own parts: processes and resources. `simpy lean` is a model with callbacks and one
-    timeout for each job. Both models keep no accounts, and know no faults, policies or drops.
+    Three variants are Trilane's scheduler. `trilane` makes the report of the run; `trilane, no report` does not;
+    `trilane, recorded` also keeps a recording. Two variants are models in SimPy. `simpy` uses SimPy's own parts:
+    processes and resources. `simpy lean` has callbacks, and one timeout for each job. Both models keep no accounts, and
+    know no faults, policies or drops.
 
-    `rows` has a row for each variant (`way`): `frames`: number of frames. `events`: number of releases of frames and of
-    ends of jobs, which is the same for all variants. `seconds`: median CPU time of a run. `seconds_low`,
-    `seconds_high`: its 95 % interval; with fewer than six rounds, the least and the largest. `events_per_s`: `events`
-    divided by `seconds`. `processed`: number of events by the variant's own count; SimPy needs several for a job.
+    `rows` has a row for each variant (`way`):
+    `frames`: number of frames.
+    `events`: number of releases of frames and of ends of jobs, which is the same for all variants.
+    `seconds`: median CPU time of a run.
+    `seconds_low`, `seconds_high`: its 95 % interval; with fewer than six rounds, the least and the largest.
+    `events_per_s`: `events` divided by `seconds`.
+    `processed`: number of events by the variant's own count; SimPy needs several for a job.
 
     `over_trilane`: seconds of each variant divided by the seconds of `trilane` in the same round, as median and
-    interval; below 1, the variant is faster. `over_simpy`, `over_simpy_lean`: the medians for `simpy` and `simpy lean`.
-    `agree`: number of frames that all variants present at the same nanosecond; these are all frames. `same_traces`:
-    number of seeds for which 10 repeats of a run give the same trace; a unit dies in each of these runs.
-    `different_traces`: number of different traces among the seeds. `replay`: number of `steps` in `events`, number of
-    steps to which the scheduler now answers differently, and the `first` of these. `absent`: why SimPy is not measured.
+    interval; below 1, the variant is faster.
+    `over_simpy`, `over_simpy_lean`: the medians for `simpy` and `simpy lean`.
+    `agree`: number of frames, which all variants present at the same nanosecond; null without SimPy.
+    `same_traces`: number of seeds for which 10 repeats of a run give the same trace; a unit dies in each of these runs.
+    `different_traces`: number of different traces among the seeds.
+    `replay`: number of `steps` in `events`, number of steps to which the scheduler now answers differently, and the
+    `first` of these.
+    `absent`: why SimPy is not measured.
 
     Raises BadInputError for an option out of range and for `events` that is no recording. Raises TrilaneError if a
     model presents a frame at another time.

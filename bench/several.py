@@ -60,13 +60,18 @@ def measure(
 
     The tensor has `avatars` copies of the avatar. It is drawn at `views` moments of a scene.
 
-    `rows` has a row for each margin: `margin`: pixels of the tensor between two avatars. `loss_db_median`,
-    `loss_db_worst`: PSNR without neighbours minus PSNR with neighbours, in dB. `psnr_db_alone`: median PSNR without
-    neighbours. `bytes_mean`, `bytes_max`: mean and largest difference of the two pictures in an avatar's cell, in
-    bytes. `cell_height`: median height of a cell in tensor pixels.
+    `rows` has a row for each margin:
+    `margin`: pixels of the tensor between two avatars.
+    `loss_db_median`, `loss_db_worst`: PSNR without neighbours minus PSNR with neighbours, in dB.
+    `psnr_db_alone`: median PSNR without neighbours.
+    `bytes_mean`, `bytes_max`: mean and largest difference of the two pictures in an avatar's cell, in bytes.
+    `cell_height`: median height of a cell in tensor pixels.
 
-    Further keys: `bound_db`: largest loss that is acceptable. `margin_px`: margin of a run. `sources`: source of the
-    rows. `config`: settings of the bench.
+    Further keys:
+    `bound_db`: largest acceptable loss of PSNR, in dB.
+    `margin_px`: margin of a run.
+    `sources`: source of the rows.
+    `config`: settings of the bench.
 
     Raises BadInputError for an option out of range, MissingPartError if a library is not installed.
     """

@@ -70,7 +70,10 @@ def pace_of(config: RunConfig, profile: str, slow_motion: float = 1.0) -> Pace:
 
 
 def release_fps(pace: Pace, scene_fps: float) -> float:
-    """Return the rate at which a paced policy releases frames: `scene_fps`, divided by the slow motion."""
+    """Return the rate at which a paced policy releases frames, in frames a second.
+
+    The rate is `scene_fps`, the rate of the scene, divided by the factor of the slow motion.
+    """
     return scene_fps / pace.slow_motion
 
 

@@ -211,8 +211,9 @@ class UnitTime(Record):
 class PlacementFacts(Record):
     """The placement of the units, and how it was chosen (`trilane.stages.placing`).
 
-    `how`: way in which the placement was chosen: `tried` and `measured` by measurements, `asked` by the user, or `rule`
-    by the rule for any run. `why`: reason in words.
+    `how`: way in which the placement was chosen. `tried`: by a trial with real frames. `measured`: by predictions from
+    measured times. `asked`: by the user. `rule`: by the rule for any run.
+    `why`: reason in words.
     `units`: place of each unit, by name.
     `measured_at`: time of the measurement, UTC. This field and all fields below are absent if nothing was measured.
     `predicted_ms`: predicted frame time under the run's policy.

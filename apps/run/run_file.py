@@ -161,9 +161,9 @@ def picture_size(pipeline: Pipeline) -> dict[str, dict[str, int]]:
 
 
 def with_window(pipeline: Pipeline, window: Path) -> Pipeline:
-    """Return `pipeline`, but with a first block `encode` that also shows the newest picture in the file `window`.
+    """Return a copy of `pipeline` whose first block `encode` also shows the newest picture in the file `window`.
 
-    Without a block `encode`, nothing changes.
+    Without a block `encode`, the copy equals `pipeline`.
     """
     name = next((stage.name for stage in pipeline.stages if stage.factory == ENCODE), "")
     stages = tuple(

@@ -151,9 +151,10 @@ class RunFolder:
             raise TrilaneError(f"{failed}; {left}") from error
 
     def _unwritten(self, error: BaseException | None) -> str:
-        """Return a text that says which file could not be written, and why; "" if `error` has another cause.
+        """Return a text that says which file could not be written, and why.
 
-        `error`: exception that ended the block; None if no exception did.
+        `error`: exception that ended the `with` block; None if no exception did. For None, and for an exception with
+        another cause, the text is "".
         """
         if isinstance(error, UnwrittenError):
             return str(error)

@@ -49,7 +49,8 @@ NO_TRUTH: Final = "nothing to compare with: a pipeline of your own has no true p
 def verdict_of(report: Report, folder: str = "") -> Verdict:
     """Return the verdict of a run.
 
-    `report`: report of the run. `folder`: path of the run folder, which appears in commands that the verdict proposes; "" if unknown.
+    `report`: report of the run. `folder`: path of the run folder, which appears in commands that the verdict proposes;
+    "" if unknown.
     """
     return judged(facts_of(report.as_json(), folder))
 
@@ -159,7 +160,7 @@ def _image(document: Mapping[str, Any]) -> str:
     """Return a text on the image error of a run.
 
     If the run's frames were checked, the text has their error. If they were not, it has the error from the validation
-    of the worst avatar.
+    of the worst avatar, or says that the error is unknown. `document`: mapping with the known keys of report.json.
     """
     avatars = document.get("accuracy") or {}
     if check := document.get("check"):

@@ -94,7 +94,8 @@ class AvatarFrames:
     def __init__(self, checked: Checked, units: Units | None = None) -> None:
         """Build the stages.
 
-        `checked`: configuration of a run. `units`: contexts of another object in this process, which this object then shares; None for new contexts.
+        `checked`: configuration of a run.
+        `units`: contexts of another object in this process, which this object then shares; None for new contexts.
         Raises BadInputError if a file cannot be read, MissingPartError if a library is not installed.
         """
         pipeline = avatar_pipeline(checked.config, checked.assets)
