@@ -362,7 +362,10 @@ class HandoffStage:
         self._inputs, self._outputs = inputs, outputs
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
-        """Run a job: `pose` pauses, `raster` writes, `infer` reads. Raises TrilaneError for wrong bytes."""
+        """Run a job: `pose` pauses, `raster` writes, `infer` reads. Raises TrilaneError if `infer` reads wrong bytes.
+
+        `frame`: number of the frame. `slot_in`, `slot_out`: numbers of the slots to read and to write; None for none.
+        """
         if self._name == STAGES[0][0]:
             time.sleep(PAUSE_S)
         elif self._name == WRITER and slot_out is not None:

@@ -162,7 +162,10 @@ class _Trial:
                 self._runs[of].append(self._run(self._found[place].placement))
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return the row of `rows` in `measure` for each placement, the shortest predicted frame time first."""
+        """Return a row of `measure` for each placement, the shortest predicted frame time first.
+
+        If the predictions do not consider the rule's placement, its row is the last.
+        """
         return [
             {
                 "placement": described(each.placement),

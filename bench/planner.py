@@ -153,7 +153,7 @@ class _Moment:
 
 
 class _Scene:
-    """Runs and compares one scene by both plans.
+    """One scene, which is run and compared by both plans.
 
     `name`: name of the scene. `driver`: facts about the OpenGL driver; empty before `compare`.
     """

@@ -369,7 +369,8 @@ KERNELS = {
 class Issued:
     """Measured rates, as means over the cores.
 
-    `rate`: sequences a cycle of one core. `clock_ghz`: clock. `clock_low_ghz`, `clock_high_ghz`: its 95 % interval.
+    `rate`: sequences (see `InstructionSet`) that one core issues in a cycle. `clock_ghz`: clock. `clock_low_ghz`,
+    `clock_high_ghz`: 95 % interval of the clock.
     """
 
     rate: float

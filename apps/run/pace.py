@@ -40,7 +40,7 @@ class Pace:
 
     `profile`: hardware profile of the chip, by name. `performance_profile`: performance profile of the chip.
     `slow_motion`: factor by which the run is slower than the chip.
-    `stage_ns`: time to which a job of each stage is stretched, ns.
+    `stage_ns`: time in ns to which a job is stretched, by stage.
     """
 
     profile: str

@@ -187,8 +187,8 @@ def cores_of(file: PipelineFile, cores: Sequence[int]) -> dict[str, UnitSettings
     """Return the cores and the number of threads of each unit of `file`, by the unit's name.
 
     A unit whose cores the file does not state gets a share of `cores`. These units get one core each, in the order of
-    the stages. Remaining cores go to those of them with networks, in turn. If there are too few cores, units share
-    cores. A unit whose threads the file does not state has one thread for each of its cores.
+    the stages. Remaining cores go to the units among them that run networks, in turn. If there are too few cores, units
+    share cores. A unit whose threads the file does not state has one thread for each of its cores.
     `cores`: numbers of the cores that this process may use.
     Raises BadInputError for a core in the file that is not in `cores`.
     """

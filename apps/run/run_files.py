@@ -162,7 +162,7 @@ def _frame_numbers(segment: Path) -> list[int]:
 
 
 def _digest_lines(path: Path) -> list[str]:
-    """Return the complete lines of a digest file, because a truncated file may end with half a line."""
+    """Return the lines of the digest file `path`, without the last line if it is incomplete in a truncated file."""
     return [line for line in path.read_text(encoding="ascii").splitlines(keepends=True) if line.endswith("\n")]
 
 

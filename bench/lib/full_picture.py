@@ -139,7 +139,10 @@ class FullPictures:
         return sorted({avatar.network for avatar in self._avatars.values()})
 
     def frame(self, number: int, background: U8) -> U8:
-        """Return frame `number` over its `background` (h,w,3): (h,w,3) uint8, sRGB."""
+        """Return the picture (h,w,3) uint8 sRGB of frame `number` by the plan `full`.
+
+        `background`: picture (h,w,3) uint8 sRGB of the same frame without avatars.
+        """
         return blended(background, [self._layer(seen) for seen in self._cast.seen(number)])
 
     def _layer(self, seen: CastView) -> RasterLayer:
@@ -211,7 +214,10 @@ class TruePictures:
         self._clothed = {folder: _clothed(data, ctx) for folder, data in cast.avatars.items()}
 
     def frame(self, number: int, background: U8) -> U8:
-        """Return frame `number` over its `background` (h,w,3): (h,w,3) uint8, sRGB."""
+        """Return the true picture (h,w,3) uint8 sRGB of frame `number`.
+
+        `background`: picture (h,w,3) uint8 sRGB of the same frame without avatars.
+        """
         return blended(background, self.layers(number))
 
     def layers(self, number: int) -> list[RasterLayer]:

@@ -162,7 +162,10 @@ def _timed(runs: Runs, count: int) -> list[float]:
 
 
 def _runtime(variant: ProcessVariant) -> Runs:
-    """Return calls of a Trilane runtime. As in a run, the arrays of each slot are bound once."""
+    """Return an endless iterator of calls, each of which infers once with the Trilane runtime of `variant`.
+
+    As in a run, the arrays of each slot are bound once.
+    """
     from trilane.avatars.network_file import read_network
     from trilane.bench.lib.networks import random_tensors
     from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
@@ -182,7 +185,10 @@ def _runtime(variant: ProcessVariant) -> Runs:
 
 
 def _ort_default(variant: ProcessVariant) -> Runs:
-    """Return calls as in ONNX Runtime's introductory example: a session with defaults, whose `run` gets an array."""
+    """Return an endless iterator of calls, each of which infers once as in ONNX Runtime's introductory example.
+
+    The session has the library's defaults, except for the threads of `variant`, and its `run` gets an array.
+    """
     import onnxruntime
 
     settings = onnxruntime.SessionOptions()
@@ -200,7 +206,10 @@ def _ort_default(variant: ProcessVariant) -> Runs:
 
 
 def _openvino_default(variant: ProcessVariant) -> Runs:
-    """Return calls as in OpenVINO's introductory example: the file is compiled, and each call gets an array."""
+    """Return an endless iterator of calls, each of which infers once as in OpenVINO's introductory example.
+
+    The file is compiled with the library's defaults, except for the threads of `variant`. Each call gets an array.
+    """
     from trilane.stages.dsp.runtime import quiet_openvino
 
     openvino = quiet_openvino()

@@ -1,6 +1,7 @@
 """The networks that the inference benches run: untrained, with the shapes and operators of trained networks.
 
-Rule: weights and inputs are random and the same every time. The time of a network does not depend on them.
+Rule: weights and inputs are random, and the same every time. The time that a network takes does not depend on their
+values.
 """
 
 from __future__ import annotations
