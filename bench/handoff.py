@@ -80,12 +80,12 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 300, rounds
     `absent`: reason for each peer that is not installed.
     `met`: whether p50 <= 150 us and p99 <= 500 us at the largest size, by variant of Trilane; null without a p99.
     `p50_largest_over_smallest`: p50 at the largest size divided by p50 at the smallest, by variant of Trilane.
-    `slower_us`: p50 of the peer minus p50 of `slot through the scheduler`, in the same round; by peer and size, the
-    interval of its median.
-    `read_slower_us`: the same, until every byte was read.
+    `slower_us`: p50 of the peer minus p50 of `slot through the scheduler` in the same round. The value is the 95 %
+    interval of the median over the rounds, by peer and size.
+    `read_slower_us`: the same for the times until every byte was read.
     `slower_than_slot_us`, `read_slower_than_slot_us`: the same, with `slot` in place of `slot through the scheduler`.
-    `ahead`, `read_ahead`: whether the peer is slower than `slot through the scheduler` at every size, that is, whether
-    all intervals lie above 0.
+    `ahead`, `read_ahead`: whether the peer is slower than `slot through the scheduler` at every size, by peer. All
+    intervals of the peer must lie above 0.
 
     Raises BadInputError for other sizes, fewer than 10 frames or no round, TrilaneError if a process or a run fails.
     """
@@ -168,8 +168,8 @@ class ChannelPair:
 def produce(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[int, ...], written: int) -> None:
     """Run the process that writes.
 
-    For each number of frames that it receives, it does as many hand-overs. It answers with the times in ns at which the
-    last byte of each frame was written.
+    For each number of frames that the process receives, it does as many hand-overs. The answer is a list of the times
+    in ns at which the last byte of each frame was written.
     `pipe`: pipe to the parent process. `ack`: pipe on which the other process acknowledges each frame. `channel`:
     channel between both processes. `cores`: cores of the process. `written`: number of bytes in each hand-over.
     """
@@ -190,8 +190,8 @@ def produce(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[in
 def consume(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[int, ...], written: int) -> None:
     """Run the process that reads.
 
-    For each number of frames that it receives, it takes as many hand-overs. It answers with two lists of times in ns:
-    when all bytes of each frame could be read, and when all of them were read. Parameters: see `produce`.
+    For each number of frames that the process receives, it takes as many hand-overs. The answer is two lists of times
+    in ns: when all bytes of each frame could be read, and when all of them were read. Parameters: see `produce`.
     """
     with _child(pipe, cores):
         end = channel.consumer()

@@ -121,7 +121,7 @@ def packed_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int], deferred:
 def skinned_variant(
     ctx: Any, fixture: Fixture, shape: tuple[int, int], deferred: bool
 ) -> tuple[Callable[[int], None], Draw]:
-    """Return (skin, draw): a function that skins the body as the CPU unit does, and one that draws the skinned body.
+    """Return (skin, draw): a function that skins the body as the CPU unit does, and a function that draws the result.
 
     `draw` uses the packed pass. Parameters: see `packed_variant`.
     """

@@ -136,7 +136,7 @@ def _best_ms(variants: dict[str, ProcessVariant]) -> dict[str, float]:
 def _memory_gb_s() -> float:
     """Return the memory rate of one thread in 1e9 bytes a second, measured by a copy that is larger than the caches.
 
-    Bytes that are read count, and bytes that are written.
+    The rate counts bytes that are read and bytes that are written.
     """
     source, target = np.ones(COPY_BYTES // 8), np.empty(COPY_BYTES // 8)
     best = float("inf")

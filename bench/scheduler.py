@@ -65,7 +65,7 @@ def measure(minutes: float = 15.0, rounds: int = 7, seeds: int = 10, events: str
     `over_trilane`: seconds of each variant divided by the seconds of `trilane` in the same round, as median and
     interval; below 1, the variant is faster.
     `over_simpy`, `over_simpy_lean`: the medians for `simpy` and `simpy lean`.
-    `agree`: number of frames, which all variants present at the same nanosecond; null without SimPy.
+    `agree`: number of frames that all variants present at the same nanosecond; null without SimPy.
     `same_traces`: number of seeds for which 10 repeats of a run give the same trace; a unit dies in each of these runs.
     `different_traces`: number of different traces among the seeds.
     `replay`: number of `steps` in `events`, number of steps to which the scheduler now answers differently, and the

@@ -58,7 +58,7 @@ def measure(
 ) -> dict[str, Any]:
     """Compare pictures of the default avatar with ground truth, with and without neighbours in its tensor.
 
-    The tensor has `avatars` copies of the avatar. It is drawn at `views` moments of a scene.
+    The tensor has `avatars` copies of the avatar. The copies are drawn at `views` moments of a scene.
 
     `rows` has a row for each margin:
     `margin`: pixels of the tensor between two avatars.

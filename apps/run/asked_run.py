@@ -99,7 +99,7 @@ def prepare(
 
 
 def _with_remade_avatar(options: RunOptions) -> tuple[RunOptions, tuple[str, ...]]:
-    """Return (options, notes): `options` with the variant of the avatar that they request, and a note about it.
+    """Return (options, notes): `options` with the variant of the avatar that they request, and notes on the variant.
 
     Raises BadInputError for a scene of several avatars, for a check of an untrained network, and for a variant that
     cannot be made. Raises MissingPartError without PyTorch.

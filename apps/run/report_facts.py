@@ -230,7 +230,7 @@ def resolution_of(
 
 
 def worst_loss(work: int, losses: Sequence[SizeLoss]) -> float | None:
-    """Return the largest loss of PSNR among avatars for one tensor size, in dB; None if the loss of one is unknown.
+    """Return the largest loss of PSNR among avatars for one tensor size, in dB; None if an avatar's loss is unknown.
 
     `work`: number of the tensor's pixels, in thousandths of the number that the network was trained for.
     `losses`: loss of PSNR by tensor size, for each avatar.

@@ -138,7 +138,7 @@ def picture_fps(file: PipelineFile) -> float:
     """Return the rate of the videos that a run of `file` writes, in frames a second.
 
     The key `run.fps` states the rate. Without this key, the first video that the run reads determines the rate. Without
-    a video of known rate, it is DEFAULT_FPS. Raises BadInputError for a video that cannot be read.
+    a video of known rate, the rate is DEFAULT_FPS. Raises BadInputError for a video that cannot be read.
     """
     if file.run.fps is not None:
         return file.run.fps

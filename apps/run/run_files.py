@@ -37,9 +37,10 @@ def write_files(work: Path, fps: float, frames: int) -> tuple[dict[str, Any], Un
     """Write every file of the run folder `work` except the report. Return (facts, error).
 
     `facts` has two keys of the report: `video`, None without a video, and `checksum`, None if the pictures are not all
-    known. `error` is None if all is well. Otherwise it says that the disk is full, or that segments were removed during
-    the run. On a full disk, each file is complete or absent, and the segments stay until the video and the contact
-    sheet are complete. If segments were removed, the files are made from the remaining segments.
+    known. `error` is None if every file is complete. If a file is not, `error` says that the disk is full, or that
+    segments were removed during the run. On a full disk, each file is complete or absent, and the segments stay until
+    the video and the contact sheet are complete. If segments were removed, the files are made from the remaining
+    segments.
 
     `fps`: frames a second of the scene. `frames`: least number of frames that the segments should contain.
     Raises BadInputError for a broken journal.

@@ -1,4 +1,4 @@
-"""The verdict of a run or a prediction: whether it holds its rate, what bounds it, whether to trust it, what to try.
+"""The verdict of a run or a prediction: does it hold its rate, what bounds it, can its times be trusted, what to try?
 
 Rule: the functions are pure, and only this module judges. All commands, pages, notebooks and report.json show its
 verdict. `trilane.apps.run.verdict_facts` makes the facts that the verdict rests on.
@@ -290,8 +290,8 @@ def _late(found: LateFrames) -> str:
 def _held(facts: Facts) -> str:
     """Return the rate and the late frames as a text, such as `96 fps (92 to 102), at 30 fps 0 of 299 frames late`.
 
-    For a run that ended early, the text is the reason. If a fixed rate releases the frames, the first number is
-    followed by `shown`. In a prediction with late frames, it is followed by ALWAYS_FED.
+    For a run that failed, the text is the reason. If a fixed rate releases the frames, the first number is followed by
+    `shown`. In a prediction that counts late frames, the first number is followed by ALWAYS_FED.
     """
     if facts.failure:
         return f"the run ended early: {facts.failure}"
@@ -345,8 +345,8 @@ def _bound(facts: Facts) -> str:
 def _stages(bound: NamedBound, *, is_own: bool) -> str:
     """Return a text with stages of `bound` and their ms, such as `infer 9.1 `; "" if there are no such stages.
 
-    `is_own`: whether the text has the stages of the bound's own unit; if not, it has those of other units. Stages whose
-    ms are rounded to 0 are left out.
+    `is_own`: whether the text has the stages of the bound's own unit; if not, the text has the stages of other units.
+    Stages whose ms are rounded to 0 are left out.
     """
     rows = [(stage, ms) for stage, ms in bound.stages.items() if (stage in bound.of_unit) == is_own]
     rows = [(stage, ms) for stage, ms in rows if ms is None or _ms(ms) != _ms(0.0)]

@@ -1,7 +1,7 @@
 """Makes the facts of a verdict from a report, from the figures of a live run, or from a prediction.
 
 Rule: the functions are pure. All three sources have the keys of docs/report.md, as far as their values are known. The
-verdict leaves out unknown values. A report and a live run name their bound, and the verdict takes it over.
+verdict leaves out unknown values. A report and a live run name their bound, and the verdict has the same bound.
 """
 
 from __future__ import annotations
@@ -91,8 +91,9 @@ def facts_of(document: Mapping[str, Any], folder: str = "", *, goes_on: bool = F
 def target_fps(document: Mapping[str, Any]) -> float:
     """Return the rate that a run must hold, in frames a second.
 
-    The rate comes from `--fps`, the scene or the pipeline file; without any of them, it is TARGET_FPS. In slow motion,
-    it is divided by the factor of the slow motion. `document`: mapping with the known keys of report.json.
+    The rate comes from `--fps`, the scene or the pipeline file; if none of them has a rate, TARGET_FPS counts. In slow
+    motion, the rate is divided by the factor of the slow motion. `document`: mapping with the known keys of
+    report.json.
     """
     config = document.get("config") or {}
     fps = float((config.get("scene") or {}).get("fps") or TARGET_FPS)
@@ -126,7 +127,7 @@ def _lateness(document: Mapping[str, Any], *, is_paced: bool) -> LateFrames | No
 
 
 def bound_of(document: Mapping[str, Any]) -> NamedBound | None:
-    """Return the bound that a report names, with each stage's ms on the critical path; None if it names no bound.
+    """Return the bound that a report names, with each stage's ms on the critical path; None if no bound is named.
 
     `document`: mapping with the known keys of report.json.
     """
@@ -159,8 +160,9 @@ def _causes(idle: Mapping[str, float | None]) -> dict[str, float]:
 def _image(document: Mapping[str, Any]) -> str:
     """Return a text on the image error of a run.
 
-    If the run's frames were checked, the text has their error. If they were not, it has the error from the validation
-    of the worst avatar, or says that the error is unknown. `document`: mapping with the known keys of report.json.
+    If the run's frames were checked, the text has their error. If they were not, the text has the error from the
+    validation of the worst avatar, or says that the error is unknown. `document`: mapping with the known keys of
+    report.json.
     """
     avatars = document.get("accuracy") or {}
     if check := document.get("check"):
@@ -212,8 +214,9 @@ def _tries(document: Mapping[str, Any], bound: NamedBound | None, target: float,
 def _shorter(document: Mapping[str, Any], bound: NamedBound | None) -> Iterator[str]:
     """Yield proposals to shorten the frame time.
 
-    The first is a policy under which the units work at once, for a run with one frame at a time. The second concerns
-    the stage that bounds; it is missing if no unit bounds the run, but, for example, the rate.
+    For a run with one frame at a time, the first proposal is a policy under which the units work at once. If a unit
+    bounds the run, and not, for example, the rate, another proposal concerns the stage that bounds.
+    `document`: mapping with the known keys of report.json. `bound`: result of `bound_of`.
     """
     if works_on_one_frame(document.get("policy", "")) and len(document["units"]) > 1:
         yield "--policy pipelined: the units then work at once"

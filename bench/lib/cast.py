@@ -171,7 +171,8 @@ def box_around(rect: Rect, output: Shape) -> Box:
 def grown(box: Box, step: int) -> Box:
     """Return `box`, grown evenly until both sides are multiples of `step` pixels.
 
-    If an odd number of rows or columns is added, the bottom or the right side gets one more.
+    If an odd number of rows is added, the bottom gets one row more than the top. If an odd number of columns is added,
+    the right side gets one column more than the left side.
     """
     rows, columns = _grown(box.top, box.bottom, step), _grown(box.left, box.right, step)
     return Box(rows[0], columns[0], rows[1], columns[1])
