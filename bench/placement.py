@@ -1,8 +1,9 @@
 """Is the placement that a run chooses the best one, what does it gain over the rule, and does the model predict it?
 
 Rule: first a placement is chosen as in a run. After that, all placements are tried in interleaved rounds, a few frames
-each. The fastest placements run in further rounds, and the further rounds decide. Whole runs compare the chosen placement
-with the placement by the rule for any run. Other numbers of cores are computed in virtual time, and the results say so.
+each. The fastest placements run in further rounds, and the further rounds decide. Whole runs compare the chosen
+placement with the placement by the rule for any run. Other numbers of cores are computed in virtual time, and the
+results say so.
 """
 
 from __future__ import annotations

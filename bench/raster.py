@@ -1,7 +1,8 @@
 """How much faster is one packed pass than a pass for every four channels and a permute?
 
 Rule: all variants draw the same body in the same poses, in one process, in interleaved rounds. They must give the same
-bytes, but a few bytes may differ by one step. The split passes share mesh, texture and triangles with the packed pass.
+bytes, except for a share `UNEQUAL` that may differ by one step. The split passes share mesh, texture and triangles with
+the packed pass.
 """
 
 from __future__ import annotations

@@ -399,8 +399,9 @@ def _loop(kernel: Kernel, body: bytes) -> bytes:
 
 
 def measure_issued(name: str, cores: Sequence[int]) -> Issued:
-    """Measure sequences a cycle and clock of all `cores` while all of them work.
+    """Measure the clock of all `cores`, and how many sequences they issue in a cycle, while all of them work.
 
+    A sequence is a few instructions (see `InstructionSet`).
     `name`: name in `KERNELS` of an instruction set that this processor has. `cores`: numbers of the cores.
     Raises OSError for an architecture other than x86-64, and if Linux refuses executable memory or the tiles of AMX.
     """
@@ -426,7 +427,7 @@ def _ask_for_tiles() -> None:
 
 
 def _on_core(core: int, kernel: Kernel, together: threading.Barrier) -> tuple[float, list[float]]:
-    """Return (sequences a cycle, clock in GHz in each burst) of one core.
+    """Return (sequences that a core issues in a cycle, clock of the core in each burst in GHz).
 
     The call binds the calling thread to the core. Therefore the thread must end afterwards.
     `core`: number of the core. `kernel`: loop to run. `together`: barrier at which the threads of all cores meet.

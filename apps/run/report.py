@@ -57,11 +57,11 @@ class MachineFacts(Record):
     """The machine that was measured.
 
     `system`: operating system and kernel.
-    `python`, `trilane`: versions; `trilane` is null if Trilane is not installed as a package.
+    `python`, `trilane`: versions of Python and Trilane; `trilane` is null if Trilane is not installed as a package.
     `cpu`: processor.
     `hardware_counters`: hardware counters that were read for each job, or `absent` and the reason; null in older
     reports.
-    `memory_bytes`: physical memory.
+    `memory_bytes`: size of the physical memory.
     `gl`: OpenGL driver; null for a machine without such a driver.
     `packages`: version of each installed package that Trilane uses.
     """

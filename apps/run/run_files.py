@@ -36,11 +36,11 @@ FAST_PNG = 1  # zlib level: files are a fifth larger than at the best level, but
 def write_files(work: Path, fps: float, frames: int) -> tuple[dict[str, Any], UnwrittenError | None]:
     """Write every file of the run folder `work` except the report. Return (facts, error).
 
-    `facts` has two keys of the report: `video`, None without a video, and `checksum`, None if the pictures are not all
-    known. `error` is None if every file is complete. If a file is not, `error` says that the disk is full, or that
-    segments were removed during the run. On a full disk, each file is complete or absent, and the segments stay until
-    the video and the contact sheet are complete. If segments were removed, the files are made from the remaining
-    segments.
+    `facts` has two keys of the report. `video` has the fields of `trilane.apps.run.report.Video`; it is None without a
+    video. `checksum` is the result of `run_checksum`; it is None if segments were removed.
+    `error` is None if every file is complete. If a file is not, `error` says that the disk is full, or that segments
+    were removed during the run. On a full disk, each file is complete or absent, and the segments stay until the video
+    and the contact sheet are complete. If segments were removed, the files are made from the remaining segments.
 
     `fps`: frames a second of the scene. `frames`: least number of frames that the segments should contain.
     Raises BadInputError for a broken journal.
