@@ -115,7 +115,7 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 300, rounds
 
 
 class ChannelPair:
-    """A producer process and a consumer process that a channel connects. Both wait for requests.
+    """A producer process and a consumer process that a channel connects. Both wait until `run` requests hand-overs.
 
     `context`: context of multiprocessing that starts the processes. `channel`: channel between them. `written`: number
     of bytes that are written and read in each hand-over.

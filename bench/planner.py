@@ -43,7 +43,10 @@ FIXED = "512x512"
 
 
 def fixed(checked: Checked) -> Checked:
-    """Return `checked` with the plan of the reference application: the same square tensor `FIXED` in all frames."""
+    """Return `checked` with the plan of the reference application.
+
+    In every frame, the tensor is a square of the size `FIXED`, and everything is modelled.
+    """
     scene = checked.config.scene.model_copy(update={"size": FIXED, "plan": "fixed"})
     return checked.changed(scene=scene, shapes=())
 

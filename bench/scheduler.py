@@ -187,9 +187,9 @@ def _trilane_variants(graph: Graph, service: Service, frames: int) -> dict[str, 
 
 
 def _simpy_variants(graph: Graph, service: Service, frames: int) -> tuple[dict[str, Run], dict[str, dict[str, str]]]:
-    """Return (runs, absent): functions that run the models in SimPy, by variant, and {} as `absent`.
+    """Return (runs, facts): functions that run the models in SimPy, by variant, and keys for the result of `measure`.
 
-    If SimPy is not installed, there are no runs, and `absent` has the key `absent` with the reason.
+    With SimPy, `facts` is {}. If SimPy is not installed, `runs` is {}, and `facts` has the key `absent`.
     """
     try:
         models = _models()

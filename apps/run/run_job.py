@@ -283,8 +283,9 @@ class _Job:
 
 
 def _checked_frames(checked: Checked, work: Path, hooks: Hooks, interrupted: Callable[[], bool]) -> dict[str, Any]:
-    """Return the key `check` of the report, or the key `notes`, which says why the check failed, as a dictionary.
+    """Check the run's frames, and return {"check": block `check` of the report}.
 
+    If the check fails or is interrupted, return {"notes": all notes of the report, the last of which says why}.
     `checked`: configuration of the run. `work`: run folder; its lossless pictures are removed after the check.
     `hooks`: callbacks of the run. `interrupted`: function that returns whether the check shall end; it is called before
     the check and after each frame.

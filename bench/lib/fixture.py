@@ -41,7 +41,7 @@ INPUTS, SLOTS = 5, 2
 class Fixture:
     """The body that a bench draws, with its neural texture and its camera.
 
-    `shaped`: body in its shape.
+    `shaped`: default body after its shape blend shapes.
     `poses`: joints of the body in each of INPUTS poses.
     `arrays`: mesh of the body for the GPU.
     `view`, `projection`: matrices of the camera, (4,4) float64.
