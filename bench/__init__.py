@@ -1,6 +1,6 @@
 """Measurements of this machine: a module for each question, with a function `measure`, and shared parts in `lib/`.
 
-This folder may import from every folder but apps/. The parameters of `measure` are options of `trilane bench`.
+This folder may import from every folder except apps/. The parameters of `measure` are options of `trilane bench`.
 """
 
 from __future__ import annotations
@@ -33,7 +33,10 @@ LIMITS: dict[str, tuple[float, float]] = {
 
 
 def check_limits(asked: Mapping[str, Any]) -> None:
-    """Raise BadInputError if a value is outside its option's range. `asked`: value or values of each option."""
+    """Raise BadInputError if a value is outside of its option's range.
+
+    `asked`: value of each option, or a list of values, by the option's name. Texts have no range.
+    """
     for option, values in asked.items():
         low, high = LIMITS.get(option, (None, None))
         if low is None or high is None:

@@ -1,7 +1,7 @@
 """What do MIP maps and anisotropic filtering of the neural texture cost, and what do they change?
 
-Rule: all filters read the same avatar in the same view and poses, interleaved. The last picture of every filter is
-compared with the same ground truth.
+Rule: every filter draws the same avatar in the same view and poses. The filters run in interleaved rounds. The last
+picture of every filter is compared with the same ground truth.
 """
 
 from __future__ import annotations
@@ -37,12 +37,21 @@ MAX_SIDE = 2048
 def measure(sizes: tuple[int, ...] = (64, 128, 256, 512), repeats: int = 20) -> dict[str, Any]:
     """Draw the standing default avatar into square tensors with every texture filter of the packed pass.
 
-    `sizes`: sides of the tensors, pixels. `repeats`: timed draws of each filter.
-    Keys: `rows`, one per size and filter: `raster_ms` (median), `steps_mean` (mean absolute difference from the tensor
-    of `linear` over the body's pixels), `psnr_db` (of the network's picture against the truth; the network was trained
-    with `linear`); `sources`; `driver`; `config`.
+    `sizes`: sides of the tensors, pixels. `repeats`: number of timed draws of each filter.
 
-    Raises BadInputError, MissingPartError.
+    `rows` has a row for each size and filter:
+    `side`: side of the tensor, pixels.
+    `filter`: name of the filter.
+    `raster_ms`: median time of a draw.
+    `steps_mean`: mean absolute difference from the tensor of the filter `linear`, in bytes, over the body's pixels.
+    `psnr_db`: PSNR of the network's picture against ground truth; the network was trained with `linear`.
+
+    Further keys:
+    `sources`: source of the rows.
+    `driver`: facts about the OpenGL driver.
+    `config`: settings of the bench.
+
+    Raises BadInputError for an option out of range, MissingPartError if a library is not installed.
     """
     if bad := [side for side in sizes if side % BUCKET_STEP or not BUCKET_STEP <= side <= MAX_SIDE]:
         raise BadInputError("--sizes", str(bad[0]), f"a multiple of {BUCKET_STEP} up to {MAX_SIDE}")
@@ -59,7 +68,10 @@ def measure(sizes: tuple[int, ...] = (64, 128, 256, 512), repeats: int = 20) -> 
 
 
 class _FilterFixture:
-    """The default avatar, ready to be drawn with every filter, with its network and ground truth."""
+    """The default avatar, ready to be drawn with every filter, with its network and its ground truth.
+
+    `ctx`: OpenGL context.
+    """
 
     def __init__(self) -> None:
         bundle, assets = load_bundle("default"), load_drawable("default")
@@ -72,7 +84,10 @@ class _FilterFixture:
             self._drawn[name] = packed, PackedAvatar(packed, SkinnedMesh(self.ctx, assets.arrays), assets.texture)
 
     def rows(self, shape: tuple[int, int], repeats: int) -> list[dict[str, Any]]:
-        """Return one row of `measure` per filter. `shape`: (height, width) of the tensor."""
+        """Return one row of `measure` for each filter.
+
+        `shape`: (height, width) of the tensor in pixels. `repeats`: number of timed draws of each filter.
+        """
         slots = {name: np.empty((SLOTS, *shape, drawn[0].channels), np.uint8) for name, drawn in self._drawn.items()}
         variants = {name: partial(self._draw, name, shape, tensors) for name, tensors in slots.items()}
         times = interleaved_ms(variants, repeats)

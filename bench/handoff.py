@@ -1,8 +1,10 @@
 """How soon after the producer's last write can the consumer process read all bytes, and when has it read them?
 
-Rule: one definition holds for all variants, which run interleaved. The producer writes every byte again, then reads the
-clock. The variant that is judged and compared with the peers is a real run through the scheduler. Its pipeline is a
-chain of four stages: the second fills its slot, the third reads every byte of the slot, the first and last do no work.
+Rule: one definition holds for all variants, which run in interleaved rounds. The producer writes every byte again and
+reads the clock after the last byte. Two variants are compared with the peers. The first is a real run through the
+scheduler. The pipeline of this run is a chain of four stages. Its second stage fills a slot, and its third stage reads
+every byte of the slot; the others do no work. The second variant has the same slot, but no scheduler between the
+processes.
 """
 
 from __future__ import annotations
@@ -48,31 +50,44 @@ STAGES = (("pose", "cpu"), (WRITER, "gpu"), (READER, "dsp"), ("present", "cpu"))
 
 
 def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 300, rounds: int = 6) -> dict[str, Any]:
-    """The time from the producer's last byte written until the consumer can read them all, by variant and size.
+    """Measure how long a hand-over takes from the last byte written, by variant and size.
 
-    `kib`: sizes in KiB, some of 256, 1024, 4096 and 16384.
-    `frames`: hand-overs of each variant and size in a round.
+    `kib`: sizes in KiB: 256, 1024, 4096 or 16384.
+    `frames`: number of hand-overs of each variant and size in a round.
     `rounds`: number of rounds, in which all variants take part.
 
-    Rows: `way` (the variant), `kib`, `frames`; `p50_us` and `p99_us`: time until every byte can be read; `read_p50_us`
-    and `read_p99_us`: time until every byte was read and checked. These are medians of the rounds' percentiles, with
-    the 95 % interval of the median as `_low_us` and `_high_us`; with fewer than six rounds, the least and the largest.
-    With fewer than 299 frames a round there is no p99. `max_us`: the largest of all rounds. Before each hand-over the
-    consumer waits at least 1 ms, as an idle unit does.
+    `rows` has a row for each variant (`way`) and size (`kib`).
+    `frames`: number of hand-overs in all rounds.
+    `p50_us`, `p99_us`: percentiles of the time until every byte can be read.
+    `read_p50_us`, `read_p99_us`: percentiles of the time until every byte was read and checked.
+    `max_us`: longest time until every byte can be read.
+    Each percentile is the median of the rounds' percentiles. The keys with `_low_us` and `_high_us` have its 95 %
+    interval; with fewer than six rounds, the least and the largest percentile. With fewer than 299 frames in a round,
+    the p99 is null. Before each hand-over, the consumer waits at least 1 ms, as an idle unit does.
 
-    Trilane's variants: `slot through the scheduler`: as between two stages of a run, the message goes to the
-    scheduler's process, through its core, and on to the next unit. `slot`: the message goes directly from process to
-    process. `slot, 256 KiB of it written`: the same, but most of the slot is not written, so the caches hardly change.
-    Peers, each in its best form and without a scheduler between: `iceoryx2` with an event, `zeromq` without copies of
-    its own, `pipe` (bytes through multiprocessing.Pipe into an array), `pickled queue` (multiprocessing.Queue).
+    Trilane has three variants.
+    `slot through the scheduler`: as in a run, the message goes to the scheduler's process, through the scheduler's
+    core, and on to the next unit.
+    `slot`: the message goes directly from process to process.
+    `slot, 256 KiB of it written`: the same, but most of the slot is not written, so the caches hardly change.
 
-    `absent`: peers that are not installed. `met`: whether Trilane's variants keep p50 <= 150 us and p99 <= 500 us at
-    the largest size; null without a p99. `slower_us`: by peer and size, the interval of the median of the peer's p50
-    minus the p50 of `slot through the scheduler` in the same round. `read_slower_us`: the same, until every byte was
-    read. `slower_than_slot_us`, `read_slower_than_slot_us`: the same against `slot`. `ahead`, `read_ahead`: for each
-    peer, whether `slot through the scheduler` is faster at every size: all intervals lie above 0.
+    The peers are in their best form, and have no scheduler.
+    `iceoryx2`: a sample is written in place, and an event wakes the consumer.
+    `zeromq`: the bytes are a ZeroMQ frame, which pyzmq itself does not copy.
+    `pipe`: the bytes go through multiprocessing.Pipe into an array.
+    `pickled queue`: the array goes through multiprocessing.Queue.
 
-    Raises BadInputError for other sizes than 256, 1024, 4096, 16384 KiB.
+    `absent`: reason for each peer that is not installed.
+    `met`: whether p50 <= 150 us and p99 <= 500 us at the largest size, by variant of Trilane; null without a p99.
+    `p50_largest_over_smallest`: p50 at the largest size divided by p50 at the smallest, by variant of Trilane.
+    `slower_us`: p50 of the peer minus p50 of `slot through the scheduler` in the same round. The value is the 95 %
+    interval of the median over the rounds, by peer and size.
+    `read_slower_us`: the same for the times until every byte was read.
+    `slower_than_slot_us`, `read_slower_than_slot_us`: the same, with `slot` in place of `slot through the scheduler`.
+    `ahead`, `read_ahead`: whether the peer is slower than `slot through the scheduler` at every size, by peer. All
+    intervals of the peer must lie above 0.
+
+    Raises BadInputError for other sizes, fewer than 10 frames or no round, TrilaneError if a process or a run fails.
     """
     if unknown := set(kib) - set(SIZES_KIB):
         raise BadInputError("--kib", str(min(unknown)), ", ".join(map(str, SIZES_KIB)))
@@ -100,9 +115,11 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 300, rounds
 
 
 class ChannelPair:
-    """A producer and a consumer process, connected by `channel`, that wait for requests.
+    """A producer process and a consumer process that a channel connects. Both wait until `run` requests hand-overs.
 
-    `written`: number of bytes that are written and read in each hand-over.
+    `context`: context of multiprocessing that starts the processes. `channel`: channel between them. `written`: number
+    of bytes that are written and read in each hand-over.
+    The constructor raises TrilaneError if a process cannot start.
     """
 
     def __init__(self, context: SpawnContext, channel: Channel, written: int) -> None:
@@ -128,14 +145,17 @@ class ChannelPair:
             raise
 
     def run(self, frames: int) -> Times:
-        """Do `frames` hand-overs, and return their times from all bytes written to readable, and to all read."""
+        """Do `frames` hand-overs, and return (times until all bytes can be read, times until all were read), in µs.
+
+        The times begin when all bytes were written. Raises TrilaneError if a process fails.
+        """
         for pipe in reversed(self._pipes):
             pipe.send(frames)
         written, (readable, read) = (_answer(pipe) for pipe in self._pipes)
         return _microseconds(readable, written), _microseconds(read, written)
 
     def close(self) -> None:
-        """End both processes."""
+        """End both processes, and release the channel."""
         for pipe in self._pipes:
             pipe.close()
         for process in self._processes:
@@ -146,9 +166,12 @@ class ChannelPair:
 
 
 def produce(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[int, ...], written: int) -> None:
-    """Run the writing process. It receives a number of frames, and answers with the time at which each was written, ns.
+    """Run the process that writes.
 
-    `pipe`: pipe to the parent. `ack`: pipe on which the reading process acknowledges each frame.
+    For each number of frames that the process receives, it does as many hand-overs. The answer is a list of the times
+    in ns at which the last byte of each frame was written.
+    `pipe`: pipe to the parent process. `ack`: pipe on which the other process acknowledges each frame. `channel`:
+    channel between both processes. `cores`: cores of the process. `written`: number of bytes in each hand-over.
     """
     with _child(pipe, cores):
         end = channel.producer()
@@ -165,9 +188,10 @@ def produce(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[in
 
 
 def consume(pipe: Connection, ack: Connection, channel: Channel, cores: tuple[int, ...], written: int) -> None:
-    """Run the reading process. It receives a number of frames, and answers with two lists of times, ns.
+    """Run the process that reads.
 
-    The lists say when all bytes of each frame could be read, and when they had been read. `pipe`, `ack`: see `produce`.
+    For each number of frames that the process receives, it takes as many hand-overs. The answer is two lists of times
+    in ns: when all bytes of each frame could be read, and when all of them were read. Parameters: see `produce`.
     """
     with _child(pipe, cores):
         end = channel.consumer()
@@ -209,7 +233,10 @@ def _answer(pipe: Connection) -> Any:
 
 
 def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, int], ChannelPair], dict[str, str]]:
-    """Return waiting processes for each variant and size, and the reason for each absent variant."""
+    """Return (pairs, absent): waiting processes by variant and size in KiB, and the reason for each absent variant.
+
+    `stack`: exit stack that ends the processes. `sizes`: sizes in KiB.
+    """
     context = multiprocessing.get_context("spawn")
     pairs, absent = {}, {}
     for variant, make in CHANNELS.items():
@@ -225,7 +252,10 @@ def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, in
 
 
 def _through_pipeline(size: int, frames: int) -> Times:
-    """Run a pipeline whose stages only write and read; return the times from raster's end to infer's begin and end."""
+    """Run `handoff_pipeline`, and return (times from raster's end to infer's begin, times to infer's end), in µs.
+
+    `size`: size of the slot in KiB. `frames`: number of frames. Raises TrilaneError if the run fails.
+    """
     result = run_pipeline(handoff_pipeline(size * 1024), frames, policy="sequential")
     if result.interrupted:
         raise KeyboardInterrupt
@@ -255,9 +285,10 @@ def _row(variant: str, size: int, rounds: list[Times]) -> dict[str, Any]:
 
 
 def over_rounds(key: str, rounds: Sequence[list[float]], percent: float) -> dict[str, float | None]:
-    """Return the median of the rounds' percentiles and its interval; None if a round has too few values.
+    """Return the median of the rounds' percentiles and its 95 % interval; all None if a round has too few values.
 
-    `key`: beginning of the result's keys. `percent`: percentile, 0 to 100.
+    `key`: beginning of the result's keys, which end in `_us`, `_low_us` and `_high_us`. `rounds`: times of each round,
+    in µs. `percent`: percentile, 0 to 100.
     """
     names = (f"{key}_us", f"{key}_low_us", f"{key}_high_us")
     if min(map(len, rounds)) < samples_needed(percent / 100):
@@ -284,7 +315,10 @@ def _met(row: dict[str, Any]) -> bool | None:
 
 
 def against_peers(times: dict[tuple[str, int], list[Times]]) -> dict[str, Any]:
-    """Return how much longer each peer takes than Trilane's variants; keys: see `measure`."""
+    """Return how much longer each peer takes than Trilane's variants, under the keys that `measure` describes.
+
+    `times`: times of each round, by variant and size in KiB.
+    """
     slower, read_slower = _slower(times, PIPELINE, 0), _slower(times, PIPELINE, 1)
     return {
         "ahead": _ahead(slower),
@@ -299,10 +333,11 @@ def against_peers(times: dict[tuple[str, int], list[Times]]) -> dict[str, Any]:
 def _slower(
     times: dict[tuple[str, int], list[Times]], ours: str, until: int
 ) -> dict[str, dict[int, tuple[float, float]]]:
-    """Return by how much each peer's p50 is above that of the variant `ours`: by peer and size in KiB.
+    """Return the p50 of each peer minus the p50 of the variant `ours`, by peer, by size in KiB.
 
-    Each value is the interval (low, high) of the median over the rounds, in microseconds.
-    `times`: times of each round, by variant and size. `until`: index into `Times`.
+    Each value is the 95 % interval (low, high) of the median over the rounds, in µs.
+    `times`: times of each round, by variant and size. `until`: index into `Times`: 0 until all bytes can be read, 1
+    until all were read.
     """
     p50 = {key: np.array([np.percentile(of_round[until], 50) for of_round in of]) for key, of in times.items()}
     sizes = sorted({size for _, size in times})
@@ -317,17 +352,20 @@ def _ahead(slower: dict[str, dict[int, tuple[float, float]]]) -> dict[str, bool]
 
 
 class HandoffStage:
-    """A `trilane.pipeline.stage.Stage`; its name decides what it does."""
+    """A stage of `handoff_pipeline`. Its name decides whether it pauses, writes, reads or does nothing."""
 
     def __init__(self, name: str) -> None:
         self._name = name
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
-        """Keep the slots."""
+        """Keep the slots that the stage reads and writes."""
         self._inputs, self._outputs = inputs, outputs
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
-        """Run a job: `pose` pauses, `raster` writes, `infer` reads. Raises TrilaneError for wrong bytes."""
+        """Run a job: `pose` pauses, `raster` writes, `infer` reads. Raises TrilaneError if `infer` reads wrong bytes.
+
+        `frame`: number of the frame. `slot_in`, `slot_out`: numbers of the slots to read and to write; None for none.
+        """
         if self._name == STAGES[0][0]:
             time.sleep(PAUSE_S)
         elif self._name == WRITER and slot_out is not None:
@@ -341,19 +379,25 @@ class HandoffStage:
 
 
 def check_bytes(payload: U8, value: int) -> None:
-    """Sum all bytes of `payload`, a multiple of 8. Raises TrilaneError if the sum is not that of bytes `value`."""
+    """Raise TrilaneError if the sum of all bytes is not the sum of as many bytes `value`.
+
+    `payload`: bytes to check; their number is a multiple of 8.
+    """
     words = payload.view(np.uint64)
     if int(words.sum(dtype=np.uint64)) != len(words) * value * 0x0101010101010101 % 2**64:
         raise TrilaneError(f"a slot of {payload.size} bytes holds others than were written")
 
 
 def build(settings: Mapping[str, Any], unit: UnitContext) -> HandoffStage:  # noqa: ARG001 - a factory's signature
-    """Return the stage with the name `settings["name"]`. This is the factory of all stages."""
+    """Return the stage with the name `settings["name"]`. This function is the factory of all stages."""
     return HandoffStage(settings["name"])
 
 
 def handoff_pipeline(payload_bytes: int) -> Pipeline:
-    """Return a chain of four stages. Only its edge from the GPU unit to the DSP unit has a payload, `payload_bytes`."""
+    """Return a pipeline of four stages in a chain. Only the edge from raster to infer has a payload.
+
+    `payload_bytes`: size of this payload.
+    """
     sizes = [payload_bytes if before == WRITER else 0 for before, _ in STAGES[:-1]]
     return Pipeline(
         stages=tuple(

@@ -1,6 +1,7 @@
 """How long does a network take on each runtime, run continuously on random inputs?
 
-Rule: the runtimes and ONNX Runtime in FP32 run in turn, a period each, on the same cores, each in a process of its own.
+Rule: Trilane's runtimes and ONNX Runtime in FP32 run in turn on the same cores, a period each. Each has a process of
+its own.
 """
 
 from __future__ import annotations
@@ -44,16 +45,31 @@ def measure(
     seconds: float = 5.0,
     period: float = 1.0,
 ) -> dict[str, Any]:
-    """One row per network and runtime. Times are for one frame; FP32 always infers one frame at a time.
+    """Measure how long each network takes on each runtime. Times are for one frame.
 
-    Rows: the network's settings, `parameters`, `gmac`, `runtime`, `startup_cold_ms` and `startup_warm_ms` (to import
-    libraries and load the network, with an empty and with a filled cache), `frames`, `min_ms`, `mean_ms`, `p50_ms`,
-    `p90_ms`, `p99_ms`, `max_ms`, `periods` (min, mean, max of each), `int8_over_fp32` (speed divided by that of ONNX
-    Runtime in FP32), `share_of_roofline` (rate divided by that of the runtimes' best INT8 layer, measured in the same
-    bench), `share_of_instruction_peak` (rate divided by the peak of the instruction set, at the clock measured in the
-    same bench; null if unknown), `temperature_c` (null if it cannot be read).
+    `rows` has a row for each network and runtime. A row has the network's settings, and:
+    `parameters`: number of parameters.
+    `gmac`: 1e9 multiply-accumulates of a frame.
+    `runtime`, `batch`: name of the runtime, and frames that it infers at once; ONNX Runtime in FP32 always infers one
+    frame at once.
+    `startup_cold_ms`, `startup_warm_ms`: time to import libraries and load the network, with an empty and with a filled
+    cache.
+    `frames`: number of inferred frames.
+    `min_ms`, `mean_ms`, `p50_ms`, `p90_ms`, `p99_ms`, `max_ms`: times over all periods.
+    `periods`: least, mean and largest time of each period.
+    `temperature_c`: temperature of the machine's sensor; null if it cannot be read.
 
-    Raises BadInputError, MissingPartError.
+    Rows of INT8 networks also have:
+    `int8_over_fp32`: speed divided by the speed of ONNX Runtime in FP32; null if there is no float network.
+    `share_of_roofline`: rate divided by the rate of the runtimes' best INT8 layer.
+    `share_of_instruction_peak`: rate divided by the peak of the instruction set; null if this peak is unknown.
+
+    Further keys:
+    `roofline`: result of the bench `roofline`, which measures both peaks before the networks run.
+    `config`: settings of the bench.
+
+    Raises BadInputError for an option out of range, or a network or avatar that cannot be read. Raises MissingPartError
+    if a library is not installed, and TrilaneError if a process fails.
     """
     threads = threads or len(machine.here.cores())
     if not 0 < period <= seconds:
@@ -78,7 +94,11 @@ def _fixtures(
     size: tuple[str, ...],
     batch: tuple[int, ...],
 ) -> Iterator[tuple[NetworkFixture, onnx.ModelProto | None]]:
-    """Yield (integer network, its float network) for each combination of settings; None for no float network."""
+    """Yield (integer network, float network) for each combination of settings; None: the float network is unknown.
+
+    Parameters: see `measure`. A `network` that is named has no known float network. Raises BadInputError for a wrong
+    size, or a network that cannot be read.
+    """
     if network:
         file = read_network(Path(network)) if network.endswith(".onnx") else load_bundle(network).read_network()
         for frames in batch:
@@ -107,7 +127,7 @@ def _variants(
 
 @contextmanager
 def _cache(folder: Path) -> Iterator[None]:
-    """Let processes that are started inside the block keep compiled networks in `folder`."""
+    """Make `folder` the cache for compiled networks of all processes that are started inside the `with` block."""
     before = os.environ.get(CACHE)
     os.environ[CACHE] = str(folder)
     try:
@@ -120,7 +140,12 @@ def _cache(folder: Path) -> Iterator[None]:
 
 
 def _measure_periods(variants: dict[str, ProcessVariant], seconds: float, period: float) -> dict[str, dict[str, Any]]:
-    """Return, for each variant, its cold and warm start-up times and the times of its runs by period, all in ms."""
+    """Return the measured times of each variant, by name, in ms.
+
+    The times of a variant have the keys `startup_cold_ms`, `startup_warm_ms`, and `periods`, a list of the times of all
+    runs for each period. `variants`: variants by name. `seconds`: time for which each variant runs. `period`: seconds
+    of a variant's turn.
+    """
     with runners(variants) as by_name:
         cold = {name: runner.startup_ms for name, runner in by_name.items()}
     with runners(variants) as by_name:

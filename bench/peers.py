@@ -1,7 +1,7 @@
 """Are Trilane's runtimes as fast as the libraries themselves, and how near are they to the machine's peak?
 
-Rule: the libraries run as in their own introductory examples, Trilane's runtimes on as many threads. All run
-interleaved.
+Rule: the libraries run as in their own introductory examples. Trilane's runtimes get the same number of threads. All
+variants run in interleaved rounds.
 """
 
 from __future__ import annotations
@@ -43,17 +43,24 @@ PEAKS = {
 def measure(
     width: int = 64, size: str = "512x512", threads: int = 0, rounds: int = 8, seconds: int = 2
 ) -> dict[str, Any]:
-    """Ratios of median speeds. Above 1, Trilane's runtime before `over` is faster than the variant after it.
+    """Compare the speed of Trilane's runtimes with the libraries' own examples and with peaks of the machine.
 
-    `ratios.ort_over_fp32`, `ratios.openvino_over_fp32`: Trilane's runtime in INT8 against ONNX Runtime in FP32 with its
-    defaults. `ratios.openvino_over_benchmark_app`: against OpenVINO's own tool on the same file.
-    `ratios.openvino_of_roofline`: share of the rate of the best INT8 layer of the same runtimes, measured here.
-    `ratios.openvino_of_instruction_peak`: share of the peak of the instruction set, null if that is unknown. `peaks`:
-    the peaks of these two shares, in words. `low`, `high`: 95 % interval of each ratio's median over the rounds; with
-    fewer than six rounds, the least and the largest. `rows`: median time and number of runs of each variant. Each
-    variant runs for `seconds` in each round.
+    `ratios` are medians over the rounds. In a key with `over`, the ratio is the speed of the runtime before `over`,
+    divided by the speed of the variant after `over`. In a key with `of`, the ratio is a share of a peak.
+    `ort_over_fp32`, `openvino_over_fp32`: Trilane's runtime in INT8, and ONNX Runtime in FP32 with its defaults.
+    `openvino_over_benchmark_app`: Trilane's runtime, and OpenVINO's own tool on the same file.
+    `openvino_of_roofline`: share of the best rate that an INT8 layer of the same runtimes reaches here.
+    `openvino_of_instruction_peak`: share of the peak of the instruction set; null if this peak is unknown.
 
-    Raises MissingPartError without OpenVINO or PyTorch.
+    `low`, `high`: 95 % interval of each ratio's median; with fewer than six rounds, the least and the largest ratio.
+    `peaks`: the two peaks in words.
+    `rows`: median time and number of runs of each variant (`way`). Each variant runs for `seconds` in each round.
+    `gmac`: 1e9 multiply-accumulates of the network.
+    `roofline`: result of the bench `roofline`.
+    `config`: settings of the bench.
+
+    Raises BadInputError for a wrong size, MissingPartError without OpenVINO or PyTorch, TrilaneError if a variant's
+    process fails.
     """
     for name in ("openvino", "ort"):
         resolve(name)
@@ -85,10 +92,11 @@ def measure(
 def compared(
     times: Mapping[str, Sequence[Sequence[float]]], gmac: float, layer_gmac_s: float, instruction_gmac_s: float | None
 ) -> dict[str, dict[str, Any]]:
-    """Return `ratios`, `low` and `high` of `measure`.
+    """Return the keys `ratios`, `low` and `high` of the result of `measure`.
 
-    `times`: milliseconds of each variant's runs, by round. `gmac`: 1e9 multiply-accumulates of a run. `layer_gmac_s`,
-    `instruction_gmac_s`: the two peaks, 1e9 multiply-accumulates a second.
+    `times`: milliseconds of each run, by round, by variant. `gmac`: 1e9 multiply-accumulates of a run.
+    `layer_gmac_s`: best rate of an INT8 layer, 1e9 multiply-accumulates a second. `instruction_gmac_s`: peak of the
+    instruction set in the same unit; None if unknown.
     """
     medians = {name: np.array([np.median(of_round) for of_round in of_rounds]) for name, of_rounds in times.items()}
     rate = gmac / (medians[OPENVINO] / 1e3)
@@ -121,7 +129,13 @@ def _variants(integer: Path, plain: Path, threads: int) -> dict[str, ProcessVari
 def _measure_rounds(
     variants: dict[str, ProcessVariant], integer: Path, threads: int, rounds: int, seconds: int
 ) -> dict[str, list[list[float]]]:
-    """Return the times of each variant's runs, ms, by round; for `benchmark_app`, only its own median."""
+    """Return the times of all runs in ms, by round, by variant.
+
+    For `benchmark_app`, each round has a single time, which is the median that the tool itself measures.
+    `variants`: variants of inference by name. `integer`: ONNX file for `benchmark_app`. `threads`: number of threads.
+    `rounds`: number of rounds. `seconds`: time for which each variant runs in a round.
+    Raises TrilaneError if a process fails, MissingPartError if `benchmark_app` is not installed.
+    """
     times: dict[str, list[list[float]]] = {name: [] for name in (*variants, APP)}
     with runners(variants) as by_name:
         for _ in range(rounds):
@@ -132,7 +146,11 @@ def _measure_rounds(
 
 
 def _benchmark_app(network: Path, threads: int, seconds: int) -> float:
-    """Return the median latency that OpenVINO's tool measures, ms, with one request at a time."""
+    """Return the median latency in ms that OpenVINO's tool `benchmark_app` measures, with one request at a time.
+
+    `network`: ONNX file. `threads`: number of threads. `seconds`: time for which the tool runs.
+    Raises MissingPartError if the tool is not installed, TrilaneError if it fails.
+    """
     tool = machine.here.program(APP, first=Path(sys.executable).parent)
     if tool is None:
         raise MissingPartError(f"{APP} is not there", extra="openvino")

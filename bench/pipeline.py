@@ -1,8 +1,8 @@
 """Does the pipeline keep its slowest unit busy, and what does that gain over one frame at a time?
 
 Rule: every run is compared with the `sequential` runs before and after it on the same cores. In a sequential run, every
-stage does the same frames in the same order while the other units are quiet. Settings run interleaved in many short
-rounds, because the speed of a shared machine changes within seconds; a row is the median over the rounds.
+stage does the same frames in the same order while the other units are quiet. The settings run in many short interleaved
+rounds, because the speed of a shared machine changes within seconds. A row has medians over the rounds.
 """
 
 from __future__ import annotations
@@ -48,7 +48,11 @@ PACE = 1.25  # factor on the slowest unit's rate: more frames are released than 
 
 @dataclass(frozen=True)
 class Setting:
-    """The settings that one row measures."""
+    """The settings of the runs of one row.
+
+    `avatar`: name or folder of the avatar. `size`: tensor size. `cores`: number of cores of the units together.
+    `policy`: policy of the scheduler. `edge`: rule of all edges.
+    """
 
     avatar: str
     size: str
@@ -70,31 +74,43 @@ def measure(
     beside: str = "",
     beside_size: str = "512x512",
 ) -> dict[str, Any]:
-    """A row for each avatar, size, number of cores, policy and edge; figures are medians over the `rounds`.
+    """Measure the avatar's pipeline for each avatar, size, number of cores, policy and edge.
 
-    Rows: `frame_ms`, `fps`; `latency_p50_ms`, `latency_p99_ms`: from a frame's sampled pose to its composited picture,
-    over the presented frames of all rounds; without 299 frames there is no p99. `efficiency`: the slowest unit's work
-    divided by the frame time, by CPU time. `slowest`: the unit that takes longest for a frame in the `sequential` runs
-    before and after; `alone_ms`: that time, without the time in which the unit had no core. `busiest`: the unit with
-    the most work; `idle`: its share of time without a job, between its first and last job, with the causes `starved`
-    (no input), `undispatched` (input, but no free slot, or not dispatched yet) and `overhead` (dispatched, but not
-    begun).
+    `rows` has a row for each of these settings. Its figures are medians over the `rounds`.
+    `frame_ms`, `fps`: frame time and rate.
+    `latency_p50_ms`, `latency_p99_ms`: percentiles of the latency, over the presented frames of all rounds; with fewer
+    than 299 frames, the p99 is null.
+    `efficiency`: CPU time of the slowest unit for a frame, divided by the frame time.
+    `slowest`: unit that takes longest for a frame in the `sequential` runs before and after.
+    `alone_ms`: this time, without the time in which the unit had no core.
+    `busiest`: unit with the most work in this run.
+    `idle`: share of time without a job, between the first and the last job of `busiest`. The causes of this share are
+    `starved` (no input), `undispatched` (input, but no free slot, or not dispatched yet) and `overhead` (dispatched,
+    but not begun).
 
-    `gain`: mean frame time of the `sequential` runs before and after, divided by `frame_ms`. `bound`: sum(t) / max(t),
-    where sum(t) is the time of all units in those runs (`all_alone_ms`) and their hand-overs, and max(t) the time of
-    the slowest unit. `in_run_over_alone`: time of the unit `slowest` in this run, without the time in which it had no
-    core, divided by `alone_ms`. `gain_of_bound`: `gain` divided by `bound`; `of_bound_low`, `of_bound_high`: the 95 %
-    interval of its median, with fewer than six rounds the least and largest. `hops_ms`: frame time of a sequential run
-    minus the times of its stages. `dropped`, `lost`: frames of all rounds. `accuracy`: the error of the avatar's
-    pictures and its source, or why there are no figures.
+    `gain`: mean frame time of the `sequential` runs before and after, divided by `frame_ms`.
+    `bound`: largest possible gain, which is (`all_alone_ms` + `hops_ms` of those runs) / `alone_ms`.
+    `all_alone_ms`: time of all units for a frame in those runs.
+    `hops_ms`: frame time of a sequential run minus the times of its stages, which is the time of hand-overs; null for
+    other runs.
+    `in_run_over_alone`: time of the unit `slowest` in this run, without the time in which it had no core, divided by
+    `alone_ms`.
+    `gain_of_bound`: `gain` divided by `bound`.
+    `of_bound_low`, `of_bound_high`: its 95 % interval; with fewer than six rounds, the least and the largest.
+    `dropped`, `lost`: numbers of frames in all rounds.
+    `accuracy`: image error of each avatar and its source, or why there are no figures.
 
-    With `beside`, a second avatar of the size `beside_size`, two `pipelined` runs go on at once, each with its own
-    scheduler and units, on the same cores. Rows, one for each run: `frame_ms`: mean frame time while both ran;
-    `isolated_ms`: time of its stages for a frame, in sequential runs before and after; `virtual_ms`: frame time
-    computed from these times; `ratio`: measured divided by computed, with its interval; `strangers`: mean number of
-    other programs' ready threads where its stages worked. Above a few hundredths, the ratio says nothing.
+    If `beside` names a second avatar, of the size `beside_size`, two `pipelined` runs go on at once on the same cores.
+    Each has its own scheduler and units. In this case, `rows` has a row for each run.
+    `frame_ms`: mean frame time while both ran.
+    `isolated_ms`: time of the stages for a frame, in sequential runs before and after.
+    `virtual_ms`: frame time that the virtual clock computes from these times.
+    `ratio`: measured frame time divided by the computed one; `ratio_low`, `ratio_high`: its 95 % interval.
+    `strangers`: time for which stages had no core in the sequential runs, divided by the time for which they worked. If
+    it is above a few hundredths, the ratio says nothing.
 
-    Raises BadInputError, MissingPartError, TrilaneError when a run fails.
+    Raises BadInputError for an option out of range, MissingPartError if a library is not installed, TrilaneError if a
+    run fails.
     """
     if frames < MIN_FRAMES or rounds < 1:
         raise BadInputError("bench pipeline", f"--frames {frames}, --rounds {rounds}", f"at least {MIN_FRAMES} and 1")
@@ -117,7 +133,10 @@ def measure(
 def _measure_two(
     which: Sequence[tuple[str, str]], edge: str, cores: int, frames: int, rounds: int, runtime: str, *, video: bool
 ) -> dict[str, Any]:
-    """Measure two avatars at once. `which`: (avatar, size) of both."""
+    """Measure two avatars at once, and return the result of `measure`.
+
+    `which`: (avatar, size) of both. `cores`: number of cores that both share. Other parameters: see `measure`.
+    """
     asked = [
         Asked(_folder(name), size, frames, runtime, usable_cores()[:cores], video=video, edge=edge)
         for name, size in which
@@ -132,7 +151,10 @@ def _folder(avatar: str) -> str:
 
 
 def _measure_rounds(checked: Checked, settings: list[Setting], rounds: int) -> list[dict[str, Any]]:
-    """Return a row for each setting. The first is `sequential`; one more sequential run ends the last round."""
+    """Return a row of `measure` for each of `settings`. The first setting is `sequential`.
+
+    One more sequential run ends the last round, because every run is compared with the sequential runs around it.
+    """
     measured = [_run_round(checked, settings) for _ in range(rounds)]
     closing = _run(checked, settings[0])
     for runs, after in zip(measured, [*(runs[0] for runs in measured[1:]), closing], strict=True):
@@ -154,7 +176,7 @@ def _check(policies: Sequence[str], edges: Sequence[str], cores: Sequence[int]) 
 
 
 def _pairs(policies: Sequence[str], edges: Sequence[str]) -> list[tuple[str, str]]:
-    """Return all pairs of policy and edge, `sequential` first, because every other pair is compared with it."""
+    """Return all (policy, edge) pairs; `sequential` with `double` is the first, as all others are compared with it."""
     return [(SEQUENTIAL, "double"), *(pair for pair in product(policies, edges) if pair != (SEQUENTIAL, "double"))]
 
 
@@ -165,16 +187,20 @@ def _config(avatar: str, size: str, cores: int, frames: int, runtime: str, video
 
 
 def _run_round(checked: Checked, settings: list[Setting]) -> list[dict[str, Any]]:
-    """Run each setting once. The `sequential` run, which is first, determines the pace for paced policies."""
+    """Run each of `settings` once, and return the figures of each run.
+
+    The first run, which is `sequential`, determines the rate at which paced policies release frames.
+    """
     base = _run(checked, settings[0])
     slowest_ms = max(base[UNITS_MS].values())
     return [base, *(_run(checked, setting, slowest_ms) for setting in settings[1:])]
 
 
 def _compare(runs: list[dict[str, Any]], after: dict[str, Any]) -> None:
-    """Add comparisons to the `runs` of a round. Each is compared with two sequential runs: the first one, and `after`.
+    """Add the comparisons of `measure` to the figures of each run of a round.
 
-    The first run is only compared with itself.
+    `runs`: figures of the runs; the first run is `sequential`. `after`: figures of the next sequential run. Each run is
+    compared with both sequential runs, but the first run only with itself.
     """
     for place, row in enumerate(runs):
         beside = (runs[0], after if place else runs[0])
@@ -193,9 +219,11 @@ def _run(checked: Checked, plan: Setting, slowest_ms: float = 0.0) -> dict[str, 
 
 
 def finished_run(checked: Checked, what: str, least: int = 2, **options: Any) -> RunResult:
-    """Run `checked` in a temporary run folder, and return the result. `options`: further arguments of `run_avatar`.
+    """Run `checked` in a temporary run folder, and return the result of the run.
 
-    Raises TrilaneError if the run fails or presents fewer than `least` frames. `what`: beginning of its message.
+    `what`: name of the run in error messages. `least`: least number of presented frames. `options`: further arguments
+    of `run_avatar`.
+    Raises TrilaneError if the run fails or presents too few frames, KeyboardInterrupt if a signal ends the run.
     """
     with tempfile.TemporaryDirectory(prefix="trilane-bench-") as folder:
         placed = checked.changed(out_dir=Path(folder))
@@ -213,7 +241,7 @@ def finished_run(checked: Checked, what: str, least: int = 2, **options: Any) ->
 
 
 def _figures(result: RunResult) -> dict[str, Any]:
-    """Return the figures of one run, without comparisons."""
+    """Return the figures of one run that need no comparison, under the keys of `measure`, LATENCIES and UNITS_MS."""
     metrics = result.report
     frame_ms = metrics.frame_time_ms.mean
     assert frame_ms is not None  # two frames were presented
@@ -234,7 +262,7 @@ def _figures(result: RunResult) -> dict[str, Any]:
 
 
 def _units_ms(result: RunResult) -> dict[str, float]:
-    """Return, by unit, the mean service time of its jobs for a frame, ms, without preempted time."""
+    """Return the time of each unit for a frame in ms, by unit: mean service times without preempted time."""
     times = dict.fromkeys(result.report.units, 0.0)
     for name, stage in result.report.stages.items():
         preempted = [job.preempted_ns for job in result.jobs if job.stage == name]
@@ -243,9 +271,10 @@ def _units_ms(result: RunResult) -> dict[str, float]:
 
 
 def idle_between_jobs(jobs: Sequence[JobRecord]) -> dict[str, float]:
-    """Return a unit's idle shares by cause, and their sum `idle`, from its first job's begin to its last job's end.
+    """Return a unit's idle shares by cause, and under `idle` their sum.
 
-    `jobs`: all jobs of the unit.
+    The shares refer to the time from the begin of the unit's first job to the end of its last job. The causes are
+    `starved`, `undispatched` and `overhead`, as in `measure`. `jobs`: all jobs of the unit.
     """
     ordered = sorted(jobs, key=lambda job: job.begin_ns)
     span = ordered[-1].end_ns - ordered[0].begin_ns
@@ -261,14 +290,20 @@ def idle_between_jobs(jobs: Sequence[JobRecord]) -> dict[str, float]:
 
 
 def latencies_ns(recording: Recording, jobs: Sequence[JobRecord]) -> list[int]:
-    """Return the latency of each presented frame of a run. `jobs`: all jobs of the run."""
+    """Return the latency of each presented frame of a run, in ns.
+
+    `recording`: recording of the run. `jobs`: all jobs of the run.
+    """
     timeline = Timeline(recording.graph, recording.settings)
     facts = (fact for record in records_of(recording, jobs) for fact in timeline.add(record))
     return [fact.latency_ns for fact in facts if isinstance(fact, Presented) and fact.latency_ns is not None]
 
 
 def _latency_ms(runs: list[dict[str, Any]]) -> dict[str, float | None]:
-    """Return the median and the 99th percentile of the latency over all `runs`; None for too few frames."""
+    """Return the keys `latency_p50_ms` and `latency_p99_ms` over all frames of `runs`; None for too few frames.
+
+    `runs`: figures of each run.
+    """
     ordered = sorted(ns for run in runs for ns in run[LATENCIES])
     enough = {percent: len(ordered) >= samples_needed(percent / 100) for percent in (50, 99)}
     return {
@@ -278,7 +313,10 @@ def _latency_ms(runs: list[dict[str, Any]]) -> dict[str, float | None]:
 
 
 def _summary(setting: Setting, runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return a setting's row from its `runs`: medians of numbers, most frequent names, sums of frame counts."""
+    """Return the row of `setting`. `runs`: figures of the setting's run in each round.
+
+    The row has the medians of numbers, the most frequent names, and the sums of dropped and lost frames.
+    """
     names = ("slowest", "busiest")
     sums = ("dropped", "lost")
     row: dict[str, Any] = {**vars(setting)}
@@ -301,10 +339,11 @@ START_S, RUN_S = 120.0, 600.0
 
 @dataclass(frozen=True)
 class Asked:
-    """A run of the default scene to be done.
+    """The settings of a run of the default scene in a process of its own.
 
-    `avatar`, `size`, `frames`, `runtime`: as in `trilane.stages.run_options.RunOptions`. `cores`: cores on which the
-    rule for any run places its units. `video`: whether a video is encoded. `edge`: rule of all edges.
+    `avatar`, `size`, `frames`, `runtime`: options as in `trilane.stages.run_options.RunOptions`. `cores`: numbers of
+    the cores on which the units are placed, by the rule for any run. `video`: whether a video is encoded. `edge`: rule
+    of all edges.
     """
 
     avatar: str
@@ -317,40 +356,40 @@ class Asked:
 
 
 class Ran(NamedTuple):
-    """The result of a run.
-
-    `jobs`: all jobs that ended. `seats`: unit -> its cores, as text such as "0,1".
-    """
+    """The result of a run. `jobs`: all jobs that ended. `seats`: cores of each unit, as text such as "0,1", by unit."""
 
     jobs: tuple[JobRecord, ...]
     seats: dict[str, str]
 
 
 class AvatarProcess:
-    """A process that runs an avatar, as the parent process sees it. `name`: name for error messages."""
+    """A process that runs an avatar, as the parent process sees it.
+
+    `pipe`: pipe to the process. `name`: name of the process in error messages.
+    """
 
     def __init__(self, pipe: Connection, name: str) -> None:
         self._pipe, self._name = pipe, name
 
     def begin(self, policy: str) -> None:
-        """Begin a run under `policy`."""
+        """Tell the process to begin a run under `policy`."""
         self._pipe.send(policy)
 
     def result(self) -> Ran:
-        """Wait for the begun run, and return its result. Raises TrilaneError if the run failed."""
+        """Wait until the begun run ends, and return its result. Raises TrilaneError if the run failed."""
         jobs, seats = self.receive(RUN_S)
         return Ran(tuple(JobRecord(*job) for job in jobs), seats)
 
     def receive(self, wait_s: float) -> Any:
-        """Return the process's next answer. Raises TrilaneError."""
+        """Return the next answer of the process. Raises TrilaneError for an error message or no answer in `wait_s`."""
         return answer_of(self._pipe, self._name, wait_s)
 
 
 @contextmanager
 def avatar_processes(asked: Sequence[Asked]) -> Iterator[list[AvatarProcess]]:
-    """Start a process for each run in `asked`, ready to run; all end with the block.
+    """Start a process for each run in `asked`, and yield the processes, which are ready to run.
 
-    Raises TrilaneError if a process does not start.
+    All processes end with the `with` block. Raises TrilaneError if a process does not start.
     """
     with asked_processes() as start:
         found = [AvatarProcess(start(serve, each), f"{each.avatar} at {each.size}") for each in asked]
@@ -360,7 +399,10 @@ def avatar_processes(asked: Sequence[Asked]) -> Iterator[list[AvatarProcess]]:
 
 
 def serve(pipe: Connection, asked: Asked) -> None:
-    """Run the process: report that it is ready, then do a run for each policy that it receives, until `pipe` closes."""
+    """Run the process: report that it is ready, and do a run for each policy that it receives, until `pipe` closes.
+
+    The answer to a policy is (jobs as tuples, seats of `Ran`), or an error message.
+    """
     try:
         request = RunOptions(avatar=asked.avatar, size=asked.size, frames=asked.frames, runtime=asked.runtime)
         checked = configure(request, Path.cwd()).changed(units=host_units(asked.cores), record=asked.video)
@@ -397,10 +439,10 @@ ENDLESS = 1 << 40
 
 
 class Isolated(NamedTuple):
-    """The times of one pipeline's stages in sequential runs.
+    """The times of one pipeline's stages in sequential runs, in ns.
 
-    `stage_ns`: mean time of each stage. `worked_ns`, `waited_ns`: total time for which stages worked, and for which
-    they had no core.
+    `stage_ns`: mean time of a job, by stage. `worked_ns`: total time for which stages worked. `waited_ns`: total time
+    for which stages had a job but no core.
     """
 
     stage_ns: Mapping[str, float]
@@ -413,10 +455,9 @@ def measure_beside(
     rounds: int,
     processes: Callable[[Sequence[Asked]], AbstractContextManager[list[AvatarProcess]]] = avatar_processes,
 ) -> list[dict[str, Any]]:
-    """Return a row for each of the two pipelines `asked`, medians over the `rounds`. Raises TrilaneError.
+    """Run the two pipelines `asked` at once, and return the row of `measure` for each, with medians over the `rounds`.
 
-    Keys: as for `beside` in `measure`, and `ratio_low`, `ratio_high`, the 95 % interval of `ratio`'s median.
-    `processes`: function that starts the processes.
+    `processes`: function that starts the processes. Raises TrilaneError if a process or a run fails.
     """
     found: list[list[dict[str, float]]] = []
     with processes(asked) as pair:
@@ -463,9 +504,9 @@ def _round(both: Sequence[Ran], isolated: Sequence[Isolated], asked: Sequence[As
 
 
 def overlapping_ms(runs: Sequence[Sequence[JobRecord]]) -> list[float]:
-    """Return the mean frame time of each run, ms, over the time in which all runs presented frames.
+    """Return the mean frame time of each run in ms, over the time in which all runs presented frames.
 
-    `runs`: jobs of each run. Raises TrilaneError if the runs hardly overlapped.
+    `runs`: jobs of each run. Raises TrilaneError if a run presented fewer than three frames in this time.
     """
     ends = [sorted(job.end_ns for job in jobs if job.stage == LAST) for jobs in runs]
     first, last = max(each[0] for each in ends), min(each[-1] for each in ends)
@@ -478,9 +519,10 @@ def overlapping_ms(runs: Sequence[Sequence[JobRecord]]) -> list[float]:
 def computed_ms(
     isolated: Sequence[Isolated], seats: Sequence[Mapping[str, str]], asked: Sequence[Asked]
 ) -> list[float]:
-    """Return the mean frame time of each pipeline, ms, computed in virtual time: all run at once and share cores.
+    """Return the mean frame time of each pipeline in ms, computed in virtual time. All run at once and share cores.
 
-    `seats`: each unit's cores, as text, by pipeline.
+    Each parameter has an element for each pipeline. `isolated`: times of the stages. `seats`: cores of each unit, as
+    text, by unit. `asked`: settings of the run.
     """
     stop = (round(SECONDS * 1e9), Stop())
     members = [

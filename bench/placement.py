@@ -1,8 +1,9 @@
 """Is the placement that a run chooses the best one, what does it gain over the rule, and does the model predict it?
 
-Rule: first a placement is chosen as in a run. After that, all placements are tried in turns, a few frames each. Only
-the placements that could be the best run in further rounds, and these rounds decide. Whole runs compare the chosen
-placement with the rule's. Other numbers of cores are computed in virtual time, and the results say so.
+Rule: first a placement is chosen as in a run. After that, all placements are tried in interleaved rounds, a few frames
+each. The fastest placements run in further rounds, and the further rounds decide. Whole runs compare the chosen
+placement with the placement by the rule for any run. Other numbers of cores are computed in virtual time, and the
+results say so.
 """
 
 from __future__ import annotations
@@ -51,27 +52,39 @@ def measure(
     runs: int = 4,
     runtime: str = "auto",
 ) -> dict[str, Any]:
-    """A row for each size, number of cores and placement.
+    """Measure the frame times of all placements, and compare the chosen placement with the others.
 
-    Rows: `predicted_ms`; `tried_ms`: median of `rounds` rounds with all placements, in turns of 16 frames, of which the
-    last 10 count; `frame_ms`: median of the `further` rounds, null for placements that are not in them; `is_chosen`,
-    `is_rule`. The further rounds have the chosen placement, the rule's, and the `finalists` fastest of the others.
+    `rows` has a row for each size, number of cores and placement:
+    `predicted_ms`: predicted frame time.
+    `tried_ms`: median frame time of `rounds` rounds with all placements; a placement runs 16 frames in a round, and the
+    last 10 count.
+    `frame_ms`: median frame time of the `further` rounds; null for a placement without further rounds. These rounds
+    have the chosen placement, the rule's placement, and the `finalists` fastest of the others.
+    `is_chosen`, `is_rule`: whether the placement is the chosen one, or the rule's.
 
-    `sizes`: a row for each size and number of cores. `how`: what chose the placement: the run's own trial, or the
-    prediction. `chosen_over_best`: frame time of the chosen placement divided by that of the best other placement in
-    the further rounds, as the median of the rounds' ratios. `low`, `high`: its 95 % interval; with fewer than six
-    rounds, the least and the largest. Up to 1, the chosen placement is the best. `rule_over_chosen`: frame time of the
-    rule's placement divided by that of the chosen one. `rule_low`, `rule_high`: its interval. `rank_correlation`:
-    Spearman's, of the predicted and tried times of all placements. `predicted_over_tried`, `predicted_least`,
-    `predicted_largest`: median, least and largest ratio of these times. `others`: share of the cores that other
-    programs had in the further rounds; above a tenth, the row says little. `run_ms`, `rule_run_ms`,
-    `machine_efficiency`, `efficiency`, `rule_machine_efficiency`: medians of `runs` whole runs of `frames` frames each,
-    in turns. `took_s`: time of a run's rehearsal and trial. `times`: the rehearsal's measured times.
+    `sizes` has a row for each size and number of cores.
+    `chosen`, `best`, `rule`: the chosen, the fastest and the rule's placement, in words.
+    `how`: reason of the choice: the run's own trial, or the prediction.
+    `chosen_over_best`: frame time of the chosen placement divided by the frame time of the best other placement. It is
+    the median over the further rounds; up to 1, the chosen placement is the best.
+    `low`, `high`: its 95 % interval; with fewer than six rounds, the least and the largest.
+    `rule_over_chosen`: frame time of the rule's placement divided by the frame time of the chosen placement.
+    `rule_low`, `rule_high`: its 95 % interval.
+    `rank_correlation`: Spearman's rank correlation of the predicted and the tried times of all placements.
+    `predicted_over_tried`, `predicted_least`, `predicted_largest`: median, least and largest ratio of these times.
+    `others`: share of the cores that other programs had in the further rounds; above a tenth, the row says little.
+    `run_ms`, `efficiency`, `machine_efficiency`: medians of `runs` whole runs of `frames` frames with the chosen
+    placement.
+    `rule_run_ms`, `rule_machine_efficiency`: the same with the rule's placement.
+    `took_s`: time of a run's rehearsal and trial.
 
-    `virtual`: other numbers of cores, by the profile `host` in virtual time. The scheduler computes `frame_ms` for
-    every placement that virtual time knows.
+    `times`: measured times of the rehearsal.
+    `virtual`: frame times for other numbers of cores, which the scheduler computes in virtual time with the profile
+    `host`.
+    `config`: settings of the bench.
 
-    Raises BadInputError, MissingPartError, TrilaneError when a run fails.
+    Raises BadInputError for an option out of range, MissingPartError if a library is not installed, TrilaneError if a
+    run fails.
     """
     counts = tuple(count or len(usable_cores()) for count in cores)
     _check(counts, frames, rounds, finalists, further, runs)
@@ -106,7 +119,11 @@ def _check(counts: Sequence[int], frames: int, rounds: int, finalists: int, furt
 
 
 class _Trial:
-    """Chooses a placement for a scene on `cores` as a run does, then tries all placements."""
+    """Chooses a placement for a scene as a run does, and tries all placements.
+
+    `checked`: configuration of the scene. `cores`: cores for the units. `starter`: unit starter.
+    The constructor chooses the placement. It raises TrilaneError if a unit cannot start or a stage fails.
+    """
 
     def __init__(self, checked: Checked, cores: Sequence[CpuCore], starter: UnitStarter) -> None:
         self._checked, self._starter = checked, starter
@@ -128,7 +145,11 @@ class _Trial:
         self._runs: dict[str, list[RunMetrics]] = {of: [] for of in self._places}
 
     def run(self, rounds: int, finalists: int, further: int, runs: int) -> None:
-        """Do `rounds` rounds with all placements, `further` rounds with the best ones, and `runs` whole runs."""
+        """Do `rounds` rounds with all placements, `further` rounds with the best placements, and `runs` whole runs.
+
+        `finalists`: number of placements in the further rounds, besides the chosen placement and the rule's.
+        Raises TrilaneError if a run fails.
+        """
         self._rounds = self._try(range(len(self._found)), rounds)
         tried_ms = self._tried_ms()
         always = list(dict.fromkeys(self._places.values()))
@@ -142,7 +163,10 @@ class _Trial:
                 self._runs[of].append(self._run(self._found[place].placement))
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return a row for each placement, in the order of the predictions."""
+        """Return a row of `measure` for each placement, the shortest predicted frame time first.
+
+        If the predictions do not consider the rule's placement, its row is the last.
+        """
         return [
             {
                 "placement": described(each.placement),
@@ -156,7 +180,7 @@ class _Trial:
         ]
 
     def summary(self) -> dict[str, Any]:
-        """Return the row of `sizes` in `measure`: the chosen placement against others, predictions against trials."""
+        """Return the row of `sizes` in `measure` for this scene and these cores."""
         place = self._places["chosen"]
         mine = self._further[place]
         best = min(self._further, key=lambda other: (median(self._further[other]), other != place))
@@ -189,7 +213,7 @@ class _Trial:
         }
 
     def times(self) -> list[dict[str, Any]]:
-        """Return rows with the rehearsal's measured times."""
+        """Return a row with the rehearsal's measured times for each unit and number of threads."""
         return times_rows(self._times)
 
     def _tried_ms(self) -> list[float]:
@@ -197,7 +221,7 @@ class _Trial:
         return [median(each.frame_ns[place] for each in self._rounds) / NS_PER_MS for place in range(len(self._found))]
 
     def _place(self, one: Ranked) -> int:
-        """Return the index of a placement in the list of all placements."""
+        """Return the index of the placement of `one` in the list of all placements."""
         return [each.placement for each in self._found].index(one.placement)
 
     def _try(self, places: Sequence[int], rounds: int) -> Sequence[Round]:
@@ -215,7 +239,10 @@ def _interval(prefix: str, values: Sequence[float]) -> dict[str, float]:
 
 
 def _virtual(checked: Checked, avatar: str, count: int) -> Mapping[str, Any]:
-    """Return computed frame times of the placements on `count` equal cores, each alone on its physical core."""
+    """Return a row of `virtual` in `measure`: computed frame times of all placements on `count` equal cores.
+
+    Each core is alone on its physical core. `checked`: configuration of the scene. `avatar`: name of the avatar.
+    """
     shape = min(checked.config.buckets, key=lambda shape: (abs(shape[0] - shape[1]), shape))
     work = painting(networks_of(checked.assets), shape, {"avatar": avatar})
     profile, plan = load_profile(HOST), Plan(work, "dsp", Variant(POLICY, EDGE))
@@ -243,7 +270,7 @@ def _virtual(checked: Checked, avatar: str, count: int) -> Mapping[str, Any]:
 
 
 def rank_correlation(first: Sequence[float], second: Sequence[float]) -> float | None:
-    """Return Spearman's rank correlation of two lists, from -1 to 1; None if all values of a list are equal.
+    """Return Spearman's rank correlation of two lists, from -1 to 1; None if a list only has equal values.
 
     Spearman, American Journal of Psychology 15 (1904), 72-101. Raises ValueError for lists of different lengths.
     """

@@ -1,9 +1,9 @@
 """What does planning save against a fixed square of 512 x 512, and what does it cost in image error?
 
-Rule: both plans run interleaved, on the same moments of the same scenes. Each plan is placed as by `trilane run`. The
-runs' own stages make the compared pictures, in the timed configurations. The reference, the plan `full`, is a second
-implementation (`bench/lib/full_picture.py`). People see single bad frames, but means hide them. Therefore every frame
-of both plans is also compared with the truth, which is quicker to draw than `full`.
+Rule: both plans run in interleaved rounds, on the same moments of the same scenes. The units are placed as by `trilane
+run`. The runs' own stages make the compared pictures, in the timed configurations. The reference is the plan `full`, a
+second implementation (`bench/lib/full_picture.py`). People see single bad frames, but means hide them. Therefore every
+frame of both plans is also compared with the truth, which is quicker to draw than `full`.
 """
 
 from __future__ import annotations
@@ -43,13 +43,16 @@ FIXED = "512x512"
 
 
 def fixed(checked: Checked) -> Checked:
-    """Return `checked` with the reference application's plan: a fixed square tensor, and up to 12 skin weights."""
+    """Return `checked` with the plan of the reference application.
+
+    In every frame, the tensor is a square of the size `FIXED`, and everything is modelled.
+    """
     scene = checked.config.scene.model_copy(update={"size": FIXED, "plan": "fixed"})
     return checked.changed(scene=scene, shapes=())
 
 
 def planned(checked: Checked) -> Checked:
-    """Return `checked` as it is: with the scene's own plan."""
+    """Return `checked` unchanged, with the scene's own plan."""
     return checked
 
 
@@ -58,9 +61,9 @@ PLANS = {"fixed": fixed, "planned": planned}
 
 
 def in_frames(checked: Checked, frames: int) -> Checked:
-    """Return `checked` with only `frames` frames at a lower rate, so that they span the whole scene.
+    """Return `checked` with only `frames` frames, at a lower rate, so that these frames span the whole scene.
 
-    A scene with at most `frames` frames stays unchanged.
+    A scene that has no more than `frames` frames stays unchanged.
     """
     scene = checked.config.scene
     if frames >= scene.frames:
@@ -78,19 +81,33 @@ def measure(
     video: bool = True,
     out: str = "",
 ) -> dict[str, Any]:
-    """For each scene: how many times as fast the planned run is as the fixed run, and the image errors of both.
+    """Compare a planned run with a run of a fixed tensor in each scene, by speed and by image error.
 
-    Keys: `scenes`, with an entry for each scene: `name`; `fixed_ms`, `planned_ms`: median frame times; `speedup`: the
-    ratio of both, as the median over the rounds; `speedup_low`, `speedup_high`: its 95 % interval, with fewer than six
-    rounds the least and largest; `placements`: by plan, the cores of the units and why; `psnr_fixed_db`,
-    `psnr_planned_db`, `ssim_*`, `flip_*`: errors against the plan `full`, where PSNR follows from the mean square over
-    all frames; the same keys with `box_`: errors in the avatars' rectangles, None with nobody in view; `truth`: the
-    same errors, also of `full`, against the clothed body that a bundled avatar was trained on; `network`: source of the
-    network of `full`; `tensors`: sizes of planned tensors; `by_frame`: errors of single frames, None without a truth.
-    Over all scenes: `median_speedup`, `least_speedup`; `largest_loss_db`: PSNR of fixed minus planned; `worst_loss_db`:
-    the same for the worst frames, None without a truth; `sources`; `driver`; `config`.
+    `scenes` has an entry for each scene:
+    `name`: name of the scene.
+    `fixed_ms`, `planned_ms`: median frame times.
+    `speedup`: fixed frame time divided by planned frame time, as the median over the rounds.
+    `speedup_low`, `speedup_high`: its 95 % interval; with fewer than six rounds, the least and the largest.
+    `placements`: cores of the units and the reason for them, by plan.
+    `psnr_fixed_db`, `psnr_planned_db`, `ssim_*`, `flip_*`: image errors against the plan `full`; PSNR follows from the
+    mean square over all compared frames. The same keys after `box_`: errors in the avatars' rectangles; null if no
+    avatar is in view.
+    `truth`: the same errors, also of the plan `full`, against the clothed body that a bundled avatar was trained on;
+    null for other avatars.
+    `network`: source of the network of `full`.
+    `tensors`: sizes of planned tensors.
+    `by_frame`: errors of single frames against the truth; null without a truth.
 
-    Raises BadInputError, MissingPartError, TrilaneError when a run fails.
+    Further keys, over all scenes:
+    `median_speedup`, `least_speedup`: median and least speedup.
+    `largest_loss_db`: largest PSNR of fixed minus PSNR of planned.
+    `worst_loss_db`: the same for the worst frame of each plan; null without a truth.
+    `sources`: source of the figures.
+    `driver`: facts about the OpenGL driver.
+    `config`: settings.
+
+    Raises BadInputError for an option out of range or a wrong scene, MissingPartError if a library is not installed,
+    TrilaneError if a run fails.
     """
     _check(frames, pictures)
     require_metrics()
@@ -126,9 +143,10 @@ def _check(frames: int, pictures: int) -> None:
 
 @dataclass(frozen=True)
 class _Moment:
-    """One frame by every plan, pictures (h,w,3) uint8.
+    """The pictures of one frame by every plan, each (h,w,3) uint8 sRGB.
 
-    `full`: picture by the plan `full`. `plans`: pictures by name in `PLANS`. `true`: true picture; None if unknown.
+    `number`: number of the frame. `full`: picture by the plan `full`. `plans`: pictures by name in `PLANS`.
+    `true`: true picture; None if unknown.
     """
 
     number: int
@@ -138,13 +156,18 @@ class _Moment:
 
 
 class _Scene:
-    """Runs and compares one scene by both plans.
+    """One scene, which is run and compared by both plans.
 
     `name`: name of the scene. `driver`: facts about the OpenGL driver; empty before `compare`.
     """
 
     def __init__(self, name: str, frames: int, runtime: str, *, video: bool) -> None:
-        """Configure both plans. Raises BadInputError, MissingPartError."""
+        """Configure both plans.
+
+        `name`: name or file of the scene. `frames`: largest number of frames of a run. `runtime`: runtime of the
+        networks. `video`: whether a video is encoded.
+        Raises BadInputError for a scene that cannot be read, MissingPartError if a library is not installed.
+        """
         asked = RunOptions(scene=name, runtime=runtime, hud=False)
         checked = in_frames(configure(asked, Path.cwd()).changed(record=video), frames)
         self.name = checked.config.scene.name
@@ -153,10 +176,10 @@ class _Scene:
         self._plans = {plan: make(checked) for plan, make in PLANS.items()}
 
     def time(self, rounds: int, starter: UnitStarter) -> dict[str, Any]:
-        """Measure frame times of both plans in turns, and return their keys of `measure`.
+        """Measure the frame times of both plans in interleaved rounds; return the keys of `measure` for speed.
 
-        `starter`: starter of all units. A scene that is too short for a rehearsal is placed by the rule for any run.
-        Raises TrilaneError if a run fails.
+        `rounds`: number of rounds. `starter`: unit starter. If a scene is too short for a rehearsal, the rule for any
+        run places its units. Raises TrilaneError if a run fails.
         """
         on_cores = {plan: placed(one, POLICY, starter, str(self.driver)) for plan, one in self._plans.items()}
         times: dict[str, list[float]] = {plan: [] for plan in self._plans}
@@ -170,9 +193,10 @@ class _Scene:
         return {"speedup": median(ratios), "speedup_low": low, "speedup_high": high, **middle, "placements": said}
 
     def compare(self, pictures: int) -> tuple[dict[str, Any], list[tuple[int, U8]]]:
-        """Compare both plans with the plan `full` and with the truth, in `pictures` evenly spread frames.
+        """Compare both plans with the plan `full` and with the truth. Return (figures, sheets).
 
-        Return the keys of `measure` that the pictures give, and (number, contact sheet) of each frame.
+        The figures have the keys of `measure` for image errors. The sheets are (number, picture by `sheet`) of each
+        compared frame. `pictures`: number of compared frames, evenly spread over the scene; `by_frame` has all frames.
         """
         cast, total = Cast(self._checked), self._checked.config.scene.frames
         full = FullPictures(cast)
@@ -212,13 +236,15 @@ def by_frame(
     true: Callable[[int, U8], U8],
     cast: Cast,
 ) -> dict[str, Any] | None:
-    """Return each plan's error in the avatars' boxes against the truth, over single frames.
+    """Return the image error of single frames against the truth, in the boxes of the avatars, by plan.
 
-    `frames`: numbers, ascending. `chains`: makes the frames, by plan. `behind`: makes the backgrounds. `true`: function
-    of a frame's number and background that makes the true picture.
-    The result has, by plan, the values of `psnr_of_frames` over the frames with a visible avatar, and the number
-    `worst_frame`. For `planned` it also has `changes`: in how many frames the tensor's shape differs from the frame
-    before; and `worst_change_db`: the least PSNR of these frames, or None. With nobody in view, the result is None.
+    `frames`: numbers of the frames, ascending. `chains`: maker of the frames, by plan. `behind`: maker of the
+    backgrounds. `true`: function of a frame's number and background that makes the true picture. `cast`: avatars and
+    camera of the scene.
+    The entry of a plan has the keys of `psnr_of_frames`, over the frames with a visible avatar, and `worst_frame`, the
+    number of the worst frame. The entry of `planned` has two further keys. `changes`: number of frames whose tensor
+    has another shape than that of the previous frame. `worst_change_db`: least PSNR of these frames; None if the shape
+    never changes. If no frame shows an avatar, the result is None.
     """
     errors: dict[str, dict[int, float]] = {plan: {} for plan in chains}
     tensors: dict[int, str] = {}
@@ -257,10 +283,10 @@ def _frame_ms(checked: Checked, what: str, starter: UnitStarter) -> float:
 
 
 def sheet(moment: _Moment) -> U8:
-    """Return a sheet (h,w,3) with the pictures of a moment in two rows.
+    """Return one picture (2 h, 3 w, 3) uint8 that shows the pictures of `moment`, each (h,w,3), in two rows.
 
-    The upper row has full, fixed and planned. The lower row has the truth, or grey without a truth, and the differences
-    of fixed and planned from full, around grey.
+    The upper row has `full`, `fixed` and `planned`. The lower row has the true picture, and `SHOWN` times the
+    differences of `fixed` and `planned` from `full`, around grey. If the truth is unknown, grey is in its place.
     """
     above = [moment.full, *moment.plans.values()]
     below = [np.full_like(moment.full, 128) if moment.true is None else moment.true]
@@ -271,7 +297,10 @@ def sheet(moment: _Moment) -> U8:
 
 
 def _write(folder: Path, name: str, sheets: Sequence[tuple[int, U8]]) -> None:
-    """Write each sheet as `NAME-FRAME.png`. Raises BadInputError."""
+    """Write each of `sheets`, (frame number, picture), to `folder` as `NAME-FRAME.png`.
+
+    `name`: name of the scene. Raises BadInputError if a file cannot be written.
+    """
     from PIL import Image
 
     with write_folder(folder) as draft:

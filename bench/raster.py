@@ -1,7 +1,8 @@
 """How much faster is one packed pass than a pass for every four channels and a permute?
 
-Rule: all variants draw the same body in the same poses, in the same process, interleaved, and must give the same bytes.
-The split passes share mesh, texture and triangles with the packed pass.
+Rule: all variants draw the same body in the same poses, in one process, in interleaved rounds. They must give the same
+bytes, except for a share `UNEQUAL` that may differ by one step. The split passes share mesh, texture and triangles with
+the packed pass.
 """
 
 from __future__ import annotations
@@ -31,13 +32,19 @@ UNEQUAL = 1e-3  # largest share of bytes that may differ, by one step: variants 
 
 
 def measure(size: int = 512, channels: int = 16, repeats: int = 40, threads: int = 1) -> dict[str, Any]:
-    """Milliseconds of one raster, readback to host memory included; medians over `repeats`.
+    """Measure the time to draw one tensor and read it back to host memory, in ms, by variant.
 
-    Keys: `raster_ms` (as in a run on this driver: with a software driver, the CPU unit skins), `packed_ms`, `split_ms`,
-    `ratios.split_over_packed`, `rows` (one per variant: median, minimum, p90), `covered` (share of the pixels that the
-    body covers), `driver`, `config`.
+    `raster_ms`: median time of the stage raster as in a run on this driver. With a software driver, the CPU unit skins
+    the body, and the time of skinning does not count.
+    `packed_ms`, `split_ms`: median times of the packed pass and of the split passes.
+    `ratios`: `split_over_packed`, the second of these times divided by the first.
+    `rows`: median, minimum and 90th percentile of each variant (`way`) over `repeats` draws.
+    `covered`: share of the pixels that the body covers.
+    `driver`: facts about the OpenGL driver.
+    `config`: settings of the bench.
 
-    Raises BadInputError, MissingPartError; TrilaneError if the variants' bytes differ.
+    Raises BadInputError for an option out of range, MissingPartError if a library is not installed, TrilaneError if the
+    variants give different bytes.
     """
     if not 1 <= size <= MAX_SIDE:
         raise BadInputError("--size", str(size), f"1 to {MAX_SIDE}")
@@ -67,9 +74,11 @@ def measure(size: int = 512, channels: int = 16, repeats: int = 40, threads: int
 def _variants(
     ctx: Any, fixture: Fixture, tensors: dict[str, Any], shape: tuple[int, int], deferred: bool
 ) -> dict[str, Callable[[int], object]]:
-    """Return all variants by name, as functions of the input's number.
+    """Return all variants by name. Each is a function of the input's number, which draws this input.
 
-    Variants in `COMPARED` write to their own array (SLOTS, bytes) of `tensors`. `deferred`: as a run on this driver.
+    `ctx`: OpenGL context. `fixture`: body to draw. `tensors`: array (SLOTS, bytes) that a variant in `COMPARED` writes
+    to, by variant. `shape`: (height, width) of the tensor. `deferred`: whether a run on this driver draws UVs first and
+    reads the texture in a second pass.
     """
     draws = (
         packed_variant(ctx, fixture, shape, deferred),
@@ -92,7 +101,7 @@ Draw = Callable[[Any, int], None]
 
 
 def packed_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int], deferred: bool) -> Draw:
-    """Return a function that draws the body by the packed pass and reads the result into a tensor.
+    """Return a function that draws the body by the packed pass, and reads the tensor into host memory.
 
     `ctx`: OpenGL context.
     `fixture`: body to draw.
@@ -113,9 +122,9 @@ def packed_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int], deferred:
 def skinned_variant(
     ctx: Any, fixture: Fixture, shape: tuple[int, int], deferred: bool
 ) -> tuple[Callable[[int], None], Draw]:
-    """Return a function that skins the body as the CPU unit does, and a function that draws the skinned body.
+    """Return (skin, draw): a function that skins the body as the CPU unit does, and a function that draws the result.
 
-    The second function uses the packed pass. Parameters: see `packed_variant`.
+    `draw` uses the packed pass. Parameters: see `packed_variant`.
     """
     packed = PackedPass(ctx, fixture.texture.shape[2], ENCODING, deferred)
     avatar = PackedAvatar(packed, PosedMesh(ctx, fixture.arrays), fixture.texture)
@@ -138,7 +147,10 @@ def skinned_variant(
 
 
 def split_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int]) -> Draw:
-    """Return a function that draws the body by the split passes, reads their targets and interleaves the channels."""
+    """Return a function that draws the body by the split passes, and interleaves their channels in host memory.
+
+    Parameters: see `packed_variant`.
+    """
     split = SplitPass(ctx, SkinnedMesh(ctx, fixture.arrays), fixture.texture, ENCODING, shape)
 
     def draw_and_read(tensors: Any, number: int) -> None:
@@ -149,7 +161,10 @@ def split_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int]) -> Draw:
 
 
 def uv_variant(ctx: Any, fixture: Fixture, shape: tuple[int, int]) -> Draw:
-    """Return a function that draws the UV coordinates of the body, two bytes a pixel, and reads them."""
+    """Return a function that draws the UV coordinates of the body, two bytes a pixel, and reads them back.
+
+    Parameters: see `packed_variant`.
+    """
     image = UvBytes(ctx, SkinnedMesh(ctx, fixture.arrays))
 
     def draw_and_read(images: Any, number: int) -> None:
@@ -196,7 +211,10 @@ class SplitPass:
         self._planes = np.empty((len(self._targets), *shape, 4), np.uint8)
 
     def draw(self, view: Floats, placement: Placement) -> None:
-        """Draw every pass. The avatar gets the whole tensor: `placement.rect` is ignored."""
+        """Draw every pass. The avatar gets the whole tensor.
+
+        `view`: view matrix (4,4). `placement`: pose and projection of the avatar; its `rect` is ignored.
+        """
         self._texture.use(0)
         self._mesh.prepare(self._ctx)
         for layer, target in enumerate(self._targets):
@@ -206,7 +224,7 @@ class SplitPass:
             self._draw.draw(placement.pose, view, placement.clip_projection)
 
     def read_into(self, tensor: U8) -> None:
-        """Read the targets of all passes, and interleave their channels into `tensor`, (h * w * C,) uint8."""
+        """Read the targets of all passes back, and interleave their channels into `tensor`, (h * w * C,) uint8."""
         image = tensor.reshape(*self._shape, 4 * len(self._targets))
         for layer, target in enumerate(self._targets):
             target.read_into(self._planes[layer], components=4)

@@ -1,7 +1,7 @@
 """Which variant of moving pixels between GPU and slot is the fastest on this driver?
 
-Rule: all variants move the same bytes and run interleaved. They are timed twice: with an idle GPU, and directly after a
-draw. Poses, pictures and slots change from run to run.
+Rule: all variants move the same bytes, and run in interleaved rounds. Readbacks are timed twice: with an idle GPU, and
+directly after a draw. Poses, pictures and slots change from round to round.
 """
 
 from __future__ import annotations
@@ -32,14 +32,25 @@ TIME_SOURCES = {
 def measure(
     sizes: Sequence[int] = SIZES, channels: Sequence[int] = CHANNELS, repeats: int = 20, threads: int = 1
 ) -> dict[str, Any]:
-    """One row for each size, number of channels and variant: `kind` (readback, upload), `way`, `lag`, `move`, `turn`.
+    """Measure how long each variant takes to move pixels, by size and number of channels.
 
-    `way`: name of the variant. `lag`: how many frames later the bytes arrive. `move`: time of the copy alone, with an
-    idle GPU; for uploads, with a copy to another framebuffer. `turn`, only for readbacks: time of the tensor's draw and
-    the copy. `fastest`: for each kind, the variant with the smallest sum of medians: of `turn` for readbacks on a
-    hardware driver, otherwise of `move`.
+    `rows` has a row for each variant, size and number of channels:
+    `kind`: readback or upload.
+    `size`: side of the square tensor or picture.
+    `channels`: number of channels.
+    `way`: name of the variant.
+    `lag`: how many frames later the bytes arrive.
+    `move`: time to move the bytes with an idle GPU; for an upload, also to copy them to another framebuffer.
+    `turn`, only for readbacks: time to draw the tensor and move the bytes.
+    Each time has median, minimum and 90th percentile in ms.
 
-    Raises MissingPartError.
+    `fastest`: variant with the smallest sum of medians, by kind. On a hardware driver, the medians of `turn` count for
+    readbacks; in all other cases, the medians of `move` count.
+    `driver`: facts about the OpenGL driver.
+    `time_source`: clock of the times.
+    `config`: settings of the bench.
+
+    Raises MissingPartError without OpenGL, TrilaneError if the variants give different bytes.
     """
     ctx = open_context(threads)
     driver = describe(ctx)
@@ -145,9 +156,9 @@ RING = 3
 
 
 class Readback(Protocol):
-    """Reads part of a framebuffer of 32-bit unsigned words.
+    """A variant that reads part of a framebuffer of 32-bit unsigned words into a slot.
 
-    `lag`: number of submits after which the bytes arrive.
+    `lag`: number of further submits after which the bytes arrive.
     """
 
     lag: int
@@ -156,17 +167,17 @@ class Readback(Protocol):
         """Start a read.
 
         `target`: framebuffer.
-        `box`: (x, y, width, height) in pixels.
-        `words`: number of components of a pixel.
+        `box`: (x, y, width, height) of the part in pixels.
+        `words`: number of words of a pixel.
         `tensor`: array that gets the bytes, `lag` submits later.
         """
 
     def drain(self) -> None:
-        """Finish all reads: every submitted tensor has its bytes afterwards."""
+        """Finish all reads, so that every submitted tensor has its bytes."""
 
 
 class DirectReadback:
-    """A readback in which the driver copies to the slot, and the caller waits."""
+    """A readback in which the driver copies to the slot while the caller waits."""
 
     lag = 0
 
@@ -174,7 +185,7 @@ class DirectReadback:
         """Do nothing: no memory is needed."""
 
     def submit(self, target: Any, box: Box, words: int, tensor: U8) -> None:
-        """Read at once, and wait."""
+        """Read at once, and wait until the bytes are in `tensor`."""
         target.read_into(tensor, box, components=words, dtype="u4", alignment=1)
 
     def drain(self) -> None:
@@ -182,7 +193,10 @@ class DirectReadback:
 
 
 class PboReadback:
-    """A readback through a pixel buffer: the driver copies to the buffer, the caller from the buffer to the slot."""
+    """A readback through a pixel buffer. The driver copies to the buffer, and the caller from the buffer to the slot.
+
+    `orphan`: whether the buffer gets new memory for each frame.
+    """
 
     lag = 0
     orphan = False
@@ -191,7 +205,7 @@ class PboReadback:
         self._buffer = ctx.buffer(reserve=most_bytes)
 
     def submit(self, target: Any, box: Box, words: int, tensor: U8) -> None:
-        """Read to the buffer, then copy to `tensor`."""
+        """Read to the buffer, and copy from the buffer to `tensor`."""
         if self.orphan:
             self._buffer.orphan()
         target.read_into(self._buffer, box, components=words, dtype="u4", alignment=1)
@@ -208,7 +222,10 @@ class OrphanPboReadback(PboReadback):
 
 
 class RingReadback:
-    """A readback through a ring of pixel buffers with fences. A slot is filled when its buffer is needed again."""
+    """A readback through a ring of pixel buffers with fences.
+
+    The bytes of a buffer are copied to their slot only when the buffer is needed for a new read.
+    """
 
     lag = RING - 1
 
@@ -217,7 +234,7 @@ class RingReadback:
         self._waiting: deque[tuple[Any, int, U8]] = deque()
 
     def submit(self, target: Any, box: Box, words: int, tensor: U8) -> None:
-        """Start this read; finish the oldest read if no buffer is free afterwards."""
+        """Start a read; if no buffer is free after that, finish the oldest read."""
         buffer = self._free.popleft()
         target.read_into(buffer, box, components=words, dtype="u4", alignment=1)
         self._waiting.append((buffer, opengl.fence(), tensor))
@@ -245,14 +262,14 @@ READBACKS: dict[str, Callable[[Any, int], Readback]] = {
 
 
 class Upload(Protocol):
-    """Writes a slot's bytes to a texture."""
+    """A variant that writes the bytes of a slot to a texture."""
 
     def write(self, texture: Any, image: U8) -> None:
-        """Write `image` to `texture`. The caller may change `image` afterwards."""
+        """Write `image` to `texture`. After the call, the caller may change `image`."""
 
 
 class SubUpload:
-    """An upload in which the driver copies from the slot."""
+    """An upload in which the driver copies directly from the slot."""
 
     def __init__(self, ctx: Any, most_bytes: int) -> None:
         """Do nothing: no memory is needed."""
@@ -263,26 +280,26 @@ class SubUpload:
 
 
 class OrphanUpload:
-    """An upload through one pixel buffer, with new memory for each frame."""
+    """An upload through one pixel buffer that gets new memory for each frame."""
 
     def __init__(self, ctx: Any, most_bytes: int) -> None:
         self._buffer = ctx.buffer(reserve=most_bytes)
 
     def write(self, texture: Any, image: U8) -> None:
-        """Copy to new memory of the buffer; the driver copies from there."""
+        """Copy `image` to new memory of the buffer, from which the driver copies to `texture`."""
         self._buffer.orphan()
         self._buffer.write(image)
         texture.write(self._buffer, alignment=1)
 
 
 class RingUpload:
-    """An upload through a ring of pixel buffers. A buffer is written again only after its fence."""
+    """An upload through a ring of pixel buffers. A buffer is written again only after the GPU has passed its fence."""
 
     def __init__(self, ctx: Any, most_bytes: int) -> None:
         self._ring: deque[tuple[Any, int | None]] = deque((ctx.buffer(reserve=most_bytes), None) for _ in range(RING))
 
     def write(self, texture: Any, image: U8) -> None:
-        """Copy to the oldest buffer; the driver copies from there."""
+        """Copy `image` to the oldest buffer of the ring, from which the driver copies to `texture`."""
         buffer, sync = self._ring.popleft()
         if sync is not None:
             opengl.wait_fence(sync)

@@ -1,8 +1,8 @@
 """What are the highest rates of this machine's cores, in INT8, in FP32, and from memory?
 
-Rule: there are two peaks for INT8, and each figure names its own. The first is the best rate that the installed
-runtimes reach here, on layers that suit them. The second is the peak of the instruction set: the documented
-multiply-accumulates a cycle, times the clock measured under that load, times the number of cores.
+Rule: there are two peaks for INT8, and each figure names the peak that it means. The first is the best rate that the
+installed runtimes reach on this machine, on layers that suit them. The second is the peak of the instruction set. It is
+the product of the documented multiply-accumulates a cycle, the clock under INT8 load, and the number of cores.
 """
 
 from __future__ import annotations
@@ -41,13 +41,17 @@ COPY_BYTES = 128 << 20
 
 
 def measure(threads: int = 0) -> dict[str, Any]:
-    """Best rates with `threads` threads; 0 means one for each core that this process may use.
+    """Measure the best rates of this machine with `threads` threads; 0: one for each core that this process may use.
 
-    Keys: `int8_gmac_s`: rate of the best INT8 layer of the runtimes, in 1e9 multiply-accumulates a second;
-    `fp32_gmac_s`: rate of an FP32 matrix product; `int8_instruction_gmac_s`: peak of the instruction set, null if it is
-    unknown; `layer_of_instruction`: `int8_gmac_s` divided by this peak; `memory_gb_s`: 1e9 bytes a second, read and
-    written by one thread; `instructions`: derivation of the instruction set's peak, or why it is unknown; `rows`: rate
-    of each INT8 layer that was tried.
+    Rates are in 1e9 multiply-accumulates a second.
+    `threads`: number of threads.
+    `int8_gmac_s`: rate of the best INT8 layer of the runtimes.
+    `int8_instruction_gmac_s`: peak of the instruction set; null if unknown.
+    `layer_of_instruction`: `int8_gmac_s` divided by this peak; null if unknown.
+    `fp32_gmac_s`: rate of an FP32 matrix product.
+    `memory_gb_s`: bytes that one thread reads and writes, in 1e9 bytes a second.
+    `instructions`: derivation of the instruction set's peak, or `absent` with the reason.
+    `rows`: rate of each INT8 layer that was tried.
     """
     threads = threads or len(machine.here.cores())
     rows = _int8_rows(threads)
@@ -67,12 +71,14 @@ def measure(threads: int = 0) -> dict[str, Any]:
 
 
 def instruction_peak(flags: Sequence[str], threads: int) -> dict[str, Any]:
-    """Return the INT8 peak of the widest instruction set among the CPU `flags`, on at most `threads` cores.
+    """Return the INT8 peak of the widest instruction set that the processor has.
 
-    `set`, `sequence`, `source`: as in `INSTRUCTION_SETS`. `macs_a_cycle`: documented value for one core.
-    `issued_macs_a_cycle`: value measured with a loop without memory accesses. `clock_ghz`: clock under that load, with
-    its 95 % interval. `cores`: number of cores. `gmac_s`: macs_a_cycle x clock x cores. If there is no peak, the only
-    key is `absent`, the reason.
+    `flags`: flags of the processor. `threads`: largest number of cores that count.
+    Keys of the result: `set`, `sequence`, `source`: name and fields of the `InstructionSet`. `macs_a_cycle`:
+    multiply-accumulates a cycle of one core, as documented. `issued_macs_a_cycle`: the same, measured with a loop
+    without memory accesses. `clock_ghz`, `clock_low_ghz`, `clock_high_ghz`: clock under this load, with its 95 %
+    interval. `cores`: number of cores. `gmac_s`: macs_a_cycle x clock x cores, in 1e9 a second. If the peak is unknown,
+    the only key is `absent`, with the reason.
     """
     widest = instruction_set_of(flags)
     if widest is None:
@@ -128,7 +134,10 @@ def _best_ms(variants: dict[str, ProcessVariant]) -> dict[str, float]:
 
 
 def _memory_gb_s() -> float:
-    """Return the memory rate of one thread, 1e9 bytes a second, read plus written, by a copy larger than the caches."""
+    """Return the memory rate of one thread in 1e9 bytes a second, measured by a copy that is larger than the caches.
+
+    The rate counts bytes that are read and bytes that are written.
+    """
     source, target = np.ones(COPY_BYTES // 8), np.empty(COPY_BYTES // 8)
     best = float("inf")
     for _ in range(ROUNDS):
@@ -146,7 +155,11 @@ def _product() -> onnx.ModelProto:
 
 
 def _layers(side: int, channels: int, kernel: int) -> onnx.ModelProto:
-    """Return a network of `LAYERS` quantised convolutions in sequence, with NHWC bytes as input and output."""
+    """Return a network of `LAYERS` quantised convolutions in sequence.
+
+    Input and output are (1, side, side, channels) uint8.
+    `side`: height and width in pixels. `channels`: channels of every layer. `kernel`: side of each kernel.
+    """
     rng = np.random.default_rng(0)
     shape = (channels, channels, kernel, kernel)
     constants = {
@@ -195,10 +208,10 @@ def _model(nodes: list[Any], ends: list[Any], tensors: list[Any]) -> onnx.ModelP
 class InstructionSet:
     """An instruction set with INT8 multiply-accumulates.
 
-    `flags`: flags of /proc/cpuinfo that every core with the set has.
-    `sequence`: the instruction that multiplies and accumulates, or a few instructions in its place.
+    `name`: name of the set. `flags`: flags of /proc/cpuinfo that every core with the set has.
+    `sequence`: instruction that multiplies and accumulates, or the few instructions that do so together.
     `macs`: INT8 multiply-accumulates of one `sequence`.
-    `rates`: documented numbers of sequences a cycle, which differ from core to core.
+    `rates`: documented numbers of sequences a cycle; kinds of cores differ.
     `source`: source of `macs` and `rates`.
     """
 
@@ -214,7 +227,10 @@ class InstructionSet:
         return min(self.rates, key=lambda rate: abs(float(rate) - measured))
 
     def macs_a_cycle(self, measured: float) -> float:
-        """Return the documented multiply-accumulates a cycle of a core with `measured` sequences a cycle."""
+        """Return the documented multiply-accumulates a cycle of a core.
+
+        `measured`: measured sequences a cycle, which select one of `rates`.
+        """
         return float(self.macs * self.rate_nearest(measured))
 
 
@@ -273,7 +289,7 @@ INSTRUCTION_SETS = (
 
 
 def instruction_set_of(flags: Iterable[str]) -> InstructionSet | None:
-    """Return the widest set in `INSTRUCTION_SETS` that a core with these `flags` has; None if it has none of them."""
+    """Return the widest set in `INSTRUCTION_SETS` that a core with these `flags` has; None if it has no such set."""
     found = {*flags}
     return next((each for each in INSTRUCTION_SETS if found.issuperset(each.flags)), None)
 
@@ -289,14 +305,14 @@ TILE_CONFIG = bytes([1, *[0] * 15, *[64, 0] * 8, *[0] * 16, *[16] * 8, *[0] * 8]
 
 @dataclass(frozen=True)
 class Kernel:
-    """The machine code of an instruction set's loop.
+    """The machine code of a loop with the instructions of one instruction set.
 
     `body`: code of independent sequences, in hexadecimal, instructions separated by spaces.
     `sequences`: number of sequences in the body.
-    `imuls`: number of `imul` after each instruction in the loop that measures the clock. They take longer than the
-    instruction.
-    `cycles`: least number of cycles that the body takes; it determines the turns of a burst.
-    `before`, `after`: code before and after the loop.
+    `imuls`: number of `imul` after each instruction, in the loop that measures the clock. These `imul` together take
+    longer than the instruction.
+    `cycles`: least number of cycles that the body takes. A burst has BURST_CYCLES / `cycles` turns of the loop.
+    `before`, `after`: code before and after the loop, in hexadecimal.
     """
 
     body: str
@@ -353,7 +369,8 @@ KERNELS = {
 class Issued:
     """Measured rates, as means over the cores.
 
-    `rate`: sequences a cycle. `clock_ghz`: clock, with the 95 % interval of its median.
+    `rate`: sequences (see `InstructionSet`) that one core issues in a cycle. `clock_ghz`: clock. `clock_low_ghz`,
+    `clock_high_ghz`: 95 % interval of the clock.
     """
 
     rate: float
@@ -363,15 +380,15 @@ class Issued:
 
 
 def rate_loop(kernel: Kernel) -> bytes:
-    """Return machine code of a function that loops over the body.
+    """Return the machine code of a function that runs the body of `kernel` in a loop.
 
-    Its arguments are the number of turns (%rdi) and the tile configuration (%rsi).
+    The arguments of the function are the number of turns (%rdi) and the tile configuration (%rsi).
     """
     return _loop(kernel, bytes.fromhex(kernel.body))
 
 
 def clock_loop(kernel: Kernel) -> bytes:
-    """Return the function of `rate_loop` with `imul` after each instruction."""
+    """Return the machine code of the same function as `rate_loop`, but with `imul` after each instruction."""
     return _loop(kernel, b"".join(bytes.fromhex(each) + IMUL * kernel.imuls for each in kernel.body.split()))
 
 
@@ -382,10 +399,11 @@ def _loop(kernel: Kernel, body: bytes) -> bytes:
 
 
 def measure_issued(name: str, cores: Sequence[int]) -> Issued:
-    """Measure all `cores` while all of them work.
+    """Measure the clock of all `cores`, and how many sequences they issue in a cycle, while all of them work.
 
-    `name`: key of `KERNELS` for a set that this CPU has. Raises OSError for another architecture, and if Linux refuses
-    executable memory or the tiles of AMX.
+    A sequence is a few instructions (see `InstructionSet`).
+    `name`: name in `KERNELS` of an instruction set that this processor has. `cores`: numbers of the cores.
+    Raises OSError for an architecture other than x86-64, and if Linux refuses executable memory or the tiles of AMX.
     """
     if machine.here.architecture() != "x86_64":
         raise OSError("there are no loops for this architecture")
@@ -402,16 +420,17 @@ def measure_issued(name: str, cores: Sequence[int]) -> Issued:
 
 
 def _ask_for_tiles() -> None:
-    """Request the tile registers of AMX from Linux. Raises OSError."""
+    """Request the tile registers of AMX from Linux. Raises OSError if Linux refuses them."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.syscall(SYS_ARCH_PRCTL, ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA):
         raise OSError(ctypes.get_errno(), "the tiles of AMX are refused")
 
 
 def _on_core(core: int, kernel: Kernel, together: threading.Barrier) -> tuple[float, list[float]]:
-    """Return, for one core, its sequences a cycle, and the clock in GHz in each burst.
+    """Return (sequences that a core issues in a cycle, clock of the core in each burst in GHz).
 
-    This binds the calling thread to the core. Therefore the thread must end afterwards.
+    The call binds the calling thread to the core. Therefore the thread must end afterwards.
+    `core`: number of the core. `kernel`: loop to run. `together`: barrier at which the threads of all cores meet.
     """
     os.sched_setaffinity(0, {core})
     turns = BURST_CYCLES // kernel.cycles
@@ -426,7 +445,7 @@ def _on_core(core: int, kernel: Kernel, together: threading.Barrier) -> tuple[fl
 
 
 class _Code:
-    """Machine code in executable memory. Raises OSError if Linux refuses such memory."""
+    """A function of machine code in executable memory. The constructor raises OSError if Linux refuses such memory."""
 
     def __init__(self, code: bytes) -> None:
         self._memory = mmap.mmap(-1, len(code), prot=mmap.PROT_READ | mmap.PROT_WRITE | mmap.PROT_EXEC)
@@ -442,7 +461,7 @@ class _Code:
         self._memory.close()
 
     def ns(self, turns: int) -> int:
-        """Return the CPU time of this thread for `turns` turns of the loop, ns."""
+        """Run `turns` turns of the loop, and return the CPU time of this thread for them, ns."""
         begin = time.thread_time_ns()
         self._call(turns, TILE_CONFIG)
         return time.thread_time_ns() - begin

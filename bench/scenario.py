@@ -1,6 +1,6 @@
 """Does the pipeline answer as a service should: one query at a time, several, at random moments, all at once?
 
-Rule: the whole pipeline answers, from pose to presented frame. A result is valid, or says why it is not. MLCommons
+Rule: the whole pipeline answers, from pose to presented frame. A result is valid, or says why it is invalid. MLCommons
 LoadGen can create the same load and evaluate the run.
 """
 
@@ -47,15 +47,31 @@ def measure(
     runtime: str = "auto",
     seed: int = 1,
 ) -> dict[str, Any]:
-    """One row for each scenario and each `judge`, which evaluates the run: `trilane`, or `loadgen` of MLCommons.
+    """Measure one run of the avatar's pipeline for each scenario and each `judge`.
 
-    Scenarios: single-stream (the next query after each answer), multi-stream (the same with `samples` frames a query),
-    server (`rate` queries a second at random moments, each to be answered within `limit_ms`), offline (all queries at
-    once). The `verdict` of a row is VALID if the run lasted `seconds`, had as many queries as its percentile needs and,
-    for a server, had few enough late answers; `because` says why it is not. `percentile_ms`: latency that the share
-    `percentile` of all queries does not exceed.
+    The judge evaluates the run: `trilane`, or `loadgen` of MLCommons. There are four scenarios:
+    `single-stream`: the next query comes after each answer.
+    `multi-stream`: the same, with `samples` frames in a query.
+    `server`: `rate` queries a second come at random moments, and each is late after `limit_ms`.
+    `offline`: all queries come at once.
 
-    Raises BadInputError, MissingPartError, TrilaneError when a run fails.
+    `rows` has a row for each run:
+    `scenario`, `judge`: scenario and judge of the run.
+    `verdict`: VALID or INVALID. A run is valid if it lasted `seconds`, had as many queries as its percentile needs and,
+    for a server, had few enough late answers.
+    `because`: reasons why the run is invalid, by the judge `trilane`.
+    `queries`, `seconds`, `rate`: number of queries, duration, and queries a second.
+    `p50_ms`, `max_ms`: median and largest latency of the queries.
+    `percentile`: share of the queries that is judged.
+    `percentile_ms`: latency that this share of all queries does not exceed; null for too few queries.
+
+    Further keys:
+    `summaries`: LoadGen's summaries.
+    `accuracy`: image error of the avatar.
+    `config`: settings of the bench.
+
+    Raises BadInputError for an option out of range, MissingPartError if a library is not installed, TrilaneError if a
+    run fails.
     """
     _check(scenario, judge, {"--seconds": seconds, "--rate": rate, "--limit-ms": limit_ms, "--samples": samples})
     if "loadgen" in judge:
@@ -81,13 +97,15 @@ def measure(
 def run_scenario(
     pipeline: Pipeline, assets: Assets, load: Load, evaluated_by: str, policy: str
 ) -> tuple[dict[str, Any], str]:
-    """Do one run under `load`; return its row, and LoadGen's summary, empty if LoadGen does not evaluate the run.
+    """Do one run under `load`, and return (row of `measure`, LoadGen's summary).
 
+    The summary is "" if LoadGen does not evaluate the run.
     `pipeline`, `assets`: pipeline to run, and the arrays that its stages may read.
     `load`: load pattern and its limits.
     `evaluated_by`: one of `JUDGES`.
     `policy`: policy of the scheduler.
-    Raises TrilaneError when the run fails.
+    Raises TrilaneError if the run fails or a query gets no answer, MissingPartError without LoadGen, and
+    KeyboardInterrupt if a signal ends the run.
     """
     queries = Queries(size=load.samples if load.scenario == "multi-stream" and evaluated_by == "trilane" else 1)
     loadgen = LoadGenPlayer(load, queries) if evaluated_by == "loadgen" else None
@@ -112,10 +130,10 @@ def run_scenario(
 
 @dataclass
 class _Player(threading.Thread):
-    """A thread that asks for frames.
+    """A thread that requests frames from a run.
 
-    `requests`: queue of the run; the thread waits until the queue is open.
-    `work`: function that asks for frames and waits for the answers.
+    `requests`: queue of frame requests; the thread waits until the queue is open.
+    `work`: function that requests frames and waits for the answers.
     `errors`: errors that `work` raised.
     """
 
@@ -189,7 +207,7 @@ class Load:
     """The load on the pipeline.
 
     `scenario`: key of `PATTERNS`.
-    `seconds`: least duration.
+    `seconds`: least duration of the run.
     `rate`: queries a second, for server.
     `limit_ms`: limit on the percentile of the latency, for server.
     `samples`: number of frames in a query, for multi-stream.
@@ -210,14 +228,14 @@ class Load:
 
 @dataclass
 class Queries:
-    """The times at which queries were asked of a `FrameRequestQueue` and answered.
+    """The times at which queries were asked, and the times at which they were answered.
 
     Two threads share this object: the thread that asks and the thread of the run.
     `size`: number of frames in a query. The last frame answers the query.
-    `asked_s`, `answered_s`: monotonic seconds of the queries that count, in order.
-    `over`: whether no more answers count: the run has ended, or a frame was dropped or lost.
-    `why`: sentence about the dropped or lost frame.
-    `changed`: condition that is notified of every answer, and of `over`.
+    `asked_s`, `answered_s`: times of the queries that count, in order, in seconds of the monotonic clock.
+    `over`: whether further answers do not count, because the run has ended or a frame was dropped or lost.
+    `why`: sentence about the dropped or lost frame; "" if there is no such frame.
+    `changed`: condition that is notified of every answer, and when `over` becomes true.
     """
 
     size: int = 1
@@ -229,7 +247,7 @@ class Queries:
     _frames: int = 0
 
     def ask(self, requests: FrameRequestQueue, count: int = 1) -> None:
-        """Ask `count` queries now, and note the time."""
+        """Ask `count` queries now, and note the time. `requests`: queue of the run."""
         self.asked_s += [time.monotonic()] * count
         requests.request(count * self.size)
 
@@ -242,7 +260,10 @@ class Queries:
                 self.changed.notify_all()
 
     def unanswered(self, causes: Mapping[str, int]) -> None:
-        """Note dropped or lost frames, by cause: their queries get no answer. The `FrameRequestQueue` calls this."""
+        """Note that frames were dropped or lost, so that their queries get no answer.
+
+        The `FrameRequestQueue` calls this. `causes`: number of frames by cause.
+        """
         frames = ", ".join(f"{cause} {count}" for cause, count in causes.items())
         self.why = f"frames of queries were dropped or lost ({frames}), and every query must be answered: {KEEPS_ALL}"
         self.ended()
@@ -256,8 +277,7 @@ class Queries:
     def wait(self) -> None:
         """Wait until every query is answered.
 
-        Raises TrilaneError when a frame was dropped or lost, when the run ends first, or when nothing is answered for
-        `STALLED_S`.
+        Raises TrilaneError if a frame was dropped or lost, if the run ends first, or if no answer comes in `STALLED_S`.
         """
         with self.changed:
             while len(self.answered_s) < len(self.asked_s) and not self.over:
@@ -267,27 +287,29 @@ class Queries:
                 raise TrilaneError(self.why or "the run ended before every query was answered")
 
     def warm_up(self, requests: FrameRequestQueue) -> None:
-        """Ask a few queries that do not count, and wait for their answers."""
+        """Ask `WARM_UP` queries that do not count, and wait for their answers. `requests`: queue of the run."""
         self.ask(requests, WARM_UP)
         self.wait()
         self.restart()
 
     def restart(self) -> None:
-        """Count only the queries from now on."""
+        """Forget all queries, so that only later queries count."""
         self.asked_s.clear()
         self.answered_s.clear()
 
     @property
     def latencies_ms(self) -> list[float]:
-        """The latencies of the answered queries, ms, in the order in which these were asked."""
+        """The latencies of the answered queries in ms, in the order in which the queries were asked."""
         return [(end - begin) * 1e3 for begin, end in zip(self.asked_s, self.answered_s, strict=False)]
 
 
 def play(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
-    """Ask queries in the pattern of `load`, for its time and until there are enough, then wait for the answers.
+    """Ask queries in the pattern of `load`, and wait for the answers.
 
+    The queries go on for at least the duration of `load`, and until there are enough for its percentile.
     `requests`: queue of the run.
-    `queries`: gets the times of the queries.
+    `queries`: object that notes the times of the queries.
+    Raises the errors of `Queries.wait`.
     """
     queries.warm_up(requests)
     PATTERNS[load.scenario](load, requests, queries)
@@ -314,7 +336,10 @@ def _poisson(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
 
 
 def _all_at_once(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
-    """Ask all queries at once, as many as take the time of `load`. The rate of a few queries before shows how many."""
+    """Ask all queries at once, as many as the pipeline answers in the duration of `load`.
+
+    A few queries before show the rate of the answers.
+    """
     few = queries_needed(load.percentile)
     queries.ask(requests, few)
     queries.wait()
@@ -332,9 +357,9 @@ PATTERNS: dict[str, Callable[[Load, FrameRequestQueue, Queries], None]] = {
 
 
 def tail(queries: int, late: int, share: float) -> float:
-    """Return the probability that at most `late` of `queries` queries are late (binomial distribution).
+    """Return the probability that at most `late` of `queries` queries are late, by the binomial distribution.
 
-    `share`: probability of each query to be late.
+    `share`: probability that a single query is late.
     """
     logs = [
         math.lgamma(queries + 1)
@@ -348,9 +373,10 @@ def tail(queries: int, late: int, share: float) -> float:
 
 
 def queries_needed(percentile: float, late: int = 1) -> int:
-    """Return how many queries are needed to show, at `CONFIDENCE`, that the share `percentile` keeps a limit.
+    """Return how many queries show, with `CONFIDENCE`, that a share of all queries keeps a limit of the latency.
 
-    `late`: number of these queries that may be late. With one late query, 64 are needed for 0.90, and 662 for 0.99.
+    `percentile`: this share, such as 0.99. `late`: number of queries that may exceed the limit. With one late query, 64
+    queries are needed for 0.90, and 662 for 0.99.
     """
     low, high = late, late + 1
     while tail(high, late, 1 - percentile) > 1 - CONFIDENCE:
@@ -362,9 +388,10 @@ def queries_needed(percentile: float, late: int = 1) -> int:
 
 
 def bound_ms(latencies_ms: list[float], percentile: float) -> float | None:
-    """Return the latency that the share `percentile` of queries keeps, at `CONFIDENCE`; None for too few queries.
+    """Return the latency that the share `percentile` of all queries does not exceed, with `CONFIDENCE`.
 
-    As in LoadGen, it is the k-th largest latency, if k queries may be late.
+    As in LoadGen, the result is the k-th largest of `latencies_ms`, where k is the number of queries that may be late.
+    For too few queries, the result is None.
     """
     if len(latencies_ms) < queries_needed(percentile):
         return None
@@ -375,7 +402,7 @@ def bound_ms(latencies_ms: list[float], percentile: float) -> float | None:
 
 
 def verdict(load: Load, latencies_ms: list[float], lasted_s: float) -> list[str]:
-    """Return sentences that say why the result is invalid; none if it is valid.
+    """Return sentences that say why the result of a run is invalid; an empty list for a valid result.
 
     `load`: load of the run.
     `latencies_ms`: latencies of all queries.
@@ -408,7 +435,7 @@ SUMMARY = "mlperf_log_summary.txt"
 
 
 def load_generator() -> Any:
-    """Return the module `mlperf_loadgen`. Raises MissingPartError."""
+    """Return the module `mlperf_loadgen`. Raises MissingPartError if it is not installed."""
     try:
         return importlib.import_module("mlperf_loadgen")
     except ImportError:
@@ -417,10 +444,10 @@ def load_generator() -> Any:
 
 @dataclass
 class LoadGenPlayer:
-    """Lets LoadGen ask a run for frames.
+    """Lets LoadGen request frames from a run.
 
-    `load`: load pattern and its limits, which are passed to LoadGen.
-    `queries`: gets the times of the same frames, and an early end of the run.
+    `load`: load pattern and its limits, which LoadGen gets.
+    `queries`: object that notes the times of the same frames, and an early end of the run.
     `valid`, `summary`: whether LoadGen calls the run valid, and LoadGen's summary as text. `play` sets both.
     """
 
@@ -433,19 +460,22 @@ class LoadGenPlayer:
     _completed: int = 0
 
     def answered(self, frame: int) -> None:
-        """Note a presented frame; after the warm-up, pass it on to LoadGen. The `FrameRequestQueue` calls this."""
+        """Note that `frame` was presented; after the warm-up, tell LoadGen. The `FrameRequestQueue` calls this."""
         self.queries.answered(frame)
         if self._begun and not self.queries.over:
             self._completed = frame - WARM_UP + 1
             self._complete(frame - WARM_UP)
 
     def unanswered(self, causes: Mapping[str, int]) -> None:
-        """Note dropped or lost frames, by cause. They end the run. The `FrameRequestQueue` calls this."""
+        """Note that frames were dropped or lost, which makes further answers useless.
+
+        The `FrameRequestQueue` calls this. `causes`: number of frames by cause.
+        """
         self.queries.unanswered(causes)
         self.ended()
 
     def ended(self) -> None:
-        """Note that the run is over; the `FrameRequestQueue` calls this."""
+        """Note that the run is over, and complete LoadGen's open samples. The `FrameRequestQueue` calls this."""
         self.queries.ended()
         if self._begun:
             with self.queries.changed:  # two threads may come here, but no sample may be completed twice
@@ -455,7 +485,10 @@ class LoadGenPlayer:
                 self._complete(number)
 
     def play(self, requests: FrameRequestQueue) -> None:
-        """Warm up, then let LoadGen ask until it has enough answers. Raises TrilaneError if the run ends first."""
+        """Warm the pipeline up, and let LoadGen ask until LoadGen has enough answers. `requests`: queue of the run.
+
+        Raises TrilaneError if the run ends first, or if a frame was dropped or lost.
+        """
         lg = load_generator()
         self.queries.warm_up(requests)
         self._begun = True

@@ -1,7 +1,7 @@
 """How fast is the scheduler in virtual time, beside SimPy on the same model, and do equal inputs give equal runs?
 
-Rule: all models must present every frame at the same nanosecond; otherwise the bench fails. Their runs are interleaved,
-with the same service times, and with Python's garbage collector off.
+Rule: all models must present every frame at the same nanosecond. If a model does not, the bench fails. The models run
+in interleaved rounds, with the same service times, and with Python's garbage collector off.
 """
 
 from __future__ import annotations
@@ -41,29 +41,39 @@ Run = Callable[[], list[int]]
 
 
 def measure(minutes: float = 15.0, rounds: int = 7, seeds: int = 10, events: str = "") -> dict[str, Any]:
-    """The speed of Trilane's scheduler and of SimPy, and whether equal inputs give equal runs.
+    """Measure the speed of Trilane's scheduler and of SimPy, and check whether equal inputs give equal runs.
 
-    `minutes`: length of a run of the avatar's pipeline, at 60 frames a second, with policy `pipelined` and edges
-    `double`.
-    `rounds`: number of runs of each variant, interleaved.
-    `seeds`: number of seeds for which equal runs are compared.
-    `events`: folder of a run, or events.jsonl, to replay.
+    `minutes`: virtual duration of a run of the avatar's pipeline, at 60 frames a second, with the policy `pipelined`
+    and `double` edges.
+    `rounds`: number of interleaved rounds, which run each variant once.
+    `seeds`: number of seeds for which repeats of a run are compared.
+    `events`: run folder, or events.jsonl, to replay; "" for no replay.
 
-    Variants: `trilane` makes its report; `trilane, no report` does not; `trilane, recorded` also keeps a recording.
-    `simpy` is the model with SimPy's own parts, processes and resources. `simpy lean` has callbacks and one timeout a
-    job. Both models in SimPy keep no accounts and know no faults, policies or drops.
+    Three variants are Trilane's scheduler. `trilane` makes the report of the run; `trilane, no report` does not;
+    `trilane, recorded` also keeps a recording. Two variants are models in SimPy. `simpy` uses SimPy's own parts:
+    processes and resources. `simpy lean` has callbacks, and one timeout for each job. Both models keep no accounts, and
+    know no faults, policies or drops.
 
-    Rows: `way` (the variant), `frames`, median CPU `seconds` and the 95 % interval of that median (`seconds_low`,
-    `seconds_high`; with fewer than six rounds the least and largest), `events_per_s` (an event is a frame's release or
-    a job's end; all variants have the same number), `processed` (events by the variant's own count; SimPy needs several
-    for a job). `over_trilane`: seconds of each variant divided by the seconds of `trilane` in the same round, as median
-    and interval; below 1, the variant is faster. `over_simpy`, `over_simpy_lean`: the medians for `simpy` and `simpy
-    lean`. `agree`: number of frames that all variants present at the same nanosecond. `same_traces`: number of seeds
-    for which 10 repeats of a run give the same trace; in that run a unit dies. `different_traces`: number of different
-    traces over the seeds. `replay`: number of `steps` of the replayed `events`, and number of steps with a different
-    answer.
+    `rows` has a row for each variant (`way`):
+    `frames`: number of frames.
+    `events`: number of releases of frames and of ends of jobs, which is the same for all variants.
+    `seconds`: median CPU time of a run.
+    `seconds_low`, `seconds_high`: its 95 % interval; with fewer than six rounds, the least and the largest.
+    `events_per_s`: `events` divided by `seconds`.
+    `processed`: number of events by the variant's own count; SimPy needs several for a job.
 
-    Raises BadInputError when `events` is not a recording, TrilaneError when SimPy disagrees.
+    `over_trilane`: seconds of each variant divided by the seconds of `trilane` in the same round, as median and
+    interval; below 1, the variant is faster.
+    `over_simpy`, `over_simpy_lean`: the medians for `simpy` and `simpy lean`.
+    `agree`: number of frames that all variants present at the same nanosecond; null without SimPy.
+    `same_traces`: number of seeds for which 10 repeats of a run give the same trace; a unit dies in each of these runs.
+    `different_traces`: number of different traces among the seeds.
+    `replay`: number of `steps` in `events`, number of steps to which the scheduler now answers differently, and the
+    `first` of these.
+    `absent`: why SimPy is not measured.
+
+    Raises BadInputError for an option out of range and for `events` that is no recording. Raises TrilaneError if a
+    model presents a frame at another time.
     """
     if minutes <= 0 or rounds < 1 or seeds < 1:
         found = f"minutes {minutes:g}, rounds {rounds}, seeds {seeds}"
@@ -90,9 +100,9 @@ def measure(minutes: float = 15.0, rounds: int = 7, seeds: int = 10, events: str
 
 
 def compared(seconds: dict[str, list[float]]) -> dict[str, Any]:
-    """Return the ratios `over_trilane`, `over_simpy` and `over_simpy_lean` of `measure`.
+    """Return the keys `over_trilane`, `over_simpy` and `over_simpy_lean` of the result of `measure`.
 
-    `seconds`: CPU seconds of each round, by variant.
+    `seconds`: CPU seconds of each round, by variant. Without SimPy, the last two values are None.
     """
     ours = seconds[TRILANE]
     ratios = {
@@ -113,9 +123,9 @@ def _with_interval(values: list[float]) -> dict[str, float]:
 
 
 def _cpu_seconds(variants: dict[str, Run], rounds: int) -> dict[str, list[float]]:
-    """Return the CPU seconds of each round, by variant.
+    """Run all `variants` in interleaved rounds, and return the CPU seconds of each round, by variant.
 
-    Raises TrilaneError if variants present frames at different times.
+    Raises TrilaneError if a variant presents a frame at another time than `trilane`.
     """
     seconds: dict[str, list[float]] = {variant: [] for variant in variants}
     for number in range(rounds):
@@ -133,7 +143,7 @@ def _cpu_seconds(variants: dict[str, Run], rounds: int) -> dict[str, list[float]
 
 
 def _timed(run: Run) -> tuple[float, list[int]]:
-    """Return the CPU seconds of a run without garbage collection, and the result of `run`."""
+    """Call `run` without garbage collection, and return (CPU seconds of the call, its result)."""
     collects = gc.isenabled()
     gc.collect()
     gc.disable()
@@ -155,7 +165,11 @@ def _determinism(seeds: int) -> dict[str, int]:
 
 
 def _service(seed: int, frames: int) -> Service:
-    """Return service times of `frames` frames, from a table made beforehand, so that runs only pay for a look-up."""
+    """Return a function that gives the service time of each job, in ns.
+
+    The random times of all jobs are computed here. Therefore a run only spends the time of a look-up.
+    `seed`: seed of the random times. `frames`: number of frames.
+    """
     rng = np.random.default_rng(seed)
     table = {name: (ms * MS * rng.uniform(0.5, 1.5, frames)).astype(int).tolist() for name, ms in SERVICE_MS.items()}
     return lambda stage, _unit, frame, _begin_ns: table[stage][frame]
@@ -173,7 +187,10 @@ def _trilane_variants(graph: Graph, service: Service, frames: int) -> dict[str, 
 
 
 def _simpy_variants(graph: Graph, service: Service, frames: int) -> tuple[dict[str, Run], dict[str, dict[str, str]]]:
-    """Return the runs in SimPy by variant; without SimPy, no runs, and `absent` with the reason."""
+    """Return (runs, facts): functions that run the models in SimPy, by variant, and keys for the result of `measure`.
+
+    With SimPy, `facts` is {}. If SimPy is not installed, `runs` is {}, and `facts` has the key `absent`.
+    """
     try:
         models = _models()
     except ModuleNotFoundError:
@@ -187,14 +204,14 @@ def _run_model(model: Any, graph: Graph, service: Service, frames: int) -> list[
 
 
 def _models() -> dict[str, Any]:
-    """Return the models in SimPy by variant. Raises ModuleNotFoundError without SimPy."""
+    """Return the functions that make the models in SimPy, by variant. Raises ModuleNotFoundError without SimPy."""
     import simpy
 
     return {SIMPY: partial(SimpyPipeline, simpy), LEAN: partial(LeanPipeline, simpy)}
 
 
 def _processed(graph: Graph, service: Service, frames: int, variants: list[str]) -> dict[str, int]:
-    """Return how many events SimPy processes in each of `variants`."""
+    """Return how many events SimPy processes in a run of each of `variants`, by variant."""
     return {variant: _count_events(_models()[variant](graph, service, frames, PERIOD_NS).env) for variant in variants}
 
 
@@ -214,7 +231,10 @@ def _row(variant: str, frames: int, events: int, seconds: list[float], processed
 
 
 def _traces(seed: int) -> list[str]:
-    """Return a digest of all steps for each of `REPEATS` equal runs under the `deadline` policy. The DSP dies once."""
+    """Do the same run `REPEATS` times, and return a digest of all steps of each run.
+
+    The policy is `deadline`, and the DSP unit dies once. `seed`: seed of the service times.
+    """
     settings = Settings(SEED_FRAMES, "deadline", period_ns=PERIOD_NS, deadline_ns=3 * PERIOD_NS)
     digests = []
     for _ in range(REPEATS):
@@ -241,9 +261,11 @@ def _replayed(events: str) -> dict[str, Any]:
 
 
 class SimpyPipeline:
-    """The pipeline as SimPy's processes and resources. Every `period_ns`, a frame is released.
+    """The pipeline as processes and resources of SimPy.
 
-    `presented_ns`: ends of the last stage, in order, after `run`.
+    `simpy`: the module. `graph`: stages, units and edges. `service`: service time of each job. `frames`: number of
+    frames. `period_ns`: time between two released frames.
+    `env`: SimPy's environment. `presented_ns`: time at which each frame is presented, in order, filled by `run`.
     """
 
     def __init__(self, simpy: Any, graph: Graph, service: Service, frames: int, period_ns: int) -> None:
@@ -258,7 +280,7 @@ class SimpyPipeline:
         self.env.process(self._source(frames, period_ns))
 
     def run(self) -> list[int]:
-        """Run until the last frame is presented."""
+        """Run until the last frame is presented, and return `presented_ns`."""
         self.env.run()
         return self.presented_ns
 
@@ -283,12 +305,12 @@ class SimpyPipeline:
 
 
 class LeanPipeline:
-    """The same model with one timeout for each job, and callbacks instead of processes; nothing is checked.
+    """The model of `SimpyPipeline` with one timeout for each job, and with callbacks in place of processes.
 
-    SimPy only keeps the clock and the order of events; slots, held jobs and queues are plain numbers and lists. Times
-    equal those of `SimpyPipeline` to the nanosecond, unless two events have the same time. The model only suits chains
-    whose frames stay in order: edges drop nothing. Of a unit's stages with waiting frames, the last has the oldest
-    frame, which the unit takes.
+    SimPy only keeps the clock and the order of events. Slots, held jobs and queues are plain numbers and lists. Times
+    equal those of `SimpyPipeline` to the nanosecond, unless two events have the same time. The model is only right for
+    chains whose edges drop nothing, so that frames stay in order. A unit takes the oldest waiting frame, which waits at
+    the last of the unit's stages that have one. Parameters and attributes: see `SimpyPipeline`.
     """
 
     def __init__(self, simpy: Any, graph: Graph, service: Service, frames: int, period_ns: int) -> None:
@@ -309,7 +331,7 @@ class LeanPipeline:
         self._after(0, None, self._release)
 
     def run(self) -> list[int]:
-        """Run until the last frame is presented."""
+        """Run until the last frame is presented, and return `presented_ns`."""
         self.env.run()
         return self.presented_ns
 
@@ -324,7 +346,7 @@ class LeanPipeline:
         self._fill(self._chain[0][1])
 
     def _fill(self, unit: str) -> None:
-        """Hand jobs to `unit` until it holds `HELD_JOBS` jobs or none can run."""
+        """Hand jobs to `unit` until it holds `HELD_JOBS` jobs, or until no further job can run."""
         while self._held[unit] < HELD_JOBS:
             for position in self._positions[unit]:
                 if self._waiting[position] and (position == self._last or self._free[position]):

@@ -1,6 +1,6 @@
 """How much does an avatar's picture change if other avatars share its tensor, by the margin between them?
 
-Rule: each avatar is drawn in the same cell, with its neighbours and without them. Nothing else differs.
+Rule: each avatar is drawn twice in the same cell of the tensor, with and without its neighbours. Nothing else differs.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ SECONDS = 10.0
 
 @dataclass(frozen=True)
 class _View:
-    """A moment of the scene.
+    """The avatars and the camera at one moment of the scene.
 
     `joints`: skinning matrices (55,3,4) of each avatar.
     `view`, `projection`: matrices (4,4) of the camera.
@@ -56,14 +56,24 @@ class _View:
 def measure(
     avatars: int = 3, views: int = 12, size: str = "512", margins: tuple[int, ...] = (0, 4, 8, MARGIN_PX, 24, 32)
 ) -> dict[str, Any]:
-    """The default avatar, `avatars` times in one tensor, in `views` moments of a scene, compared with ground truth.
+    """Compare pictures of the default avatar with ground truth, with and without neighbours in its tensor.
 
-    Keys: `rows`, one per margin in tensor pixels: `loss_db_median`, `loss_db_worst` (PSNR without neighbours minus PSNR
-    with them), `psnr_db_alone` (median without neighbours), `bytes_mean`, `bytes_max` (difference of the two pictures
-    inside the cell), `cell_height` (median, tensor pixels); `sources`; `bound_db`; `margin_px`, the margin of a run;
-    `config`.
+    The tensor has `avatars` copies of the avatar. The copies are drawn at `views` moments of a scene.
 
-    Raises BadInputError, MissingPartError.
+    `rows` has a row for each margin:
+    `margin`: pixels of the tensor between two avatars.
+    `loss_db_median`, `loss_db_worst`: PSNR without neighbours minus PSNR with neighbours, in dB.
+    `psnr_db_alone`: median PSNR without neighbours.
+    `bytes_mean`, `bytes_max`: mean and largest difference of the two pictures in an avatar's cell, in bytes.
+    `cell_height`: median height of a cell in tensor pixels.
+
+    Further keys:
+    `bound_db`: largest acceptable loss of PSNR, in dB.
+    `margin_px`: margin of a run.
+    `sources`: source of the rows.
+    `config`: settings of the bench.
+
+    Raises BadInputError for an option out of range, MissingPartError if a library is not installed.
     """
     _check(avatars, views, size, margins)
     fixture = _CrowdFixture()
@@ -90,7 +100,11 @@ def measure(
 
 
 class _CrowdFixture:
-    """The default avatar on the GPU, its network, and its ground truth."""
+    """The default avatar on the GPU, with its network and its ground truth.
+
+    `shaped`: body of the avatar. `network`: its quantised network. `packed`: pass that draws tensors. `avatar`: the
+    avatar, ready to be drawn by `packed`.
+    """
 
     def __init__(self) -> None:
         bundle = load_bundle("default")
@@ -103,7 +117,11 @@ class _CrowdFixture:
         self._bound: dict[Shape, tuple[U8, U8, Binding]] = {}
 
     def compare(self, view: _View) -> list[tuple[float, float, float, float, float]]:
-        """Return, for each avatar: PSNR with and without neighbours, mean and largest byte difference, cell height."""
+        """Return a tuple of five numbers for each avatar that is visible in `view`.
+
+        The first two are the PSNR in dB with and without neighbours. The next two are the mean and the largest
+        difference of the two pictures in bytes. The last is the height of the avatar's cell in tensor pixels.
+        """
         everyone = self._picture(view, range(len(view.joints)))
         rows = []
         for k, (crop, (top, left, height, width)) in enumerate(view.layout.crops):
@@ -119,7 +137,10 @@ class _CrowdFixture:
         return rows
 
     def _picture(self, view: _View, shown: Sequence[int]) -> U8:
-        """Return the network's picture (h,w,4) uint8 of a tensor with only the avatars `shown`, given by number."""
+        """Return the network's picture (h,w,4) uint8 of a tensor that contains only some avatars of `view`.
+
+        `shown`: numbers of these avatars.
+        """
         shape = view.layout.shape
         tensor, image, binding = self._binding(shape)
         target = self.packed.begin(shape)
@@ -142,7 +163,11 @@ class _CrowdFixture:
 
 
 def _views(fixture: _CrowdFixture, avatars: int, views: int, size: str, margin: int) -> Iterator[_View]:
-    """Yield moments, spread over the default motion. Moments in which an avatar is out of view are left out."""
+    """Yield moments that are evenly spread over the default motion, without those at which an avatar is out of view.
+
+    `fixture`: avatar to place. `avatars`: number of avatars. `views`: number of moments. `size`: tensor size, as in
+    `measure`. `margin`: tensor pixels between two avatars.
+    """
     specs = tuple(
         AvatarSpec(position=((k - (avatars - 1) / 2) * STEP_M, 0.0, -BACK_M * (k % 2))) for k in range(avatars)
     )

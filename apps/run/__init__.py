@@ -1,4 +1,4 @@
-"""Turns the options of a run into a run folder, with its report, its files and its check.
+"""Turns the options of a run into a run folder with a report, further files and, if requested, a check of the pictures.
 
-It may use every lower folder and apps/experiments/, but not apps/cli/.
+This folder may import from every lower folder and from apps/experiments/, but not from apps/cli/.
 """

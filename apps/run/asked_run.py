@@ -1,7 +1,7 @@
 """A run from its options to its run folder, for the command line and for programs alike.
 
-Rule: nothing is printed here. To save time, the fork server starts first and imports the units' modules in parallel.
-Therefore, each function here imports its own modules only when it is called.
+Rule: nothing is printed here. To save time, the fork server starts first, and imports the units' modules while this
+process prepares the run. Therefore, each function here imports the modules that it needs only when it is called.
 """
 
 from __future__ import annotations
@@ -30,9 +30,13 @@ def run_asked(
 ) -> RunOutcome:
     """Check the options, run the scene or pipeline file, and leave its run folder.
 
-    `hooks`: function that returns a context manager, which yields the callbacks. It is entered after the checks.
+    `options`: options of the run.
+    `hooks`: function that returns a context manager. The context manager yields the callbacks of the run, and is
+    entered when a run begins, or when a long check has a message.
     `command`: words of the command line.
-    Raises BadInputError and MissingPartError before a run that cannot begin, TrilaneError if no frame was presented.
+    Raises BadInputError for wrong input and MissingPartError for an absent part, both before the run begins. Raises
+    TrilaneError if no frame was presented, or if a file could not be written. Raises KeyboardInterrupt if a signal
+    ended the run before its first frame.
     """
     from trilane.pipeline.pipeline_file import is_pipeline_file
 
@@ -47,7 +51,7 @@ def run_asked(
 
 
 def _require_free(options: RunOptions) -> None:
-    """Raise BadInputError early if the folder of `--out` exists. The run folder checks this again later."""
+    """Raise BadInputError if the folder of `--out` exists, before any work. The run folder checks again later."""
     from trilane.apps.run.run_folder import require_free
 
     if options.out is not None:
@@ -61,10 +65,11 @@ def prepare(
     command: tuple[str, ...] = (),
     hooks: Callable[[], AbstractContextManager[Hooks]] | None = None,
 ) -> Prepared:
-    """Check the options and return the prepared run. Raises BadInputError and MissingPartError if it cannot begin.
+    """Check `options`, and return the prepared run.
 
     `gl`: function from `early_processes`. `command`: words of the command line.
-    `hooks`: as in `run_asked`; entered for a message if the check takes long.
+    `hooks`: see `run_asked`; a message is sent if the check takes long. None: no message is sent.
+    Raises BadInputError for wrong input, and MissingPartError if a part that the run needs is absent.
     """
 
     def say(text: str) -> None:
@@ -94,9 +99,10 @@ def prepare(
 
 
 def _with_remade_avatar(options: RunOptions) -> tuple[RunOptions, tuple[str, ...]]:
-    """Return `options` with the variant of the avatar that they request, and a note about the variant.
+    """Return (options, notes): `options` with the variant of the avatar that they request, and notes on the variant.
 
-    Raises BadInputError, MissingPartError.
+    Raises BadInputError for a scene of several avatars, for a check of an untrained network, and for a variant that
+    cannot be made. Raises MissingPartError without PyTorch.
     """
     from trilane.apps.avatar_files import is_untrained, remade_avatar
     from trilane.avatars.bundle import load_bundle
@@ -115,8 +121,8 @@ def _with_remade_avatar(options: RunOptions) -> tuple[RunOptions, tuple[str, ...
 def _require_check(checked: Checked) -> None:
     """Raise an error before the run if `--check` is not possible.
 
-    Raises BadInputError for a scene with a HUD, because the pictures to compare with have none. Raises MissingPartError
-    if a library is missing.
+    Raises BadInputError for a scene with a HUD, because the reference pictures have no HUD. Raises MissingPartError if
+    a library that the check needs is not installed.
     """
     from trilane.apps.run.run_job import require_parts
     from trilane.avatars.bundle import load_bundle
@@ -128,9 +134,9 @@ def _require_check(checked: Checked) -> None:
 
 @contextmanager
 def early_processes() -> Iterator[tuple[UnitStarter, GlFacts]]:
-    """Start the fork server and a process that examines the OpenGL driver, which may crash.
+    """Start the fork server and, because an OpenGL driver may crash, a separate process that examines the driver.
 
-    Yields the fork server, and a function that waits for the facts about OpenGL and returns them.
+    Yield (fork server, function). The function waits for the facts about OpenGL and returns them.
     Raises TrilaneError if there is too little memory for a run.
     """
     require_memory()
@@ -151,8 +157,8 @@ def run_prepared(
 ) -> RunOutcome:
     """Run a prepared scene and leave its run folder. Raises the errors of `run_asked`.
 
-    `hooks`: as in `run_asked`. `starter`, `gl`: fork server and function from `early_processes`. `watched`: viewer of
-    the run, if any.
+    `prepared`: result of `prepare`. `hooks`: see `run_asked`. `starter`, `gl`: fork server and function from
+    `early_processes`. `watched`: viewer of the run; None if nobody watches the run.
     """
     from trilane.apps.run.report_facts import made_facts
     from trilane.apps.run.run_folder import default_place

@@ -1,7 +1,7 @@
 """A run at the pace of a chip: how long each job takes, and how the run compares with the same run in virtual time.
 
-Rule: the chip's times come from its hardware profile, and the order of jobs comes from the scheduler. A job that takes
-this machine longer than the chip is counted in the report.
+Rule: the chip's times come from its hardware profile, and the order of jobs comes from the scheduler. The report counts
+the jobs for which this machine needed longer than the chip.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Pace:
 
     `profile`: hardware profile of the chip, by name. `performance_profile`: performance profile of the chip.
     `slow_motion`: factor by which the run is slower than the chip.
-    `stage_ns`: time to which a job of each stage is stretched, ns.
+    `stage_ns`: time in ns to which a job is stretched, by stage.
     """
 
     profile: str
@@ -50,10 +50,11 @@ class Pace:
 
 
 def pace_of(config: RunConfig, profile: str, slow_motion: float = 1.0) -> Pace:
-    """Return the pace of a chip for the run that `config` describes. Raises BadInputError.
+    """Return the pace of a chip for the run that `config` describes.
 
     The times are for the largest tensor that the scene's size allows, with all avatars in view.
     `profile`: hardware profile of the chip, by name or TOML file. `slow_motion`: factor on all times.
+    Raises BadInputError for a profile that describes no chip, or a factor outside of 0 to MAX_SLOW_MOTION.
     """
     if not 0 < slow_motion <= MAX_SLOW_MOTION:
         raise BadInputError("--slow-motion", f"{slow_motion:g}", f"above 0, at most {MAX_SLOW_MOTION:g}")
@@ -69,7 +70,10 @@ def pace_of(config: RunConfig, profile: str, slow_motion: float = 1.0) -> Pace:
 
 
 def release_fps(pace: Pace, scene_fps: float) -> float:
-    """Return the rate at which a paced policy releases frames: `scene_fps`, divided by the slow motion."""
+    """Return the rate at which a paced policy releases frames, in frames a second.
+
+    The rate is `scene_fps`, the rate of the scene, divided by the factor of the slow motion.
+    """
     return scene_fps / pace.slow_motion
 
 
@@ -79,7 +83,8 @@ def compare(
     """Compare a run at a chip's pace with the same run in virtual time, and return the block `pace` of report.json.
 
     `pace`, `policy`, `frames`, `edge`: pace, policy, number of frames and edge of the run. `jobs`: jobs of the run.
-    `fps`: rate of its scene. The keys of the result are the fields of `trilane.apps.run.report.PaceComparison`.
+    `fps`: rate of the scene, in frames a second. The keys of the result are the fields of
+    `trilane.apps.run.report.PaceComparison`.
     """
     late = [job for job in jobs if job.end_ns - job.begin_ns > pace.stage_ns[job.stage] + SLACK_NS]
     late_frames = sorted({job.frame for job in late})
@@ -101,13 +106,17 @@ def compare(
 
 
 def _skipping(jobs: Sequence[JobRecord]) -> set[int]:
-    """Return the numbers of the frames that took the pipeline's bypass."""
+    """Return the numbers of the frames that took the pipeline's bypass. `jobs`: all jobs of the run."""
     ends, between = ({job.frame for job in jobs if job.stage == stage} for stage in (BYPASS[1], BEFORE_INFER[-1][0]))
     return ends - between
 
 
 def _virtual_ms(pace: Pace, settings: Settings, edge: str, skipping: Set[int]) -> float:
-    """Return the median time between presented frames in virtual time, ms. `skipping`: frames that take the bypass."""
+    """Return the median time between presented frames in virtual time, ms.
+
+    `pace`: pace of all jobs. `settings`: settings of the scheduler. `edge`: rule of all edges. `skipping`: numbers of
+    the frames that take the bypass.
+    """
     graph = replace(application_graph(edge), bypass=BYPASS)
     result = simulate(
         graph,
@@ -120,13 +129,16 @@ def _virtual_ms(pace: Pace, settings: Settings, edge: str, skipping: Set[int]) -
 
 
 def _presented(jobs: Sequence[JobRecord]) -> tuple[list[int], list[int]]:
-    """Return two lists: the numbers of the presented frames, in order, and the times of their presentation, ns."""
+    """Return (numbers, times): the presented frames in the order of presentation, and when each was presented, ns."""
     ends = sorted((job.end_ns, job.frame) for job in jobs if job.stage == "present")
     return [frame for _, frame in ends], [end for end, _ in ends]
 
 
 def _in_time(jobs: Sequence[JobRecord], late_frames: Sequence[int]) -> list[tuple[int, int]]:
-    """Return (number, ns since the previous presented frame) for each frame whose time no late frame has changed."""
+    """Return (frame number, ns since the previous presented frame) for each frame that no late frame disturbed.
+
+    `jobs`: all jobs of the run. `late_frames`: numbers of the frames with a job that took too long.
+    """
     frames, ends = _presented(jobs)
     disturbed = {near for frame in late_frames for near in range(frame - 1, frame + WAKE_FRAMES)}
     pairs = zip(frames[1:], np.diff(ends).tolist(), strict=True)

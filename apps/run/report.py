@@ -26,8 +26,8 @@ EXPECTED = "a run folder or its report.json"
 class Cpu(Record):
     """The processor.
 
-    `model`: its name. `architecture`: such as x86_64.
-    `flags`: present instruction sets that matter for the speed of networks.
+    `model`: name of the processor. `architecture`: instruction set architecture, such as x86_64.
+    `flags`: flags of present instruction sets that matter for the speed of networks.
     `cores`: number of cores of the machine. `cores_allowed`: numbers of the cores that the run could use.
     """
 
@@ -39,7 +39,12 @@ class Cpu(Record):
 
 
 class GlDriver(Record):
-    """The OpenGL driver. `hardware`: false if the CPU draws. `limits`: values of OpenGL's limits, by constant."""
+    """The OpenGL driver.
+
+    `vendor`, `renderer`, `version`: texts by which the driver names itself.
+    `hardware`: whether a GPU draws; false for a driver that draws on the CPU.
+    `limits`: values of OpenGL's limits, by the name of the constant.
+    """
 
     vendor: str
     renderer: str
@@ -52,10 +57,12 @@ class MachineFacts(Record):
     """The machine that was measured.
 
     `system`: operating system and kernel.
-    `python`, `trilane`: versions; `trilane` is null if Trilane is not installed as a package.
-    `hardware_counters`: hardware counters that were read for each job, or `absent` and why; null in older reports.
-    `memory_bytes`: physical memory.
-    `gl`: OpenGL driver, null when there is none.
+    `python`, `trilane`: versions of Python and Trilane; `trilane` is null if Trilane is not installed as a package.
+    `cpu`: processor.
+    `hardware_counters`: hardware counters that were read for each job, or `absent` and the reason; null in older
+    reports.
+    `memory_bytes`: size of the physical memory.
+    `gl`: OpenGL driver; null for a machine without such a driver.
     `packages`: version of each installed package that Trilane uses.
     """
 
@@ -70,7 +77,7 @@ class MachineFacts(Record):
 
 
 class WorkPlan(Record):
-    """Facts that follow from the scene's size. `tensor_shapes`: (height, width) of the possible tensors, in pixels."""
+    """The tensor shapes that a run may use. `tensor_shapes`: (height, width) of each shape, in pixels."""
 
     tensor_shapes: tuple[Shape, ...]
 
@@ -80,13 +87,13 @@ class PaceComparison(Record):
 
     `profile`: hardware profile of the chip. `performance_profile`: performance profile of the chip.
     `slow_motion`: factor by which the run is slower than the chip.
-    `stage_ms`: time to which a job of each stage was stretched.
-    `host_slower`: number of jobs, by stage, that took longer than that on this machine.
-    `late_frames`: numbers of the frames that had such a job.
+    `stage_ms`: time in ms to which a job was stretched, by stage.
+    `host_slower`: number of jobs that took longer on this machine than `stage_ms`, by stage.
+    `late_frames`: numbers of the frames that had a job which took longer.
     `virtual_ms`: median frame time in virtual time.
-    `measured_ms`: median frame time of the run, without the late frames and their neighbours; null if none is left.
+    `measured_ms`: median frame time of the run, without the late frames and their neighbours; null if no frame is left.
     `compared_share`: share of the frames that `measured_ms` counts.
-    `ratio`: `measured_ms` / `virtual_ms`; null if no frame was compared.
+    `ratio`: `measured_ms` / `virtual_ms`; null if `measured_ms` is null.
     """
 
     profile: str
@@ -109,12 +116,12 @@ class Video(Record):
 
 
 class FrameErrors(Record):
-    """The error of frames of this run, compared with other pictures in the region that contains the avatars.
+    """The image error of a run's frames against reference pictures, in the region that contains the avatars.
 
-    `against`: the other pictures, in words.
+    `against`: reference pictures, in words.
     `psnr_db`, `mae` (steps of 1/255), `ssim`, `flip`: means over the frames; `ssim` is null if the region is too small.
-    `worst_psnr_db`: PSNR of the worst frame. `p1_psnr_db`: 1st percentile of the PSNR, null in older reports.
-    `iou`: mean overlap of the pixels that differ from the background.
+    `worst_psnr_db`: PSNR of the worst frame. `p1_psnr_db`: 1st percentile of the PSNR; null in older reports.
+    `iou`: mean IoU (intersection over union) of the pixels that differ from the background.
     """
 
     against: str
@@ -128,10 +135,10 @@ class FrameErrors(Record):
 
 
 class Check(FrameErrors):
-    """The error of frames of this run, compared with the truth if it is known, else with the float path.
+    """The image error of a run's frames against the truth, or against the float path if the truth is unknown.
 
     `frames`: number of compared frames. `numbers`: numbers of these frames.
-    `float_path`: comparison with the float path, if the other figures compare with the truth; else null.
+    `float_path`: image error against the float path; null if the other figures are already against the float path.
     """
 
     frames: int
@@ -140,11 +147,11 @@ class Check(FrameErrors):
 
 
 class Made(Record):
-    """The command that made a report, and its Trilane.
+    """The command that made a report, and the version of Trilane that the command ran.
 
-    `at`: time at which the command began, UTC, ISO 8601.
+    `at`: time just before the run, UTC, ISO 8601.
     `command`: words of the command line.
-    `trilane`: version; null if Trilane is not installed as a package.
+    `trilane`: version of Trilane; null if Trilane is not installed as a package.
     `revision`: revision of the git checkout that Trilane ran from; null outside of a checkout.
     `modified`: whether tracked files of that checkout were modified; null outside of a checkout.
     """
@@ -157,9 +164,10 @@ class Made(Record):
 
 
 class UnitPlace(Record):
-    """The place of a unit. `cores`: numbers of its cores.
+    """The cores and threads of a unit.
 
-    `threads`: number of its threads: one for each core, or a single thread that the kernel runs on any of the cores.
+    `cores`: numbers of the unit's cores.
+    `threads`: number of the unit's threads: one for each core, or a single thread that may run on any of the cores.
     """
 
     cores: tuple[int, ...]
@@ -167,24 +175,31 @@ class UnitPlace(Record):
 
 
 class OtherPlacement(Record):
-    """A placement that was not chosen. `units`: place of each unit. `predicted_ms`: predicted frame time."""
+    """A placement that was not chosen.
+
+    `units`: place of each unit, by name. `predicted_ms`: predicted frame time, ms.
+    """
 
     units: dict[str, UnitPlace]
     predicted_ms: float
 
 
 class TriedPlacementFacts(Record):
-    """A placement that was tried with real frames. `units`: place of each unit. `frame_ms`: measured frame time."""
+    """A placement that was tried with real frames.
+
+    `units`: place of each unit, by name. `frame_ms`: measured frame time, ms.
+    """
 
     units: dict[str, UnitPlace]
     frame_ms: float
 
 
 class UnitTime(Record):
-    """The measured time of a unit for one frame with `threads` threads, in ms.
+    """The measured time of a unit for one frame.
 
-    `ms`: duration of the unit's jobs, without the time in which the unit had no core.
-    `core_ms`: CPU time of each thread.
+    `unit`: name of the unit. `threads`: number of the unit's threads in this measurement.
+    `ms`: time of the unit's jobs for a frame, without the time in which the unit had no core.
+    `core_ms`: CPU time of the jobs, divided by `threads`, ms; at most `ms`.
     """
 
     unit: str
@@ -196,14 +211,16 @@ class UnitTime(Record):
 class PlacementFacts(Record):
     """The placement of the units, and how it was chosen (`trilane.stages.placing`).
 
-    `how`: tried, measured, asked (by the user) or rule. `why`: reason in words.
-    `units`: place of each unit.
+    `how`: way in which the placement was chosen. `tried`: by a trial with real frames. `measured`: by predictions from
+    measured times. `asked`: by the user. `rule`: by the rule for any run.
+    `why`: reason in words.
+    `units`: place of each unit, by name.
     `measured_at`: time of the measurement, UTC. This field and all fields below are absent if nothing was measured.
     `predicted_ms`: predicted frame time under the run's policy.
-    `rule`, `rule_ms`: placement by the general rule, and its predicted frame time.
+    `rule`, `rule_ms`: placement by the rule for any run, and its predicted frame time.
     `alternatives`: next best placements, the shortest predicted frame time first.
     `times`: a row for each unit and number of threads; medians over distinct frames, with one job at a time.
-    `tried`: placements that were tried with real frames before this run or an earlier one; absent if none was.
+    `tried`: placements that were tried with real frames, before this run or an earlier run; absent without a trial.
     """
 
     how: Literal["tried", "measured", "asked", "rule"]
@@ -221,10 +238,11 @@ class PlacementFacts(Record):
 class TensorSize(Record):
     """One size of a planned tensor.
 
-    `work`: number of pixels, as a share of those that the network was trained for.
+    `work`: number of the tensor's pixels, divided by the number that the network was trained for.
     `most_pixels`: largest number of pixels for one avatar.
     `frames`: number of presented frames with this size.
-    `psnr_loss_db`: loss of PSNR in the avatars' validation; null if an avatar has no figures by size.
+    `psnr_loss_db`: largest loss of PSNR among the avatars, from their validation; null if an avatar has no figures for
+    this size.
     """
 
     work: float
@@ -249,8 +267,9 @@ class Resolution(Record):
 class VerdictBound(Record):
     """The bound of the frame time.
 
-    `unit`: the report's `bottleneck`. `share`: share of this unit in the critical path.
-    `stages`: the stage that bounds, followed by other stages of the unit with a noticeable share of the path.
+    `unit`: unit that bounds the frame time, or another cause, such as `other programs`.
+    `share`: share of this unit in the critical path.
+    `stages`: names of the stage that bounds, and after it of the unit's stages with a noticeable share of the path.
     """
 
     unit: str
@@ -261,8 +280,9 @@ class VerdictBound(Record):
 class VerdictFacts(Record):
     """The verdict of the run (`trilane.apps.run.verdict`).
 
-    `passed`: `pass` in the file. `target_fps`: rate that the run must hold, in frames a second.
-    `bound`: null without a critical path. `trusted`: whether the machine was quiet. `why`: reasons in one line.
+    `passed`: whether the run passes; `pass` in the file. `target_fps`: rate that the run must hold, in frames a second.
+    `bound`: bound of the frame time; null if unknown. `trusted`: whether the times can be trusted.
+    `why`: reasons in one line.
     """
 
     passed: bool = Field(alias="pass")
@@ -278,7 +298,7 @@ OptionValue = str | int | float | bool | tuple[str, ...] | None
 class Preamble(Record):
     """The first keys of a report.
 
-    `schema_`: `schema` in the file, 1.
+    `schema_`: version of the format, 1; `schema` in the file.
     `clock`: clock of all times.
     `machine`: machine on which the run was measured.
     `config`: the RunConfig as JSON, without folders, with `policy` and `edge`.
@@ -295,27 +315,30 @@ class Preamble(Record):
 
 
 class Report(RunMetrics, Preamble):
-    """The whole document: the keys of `Preamble`, the other keys of `RunMetrics`, and these.
+    """The whole document: the keys of `Preamble`, the other keys of `RunMetrics`, and the following keys.
 
-    `verdict`: whether the run holds its rate, what bounds it, and whether it can be trusted; absent in older reports.
-    `made`: time, command line and Trilane of the run; null if the caller gave no such facts.
+    `temperature_c`: temperatures in °C.
+    `verdict`: judgement whether the run holds its rate, what bounds it, and whether its times can be trusted; absent in
+    older reports.
+    `made`: time, command line and Trilane of the run; null for a run without a command line.
     `options`: value of every option of the run, by name; empty in older reports.
-    `pids`: process of each unit at the end.
-    `startup_ms`: time until each unit was ready.
-    `stage_metrics`: `figures` in the file: mean of each metric of a stage's jobs.
+    `pids`: process number of each unit at the end of the run, by unit.
+    `startup_ms`: time until the unit was ready, by unit.
+    `stage_metrics`: mean of each metric of a stage's jobs, by metric, by stage; `figures` in the file.
     `messages`: sentences for a person about faults during the run.
     `interrupted`: whether a signal ended the run.
-    `failure`: reason for an early end, else null.
-    `baseline`: metrics of a `sequential` run of the same scene, null without such a run.
-    `placement`: cores of the units and the reason for them; absent if they were not placed for this run.
+    `failure`: reason for an early end; null for a run that did not fail.
+    `baseline`: metrics of a `sequential` run of the same scene; null without such a run.
+    `placement`: cores of the units and the reason for them; absent if the units were not placed for this run.
     `resolution`: sizes of a planned tensor; absent if the run does not reduce the tensor to have frames in time.
-    `pace`: comparison with virtual time, for a run at a chip's pace; else absent.
-    `accuracy`: by avatar, the result of `trilane.avatars.validation.accuracy_of`: figures, or why there are none.
-    `check`: error of frames of this run; absent if no check was requested.
+    `pace`: comparison with virtual time; absent for a run that does not keep a chip's pace.
+    `accuracy`: figures of each avatar's validation, or why there are none, by avatar; the result of
+    `trilane.avatars.validation.accuracy_of`.
+    `check`: image error of frames of this run; absent without a check.
     `sources`: source of figures, by their key or by a key that contains them (dotted path); the longest key applies.
     `notes`: format of each file that was read, and choices that were made for the run.
-    `video`: null if no frame was recorded.
-    `checksum`: SHA-256 over the presented pictures, null if no frame was recorded.
+    `video`: facts about video.mp4; null if no frame was recorded.
+    `checksum`: SHA-256 over the presented pictures; null if no frame was recorded.
     """
 
     caps: Caps
@@ -342,16 +365,19 @@ class Report(RunMetrics, Preamble):
 
 
 def write_report(report: Report, target: Path) -> None:
-    """Write `report` as JSON. Raises ValueError for a NaN, an infinity, or a report that could not be read back."""
+    """Write `report` as JSON to the file `target`.
+
+    Raises ValueError for a NaN, an infinity, or a report that could not be read back.
+    """
     document = report.as_json()
     Report.model_validate(document)
     target.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def read_report(path: Path) -> Report:
-    """Return the report in `path`, a file or a run folder.
+    """Return the report at `path`, which is report.json or a run folder.
 
-    Raises BadInputError that names the first wrong key, or says that a newer Trilane wrote the report.
+    Raises BadInputError for a file that cannot be read, that has a wrong key, or that a newer Trilane wrote.
     """
     file = path / "report.json" if path.is_dir() else path
     try:

@@ -1,9 +1,9 @@
-"""Builds report.json from the result of a run, with the source of every figure and the command that made it.
+"""Builds report.json from the result of a run, with the source of every figure and the command that made the report.
 
 `report_of` is for a run of any pipeline. `avatar_report` adds the facts of a run of avatars, such as tensor sizes.
 
-Rule: the longest matching key of `SOURCES` gives the source of a figure, and every figure matches a key. The run counts
-the frames of each tensor size. The error of a size comes from the avatars' validation, or is unknown.
+Rule: the longest matching key of `SOURCES` gives the source of a figure, and every figure matches a key. The number of
+frames of each tensor size comes from the run. The image error of a tensor size comes from the avatars' validation.
 """
 
 from __future__ import annotations
@@ -80,8 +80,8 @@ def report_of(
     """Build the report of a run on the host clock. Raises ValueError that names a wrong or unknown key.
 
     `result`: result of the run. `config`: block `config` of the report. `machine`: result of `machine_facts`.
-    `baseline`: result of the `sequential` run of the same pipeline, if any.
-    `facts`: further keys of the report by name: `video` and `checksum`, and any of its optional keys.
+    `baseline`: result of the `sequential` run of the same pipeline; None without such a run.
+    `facts`: values of further keys of the report, by key: `video` and `checksum`, and any of the optional keys.
     """
     metrics = result.report
     sensor = {"sensor": here.sensor_c()}
@@ -111,13 +111,16 @@ def _compared(metrics: RunMetrics) -> PolicyMetrics:
 
 
 def sources_of(document: Mapping[str, Any]) -> dict[str, str]:
-    """Return the sources of all figures in a report, by dotted key. `document`: content of the report."""
+    """Return the source of each figure in a report, by dotted key. `document`: content of the report."""
     sources = {key: source for key, source in SOURCES.items() if _holds(document, key.split("."))}
     return sources | _of_bytes(document["stages"]) | dict(_of_accuracy(document.get("accuracy", {})))
 
 
 def _of_bytes(stages: Mapping[str, Any]) -> dict[str, str]:
-    """Return the sources of `least` and `ratio`, which are not measured, for each stage that counts its bytes."""
+    """Return the sources of `least` and `ratio` by dotted key, for each stage whose bytes were counted.
+
+    These two figures need own sources, because they are not measured. `stages`: block `stages` of the report.
+    """
     counting = [f"stages.{name}.bytes" for name, row in stages.items() if row.get("bytes")]
     return {f"{key}.{figure}": SOURCES[f"bytes.{figure}"] for key in counting for figure in ("least", "ratio")}
 
@@ -128,7 +131,7 @@ def _of_accuracy(accuracy: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
 
 
 def _holds(document: Any, path: list[str]) -> bool:
-    """Return whether `document` has a value other than None at the keys `path`, each inside the previous one."""
+    """Return whether `document` has a value other than None at `path`, a list of keys, the outermost first."""
     for key in path:
         if not isinstance(document, Mapping) or key not in document:
             return False
@@ -137,7 +140,9 @@ def _holds(document: Any, path: list[str]) -> bool:
 
 
 def made_facts(command: Sequence[str], checkout: Path = CHECKOUT) -> dict[str, Any]:
-    """Return the fields of `trilane.apps.run.report.Made` at this moment. Unknown values are None.
+    """Return the values of the fields of `trilane.apps.run.report.Made`, with the time of this call.
+
+    Unknown values are None.
 
     `command`: words of the command line. `checkout`: folder that contains Trilane; it may be a git checkout.
     """
@@ -154,7 +159,7 @@ def made_facts(command: Sequence[str], checkout: Path = CHECKOUT) -> dict[str, A
 
 
 def _revision(checkout: Path) -> tuple[str | None, bool | None]:
-    """Return the git revision of `checkout`, and whether tracked files were modified; None for what is unknown."""
+    """Return (git revision of `checkout`, whether its tracked files were modified). An unknown value is None."""
     git = here.program("git")
     if git is None or not (checkout / ".git").exists():
         return None, None
@@ -164,7 +169,10 @@ def _revision(checkout: Path) -> tuple[str | None, bool | None]:
 
 
 def _git(git: str, checkout: Path, *words: str) -> str | None:
-    """Return the output of a git command in `checkout`; None if it fails. `git`: path of the program."""
+    """Return the output of a git command in `checkout`; None if the command fails.
+
+    `git`: path of the program. `words`: words of the command after `git`.
+    """
     command = [git, "--no-optional-locks", "-C", str(checkout), *words]
     try:
         done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=GIT_S)
@@ -181,9 +189,10 @@ def avatar_report(
     baseline: RunResult | None,
     facts: Mapping[str, Any],
 ) -> Report:
-    """Build the report of a run of avatars. `config`: configuration of the run. Other parameters: as in `report_of`.
+    """Build the report of a run of avatars.
 
-    `facts` may also have `placement`, `resolution`, `pace`, `accuracy` and `check`.
+    `config`: configuration of the run. Other parameters and errors: see `report_of`. `facts` may also have
+    `placement`, `resolution`, `pace`, `accuracy` and `check`.
     """
     facts = {"plan": {"tensor_shapes": config.buckets}, **facts}
     shown = config_facts(config, result.report.policy, result.report.edge)
@@ -191,7 +200,7 @@ def avatar_report(
 
 
 def config_facts(config: RunConfig, policy: str, edge: str) -> dict[str, Any]:
-    """Return the block `config` of the report of a run of avatars."""
+    """Return the block `config` of the report of a run of avatars. `policy`, `edge`: policy and edge of the run."""
     return {**config.model_dump(mode="json", exclude={"out_dir", "window", "kept"}), "policy": policy, "edge": edge}
 
 
@@ -200,8 +209,9 @@ def resolution_of(
 ) -> dict[str, Any]:
     """Return the block `resolution` of the report.
 
-    `rungs`: number of presented frames by rung; each rung has one tensor size. `switches`: number of frames whose rung
-    differs from the previous frame's. `losses`: loss of PSNR by size, for each avatar of the scene.
+    `rungs`: number of presented frames by rung; each rung has one tensor size. `switches`: number of presented frames
+    whose rung differs from that of the previous frame. `config`: configuration of the run. `losses`: loss of PSNR by
+    tensor size, for each avatar of the scene.
     """
     sizes = [
         {
@@ -220,9 +230,10 @@ def resolution_of(
 
 
 def worst_loss(work: int, losses: Sequence[SizeLoss]) -> float | None:
-    """Return the largest loss of PSNR among avatars, in dB; None if a loss is unknown.
+    """Return the largest loss of PSNR among avatars for one tensor size, in dB; None if an avatar's loss is unknown.
 
-    `work`: number of pixels, as `ALL_WORK` times the share of those that the network was trained for.
+    `work`: number of the tensor's pixels, in thousandths of the number that the network was trained for.
+    `losses`: loss of PSNR by tensor size, for each avatar.
     """
     found = [loss.at(work) for loss in losses]
     known = [db for db in found if db is not None]
@@ -230,7 +241,7 @@ def worst_loss(work: int, losses: Sequence[SizeLoss]) -> float | None:
 
 
 def resolution_note(resolution: Resolution) -> str:
-    """Return a message on the number of frames with smaller tensors; "" if there were none."""
+    """Return a message on the number of frames with smaller tensors; "" if all frames had the largest tensor."""
     less = [size for size in resolution.sizes[1:] if size.frames]
     if not less:
         return ""

@@ -71,10 +71,10 @@ TOKEN: Final = {"": PortType("u8", (1,))}  # port of a block `busy`, which write
 
 
 def pipeline_of(file: PipelineFile, run_folder: Path) -> Pipeline:
-    """Return the pipeline that `file` describes, with the cores from `cores_of`.
+    """Return the pipeline that `file` describes, with units on the cores that `cores_of` gives them.
 
     `run_folder`: folder for the files of the run.
-    Raises BadInputError that names the wrong key, MissingPartError if a runtime is not installed.
+    Raises BadInputError that names the wrong key, and MissingPartError if a runtime is not installed.
     """
     networks = read_networks(file)
     types = _all_types(file, networks)
@@ -96,20 +96,22 @@ def pipeline_of(file: PipelineFile, run_folder: Path) -> Pipeline:
 
 
 def preload_of(file: PipelineFile) -> tuple[str, ...]:
-    """Return the modules of Trilane that the fork server imports for the stages of a file."""
+    """Return the names of Trilane's modules that the fork server imports for the stages of `file`."""
     made = [_factory(stage) for stage in file.stages.values() if not isinstance(stage, TimedStage)]
     return tuple(dict.fromkeys(factory.partition(":")[0] for factory in made))
 
 
 def imports_of(file: PipelineFile) -> list[str]:
-    """Return the modules of the user's own code that a run of the file imports, sorted."""
+    """Return the names of the modules of the user's own code that a run of `file` imports, sorted."""
     return sorted({each.python.partition(":")[0] for each in file.stages.values() if isinstance(each, PythonStage)})
 
 
 def frames_of(file: PipelineFile) -> int:
-    """Return the number of frames of a run: as the file states it, else of its shortest video, else DEFAULT_FRAMES.
+    """Return the number of frames of a run of `file`.
 
-    The frames of a video are counted at the run's rate. Raises BadInputError for a video that cannot be read.
+    The key `run.frames` states the number. Without this key, the shortest video determines the number; its length is
+    counted at the run's rate. Without a video, the number is DEFAULT_FRAMES.
+    Raises BadInputError for a video that cannot be read.
     """
     if file.run.frames is not None:
         return file.run.frames
@@ -133,7 +135,11 @@ def _footage_of(file: PipelineFile, stage: VideoBlock) -> FoundPictures:
 
 
 def picture_fps(file: PipelineFile) -> float:
-    """Return the rate of written videos in frames a second: of the run, else of its first video, else DEFAULT_FPS."""
+    """Return the rate of the videos that a run of `file` writes, in frames a second.
+
+    The key `run.fps` states the rate. Without this key, the first video that the run reads determines the rate. Without
+    a video of known rate, the rate is DEFAULT_FPS. Raises BadInputError for a video that cannot be read.
+    """
     if file.run.fps is not None:
         return file.run.fps
     videos = [stage for stage in file.stages.values() if isinstance(stage, VideoBlock) and not stage.is_camera]
@@ -142,7 +148,10 @@ def picture_fps(file: PipelineFile) -> float:
 
 
 def picture_size(pipeline: Pipeline) -> dict[str, dict[str, int]]:
-    """Return `output`, the size of the pictures that the first block `encode` reads; empty without such a block."""
+    """Return the size of the pictures that the first block `encode` reads, as {"output": {"width": w, "height": h}}.
+
+    The sides are in pixels. Without a block `encode`, the result is empty.
+    """
     for stage in pipeline.stages:
         if stage.factory == ENCODE:
             read = stage.settings["reads"][0]
@@ -152,7 +161,10 @@ def picture_size(pipeline: Pipeline) -> dict[str, dict[str, int]]:
 
 
 def with_window(pipeline: Pipeline, window: Path) -> Pipeline:
-    """Return the pipeline with a change: its first block `encode` shows the newest picture in the file `window`."""
+    """Return a copy of `pipeline` whose first block `encode` also shows the newest picture in the file `window`.
+
+    Without a block `encode`, the copy equals `pipeline`.
+    """
     name = next((stage.name for stage in pipeline.stages if stage.factory == ENCODE), "")
     stages = tuple(
         stage
@@ -166,16 +178,18 @@ def with_window(pipeline: Pipeline, window: Path) -> Pipeline:
 
 
 def segments_of(file: PipelineFile) -> dict[str, str]:
-    """Return the name of the folder of segments for each block `encode`, by the stage's name."""
+    """Return the name of a folder for the video segments of each block `encode`, by the name of the block's stage."""
     names = [name for name, stage in file.stages.items() if isinstance(stage, EncodeBlock)]
     return {name: f"{SEGMENTS}.{name}" if place else SEGMENTS for place, name in enumerate(names)}
 
 
 def cores_of(file: PipelineFile, cores: Sequence[int]) -> dict[str, UnitSettings]:
-    """Return cores and threads of each unit, as the file states them or else as a share of `cores`.
+    """Return the cores and the number of threads of each unit of `file`, by the unit's name.
 
-    `cores`: numbers of the cores that this process may use. The units get one core each, in the order of the stages.
-    Remaining cores go to the units with networks, in turn. If there are too few cores, units share them.
+    A unit whose cores the file does not state gets a share of `cores`. These units get one core each, in the order of
+    the stages. Remaining cores go to the units among them that run networks, in turn. If there are too few cores, units
+    share cores. A unit whose threads the file does not state has one thread for each of its cores.
+    `cores`: numbers of the cores that this process may use.
     Raises BadInputError for a core in the file that is not in `cores`.
     """
     open_units = [unit for unit, keys in file.units.items() if keys.cores is None]
@@ -199,7 +213,11 @@ def cores_of(file: PipelineFile, cores: Sequence[int]) -> dict[str, UnitSettings
 
 
 def _all_types(file: PipelineFile, networks: Mapping[str, GraphFile]) -> PortTypes:
-    """Return the types of all ports. Raises BadInputError for a stage that no run can do, or a port of unknown type."""
+    """Return the types of the ports that the stages of `file` write: PortType by port name, by stage name.
+
+    `networks`: networks by stage. Raises BadInputError for a camera, for a stage that is only a time, and for a port of
+    unknown type.
+    """
     types = port_types(file, networks)
     for name, stage in file.stages.items():
         if isinstance(stage, VideoBlock) and stage.is_camera:
@@ -244,9 +262,11 @@ def _stage(
 def _bypassed(
     file: PipelineFile, stages: Sequence[PipelineStage], types: PortTypes, rules: Mapping[str, str]
 ) -> tuple[PipelineStage, ...]:
-    """Return `stages` as a chain with the bypass. The stage at its end gets the ports of the stage where it begins.
+    """Return `stages` as a chain with the bypass of `file`.
 
-    `types`: types of all ports. `rules`: rule of each edge, by the stage that writes to it.
+    The stage where the bypass begins learns how the bypass works. The stage where the bypass ends learns the ports of
+    the stage where the bypass begins.
+    `types`: types of all ports. `rules`: rule of each edge, by the name of the stage that writes to the edge.
     """
     assert file.bypass is not None
     begin, way = file.bypass
@@ -270,9 +290,11 @@ def _factory(stage: StageKeys) -> str:
 
 
 def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str, GraphFile]) -> dict[str, Any]:
-    """Return the settings of a stage: the keys of its kind, and facts from other tables of the file.
+    """Return the settings of `stage`: the keys of its kind, and facts from other tables of `file`.
 
-    `networks`: networks by stage. Raises BadInputError, MissingPartError.
+    `name`: name of the stage. `networks`: networks by stage.
+    Raises BadInputError for a network without weights, for a network with an input that is not numbers, and for a video
+    that cannot be read. Raises MissingPartError if a runtime is not installed.
     """
     common = set(StageKeys.model_fields)
     keys: dict[str, Any] = {
@@ -297,7 +319,11 @@ def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str
 
 
 def _port(file: PipelineFile, name: str, each: PortInput, types: PortTypes) -> str:
-    """Return the port that input `each` of stage `name` reads. Raises BadInputError if this is not clear."""
+    """Return the name of the port that input `each` of stage `name` reads.
+
+    `file`: pipeline file, which errors name. `types`: types of all ports.
+    Raises BadInputError if the input names a port that does not exist, or names none although there are several.
+    """
     ports = types[each.stage]
     if each.from_port or len(ports) == 1:
         chosen = each.from_port or next(iter(ports))
@@ -320,18 +346,20 @@ TAKEN: Final = (*OF_THE_RUN, "runtime", "changes", "out")
 
 
 class Watch(Protocol):
-    """A viewer that shows a run and steers it. Without a number of frames, the run lasts until the viewer ends it.
+    """A viewer that shows a run and steers the run.
 
+    A watched run lasts until the viewer ends it. The option `frames` and the key `arrivals` of the file limit the
+    number of its frames.
     `controls`: requests of the viewer to the run.
     """
 
     controls: RunControls
 
     def begins(self, folder: Path, pipeline: Pipeline, facts: Mapping[str, Any]) -> Path:
-        """Take note of a run that begins, and return the file of the window for its pictures.
+        """Take note of a run that begins, and return the path of the window that will show the run's pictures.
 
         The call comes before the units start. `folder`: folder that will contain the journal. `pipeline`: pipeline of
-        the run. `facts`: `config` and `machine` as in the report.
+        the run. `facts`: blocks `config`, `machine` and `made` of the report.
         """
 
 
@@ -343,7 +371,9 @@ def run_file(
 ) -> RunOutcome:
     """Check the options and the pipeline file, run the pipeline, and leave its run folder.
 
-    `hooks`, `command`, and the errors raised: as in `trilane.apps.run.asked_run.run_asked`. `watch`: viewer, if any.
+    `options`: options of the run; `options.scene` is the path of the pipeline file.
+    `hooks`, `command`: see `trilane.apps.run.asked_run.run_asked`, which raises the same errors.
+    `watch`: viewer of the run; None if nobody watches the run.
     """
     file = asked_file(options)
     require_memory()
@@ -358,7 +388,10 @@ def run_file(
 
 
 def asked_file(options: RunOptions) -> PipelineFile:
-    """Return the pipeline file, changed by `options`. Raises BadInputError, also for an option that is for scenes."""
+    """Return the pipeline file that `options` name, with the keys that `options` change.
+
+    Raises BadInputError for a wrong file or change, and for an option that only scenes have.
+    """
     for name in sorted(options.model_fields_set - {"scene", *TAKEN}):
         known = ", ".join(RunOptions.spelling(each) for each in TAKEN)
         found = f"{RunOptions.spelling(name)} with a pipeline file"
@@ -374,6 +407,8 @@ def asked_file(options: RunOptions) -> PipelineFile:
 class _Asked:
     """A checked run of a pipeline file, with the settings of its scheduler and facts for its report.
 
+    `options`, `file`, `pipeline`: options of the run, file that they name, and pipeline that follows from the file.
+    `watch`: viewer of the run; None if nobody watches the run.
     `settings`: settings of the scheduler. `config`, `machine`, `made`: blocks of report.json.
     """
 
@@ -438,10 +473,12 @@ def _run(asked: _Asked, folder: RunFolder, told: Hooks, starter: UnitStarter) ->
 
 
 def _written(file: PipelineFile, work: Path, fps: float, result: RunResult) -> tuple[dict[str, Any], RunResult]:
-    """Write the files of the run folder `work`, and the videos at the paths that the pipeline file names.
+    """Write the files of the run folder `work`, and copy the videos to the paths that the pipeline file names.
 
-    Returns facts for the report, and `result`, which is a failure if a file could not be written.
-    `fps`: rate of the videos. Raises BadInputError.
+    Return (facts for the report, `result`). If a file of the run folder is incomplete, the returned `result` has a
+    failure that says so.
+    `file`: pipeline file of the run. `fps`: rate of the videos, in frames a second.
+    Raises BadInputError for a broken journal, or for a path of a video that cannot be written.
     """
     segments = segments_of(file)
     videos = {name: work / (VIDEO if place == 0 else f"{name}.mp4") for place, name in enumerate(segments)}
@@ -464,7 +501,7 @@ def _written(file: PipelineFile, work: Path, fps: float, result: RunResult) -> t
 
 
 def _copied(video: Path, target: Path) -> None:
-    """Copy `video` to `target`, which is never incomplete. Raises BadInputError if `target` cannot be written."""
+    """Copy `video` to `target`. An incomplete copy has another name. Raises BadInputError if writing fails."""
     partial = target.with_name(f"{target.name}.partial")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)

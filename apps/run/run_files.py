@@ -1,7 +1,9 @@
-"""Makes video, contact sheet, checksum, recording and trace of a run folder from the segments and the journal.
+"""Makes the video, contact sheet, checksum, recording and trace of a run folder.
 
-Rule: no frame is encoded twice. video.mp4 gets the packets of the segments, and the contact sheet is decoded from it.
-The journal is read once, record by record.
+The sources are the segments (short videos, each with a digest file) and the journal of the run.
+
+Rule: no frame is encoded twice. video.mp4 gets the packets of the segments, and the contact sheet is decoded from
+video.mp4. The journal is read once, record by record.
 """
 
 from __future__ import annotations
@@ -32,10 +34,13 @@ FAST_PNG = 1  # zlib level: files are a fifth larger than at the best level, but
 
 
 def write_files(work: Path, fps: float, frames: int) -> tuple[dict[str, Any], UnwrittenError | None]:
-    """Write every file of the run folder `work` except the report. Return facts for the report, and an error or None.
+    """Write every file of the run folder `work` except the report. Return (facts, error).
 
-    The facts are `video` and `checksum`. The error says that the disk is full or that segments were removed. After a
-    full disk, each file is complete or absent, and the segments stay. After removed segments, all files are written.
+    `facts` has two keys of the report. `video` has the fields of `trilane.apps.run.report.Video`; it is None without a
+    video. `checksum` is the result of `run_checksum`; it is None if segments were removed.
+    `error` is None if every file is complete. If a file is not, `error` says that the disk is full, or that segments
+    were removed during the run. On a full disk, each file is complete or absent, and the segments stay until the video
+    and the contact sheet are complete. If segments were removed, the files are made from the remaining segments.
 
     `fps`: frames a second of the scene. `frames`: least number of frames that the segments should contain.
     Raises BadInputError for a broken journal.
@@ -60,7 +65,7 @@ def write_files(work: Path, fps: float, frames: int) -> tuple[dict[str, Any], Un
 
 @contextmanager
 def _whole_or_absent(*files: Path) -> Iterator[None]:
-    """Remove `files` if the block, which writes them, fails. Raises UnwrittenError if the disk is full."""
+    """Remove `files` if the `with` block that writes them fails. Raises UnwrittenError if the disk is full."""
     try:
         with full_disk_told(files[0]):
             yield
@@ -71,7 +76,10 @@ def _whole_or_absent(*files: Path) -> Iterator[None]:
 
 
 def _write_from_journal(journal: Path, folder: Path) -> None:
-    """Write the recording and the trace into `folder`. Raises BadInputError for a file that is no journal."""
+    """Write the recording and the trace into `folder`, from the file `journal`.
+
+    Raises BadInputError if the file is no journal.
+    """
     trace: TraceWriter | None = None
     with (folder / EVENTS).open("w", encoding="utf-8") as events, (folder / TRACE_NAME).open("wb") as file:
         for record in read_journal(journal):
@@ -88,7 +96,10 @@ def _write_from_journal(journal: Path, folder: Path) -> None:
 
 @dataclass(frozen=True)
 class JoinedVideo:
-    """A video that `join_segments` wrote. `frames`: number of pictures. `seconds`: time at which the last one ends."""
+    """A video that `join_segments` wrote.
+
+    `frames`: number of pictures. `seconds`: time at which the last picture ends.
+    """
 
     frames: int
     seconds: float
@@ -97,10 +108,11 @@ class JoinedVideo:
 def join_folder(
     segments: Path, target: Path, fps: float, frames: int
 ) -> tuple[JoinedVideo | None, UnwrittenError | None]:
-    """Join the segments in the folder `segments` to the video `target`. Return the video, and an error or None.
+    """Join the segments in the folder `segments` to the video `target`. Return (video, error).
 
-    The error says that files are missing. It follows from counts: each encoded frame has a line in a digest file. A
-    segment contains the frames of its lines, but the last frame may be missing after its writer was killed.
+    `video` is None if no segment contains a frame. `error` says that files were removed during the run; it is None if
+    no file is missing. Counts show missing files: each encoded frame has a line in a digest file. A segment contains
+    the frames of these lines, except perhaps the last frame if the process that wrote the segment was killed.
     `fps`: frames a second of the scene. `frames`: least number of frames that were encoded.
     Raises UnwrittenError if the disk is full.
     """
@@ -117,14 +129,14 @@ def join_folder(
 
 
 def join_segments(segments: list[Path], target: Path, fps: float) -> JoinedVideo | None:
-    """Copy the packets of the segments into one MP4 file; return None if they contain no frame.
+    """Copy the packets of all `segments` into one MP4 file, and return its facts; None if no segment contains a frame.
 
     `segments`: files in the order of their frames, each with a digest file beside it.
     `target`: MP4 file to write.
     `fps`: frames a second of the scene.
     Each line of a digest file has the number of a frame. The number determines the time at which the frame's packet is
-    shown. If the video is already longer, the packet is shown right after the previous one. A truncated segment is used
-    up to its end.
+    shown. If the previous packet ends later than this time, the packet is shown right after the previous packet. A
+    truncated segment is used up to its end.
     """
     readable = [path for path in segments if _has_packets(path)]
     if not readable:
@@ -151,12 +163,15 @@ def _frame_numbers(segment: Path) -> list[int]:
 
 
 def _digest_lines(path: Path) -> list[str]:
-    """Return the complete lines of a digest file, because a truncated file may end with half a line."""
+    """Return the lines of the digest file `path`, without the last line if it is incomplete in a truncated file."""
     return [line for line in path.read_text(encoding="ascii").splitlines(keepends=True) if line.endswith("\n")]
 
 
 def _packets(container: Any) -> Iterator[Any]:
-    """Yield the complete packets of the video stream, up to the end of a truncated file. `container`: PyAV's input."""
+    """Yield the packets of the video stream of `container`, a file that PyAV has opened.
+
+    From a truncated file, the complete packets come.
+    """
     try:
         for packet in container.demux(video=0):
             if packet.pts is not None and packet.size:
@@ -174,7 +189,7 @@ def _has_packets(path: Path) -> bool:
 
 
 def run_checksum(digests: list[Path]) -> str | None:
-    """Return the SHA-256 over the lines of all digest files, sorted by frame; None if there are no lines.
+    """Return the SHA-256 over the lines of the files `digests`, sorted by frame number; None if no file has a line.
 
     A line is a frame's number and the digest of its picture. Runs that presented the same pictures under the same
     numbers have the same checksum.
@@ -187,9 +202,9 @@ def run_checksum(digests: list[Path]) -> str | None:
 
 
 def contact_sheet(video: Path, target: Path, fps: float) -> int:
-    """Write a PNG with up to COLUMNS x ROWS evenly spaced frames of `video`, and return their number.
+    """Write the PNG `target` with up to COLUMNS x ROWS evenly spaced frames of `video`; return how many frames it has.
 
-    The first and the last frame are among them. Each picture is labelled with the number of its frame.
+    The first and the last frame of the video are among them. Each picture is labelled with the number of its frame.
     `fps`: frames a second of the scene. Raises av.error.FFmpegError if the video cannot be decoded.
     """
     with av.open(str(video)) as container:
@@ -204,7 +219,10 @@ def contact_sheet(video: Path, target: Path, fps: float) -> int:
 
 
 def _decode_all(container: Any, wanted: list[int]) -> Iterator[tuple[int, Image.Image]]:
-    """Yield (pts, thumbnail) for each pts in `wanted`, in one pass over the video."""
+    """Yield (pts, thumbnail) for each pts in `wanted`, in one pass over the video.
+
+    A pts is the time at which a frame is shown, in units of the stream's time base.
+    """
     container.seek(0)
     for frame in container.decode(video=0):
         if frame.pts in wanted:
@@ -212,7 +230,7 @@ def _decode_all(container: Any, wanted: list[int]) -> Iterator[tuple[int, Image.
 
 
 def _decode_each(container: Any, wanted: list[int]) -> Iterator[tuple[int, Image.Image]]:
-    """Yield the same as `_decode_all`, with a seek to each frame. This is faster if many frames lie between them."""
+    """Yield the same as `_decode_all`, but seek to each frame. A seek is faster if many frames lie between two pts."""
     stream = container.streams.video[0]
     for pts in wanted:
         container.seek(pts, stream=stream)

@@ -1,4 +1,4 @@
-"""The folder that a run writes: it has a temporary name in the same parent folder until it is complete.
+"""The folder that a run writes. Until the folder is complete, it has a temporary name in the same parent folder.
 
 Rule: a folder with the run's name is complete; a folder whose name ends in `.partial` is not. If a file cannot be
 written, as on a full disk, the written files stay in the partial folder, and the error names this folder.
@@ -34,7 +34,11 @@ def require_free(target: Path) -> None:
 
 
 def default_place(scene: str) -> Path:
-    """Return `runs/<UTC time>-<scene>` in the working directory, with a number if another run has this name."""
+    """Return the path `runs/<UTC time>-<scene>` in the working directory.
+
+    `scene`: name of the scene; characters that a file name should not have become `-`. If another run has the path,
+    `-2`, `-3` and so on is added.
+    """
     stamp = machine.here.now().strftime("%Y%m%dT%H%M%SZ")
     safe = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in scene)
     place, tries = Path("runs") / f"{stamp}-{safe}", 1
@@ -45,12 +49,13 @@ def default_place(scene: str) -> Path:
 
 
 class RunFolder:
-    """A context manager that makes a run folder under the temporary name `work`. `complete` gives it the name `target`.
+    """A context manager that makes a run folder with the temporary path `work`. `complete` renames it to `target`.
 
     Without `complete`, the exit removes `work` and the parent folders that the entry made. RESERVED_BYTES on the disk
     stay reserved for the report until `release`.
-    The entry raises BadInputError if `target` exists, if another live run will get that name, or if there is no room
-    for a report. It raises UnwrittenError if a limit of this process forbids files of that size.
+    The entry raises BadInputError if `target` exists, or if another live run will get that path. The entry raises the
+    same error if `work` cannot be made, or if the disk has no room for a report. The entry raises UnwrittenError if a
+    limit of this process forbids a file of RESERVED_BYTES.
     The exit raises TrilaneError if `work` was moved or removed, or if the block ends because a file could not be
     written. In the latter case, `work` stays if it has content.
     """
@@ -83,7 +88,10 @@ class RunFolder:
             self._made.append(folder)
 
     def _claim(self) -> None:
-        """Make `work` and lock it for the life of this process. Meanwhile, a lock on the parent excludes other runs."""
+        """Make the folder `work`, and lock it for the life of this process.
+
+        While the folder is made, a lock on the parent folder keeps other runs from making theirs.
+        """
         parent = os.open(self.target.parent, os.O_RDONLY | os.O_DIRECTORY)
         try:
             fcntl.flock(parent, fcntl.LOCK_EX)
@@ -107,9 +115,10 @@ class RunFolder:
         return text.replace(str(self.work), str(self.target))
 
     def complete(self) -> Path:
-        """Rename the folder to `target`, and return this path.
+        """Rename the folder `work` to `target`, and return the path `target`.
 
-        Raises BadInputError if `target` exists by now; the folder `work` then stays.
+        Raises BadInputError if the folder cannot be renamed, for example because `target` exists by now; in that case,
+        `work` stays.
         """
         self.release()
         self._keep = self._is_there()
@@ -142,7 +151,11 @@ class RunFolder:
             raise TrilaneError(f"{failed}; {left}") from error
 
     def _unwritten(self, error: BaseException | None) -> str:
-        """Return which file could not be written, and why; "" if `error` has another cause."""
+        """Return a text that says which file could not be written, and why.
+
+        `error`: exception that ended the `with` block; None if no exception did. For None, and for an exception with
+        another cause, the text is "".
+        """
         if isinstance(error, UnwrittenError):
             return str(error)
         if isinstance(error, BadInputError) and isinstance(error.__cause__, OSError):
@@ -152,7 +165,7 @@ class RunFolder:
         return ""
 
     def _is_there(self) -> bool:
-        """Return whether the path `work` still leads to the folder that was made."""
+        """Return whether the path `work` still leads to the folder that this object made."""
         try:
             return os.path.samestat(self.work.stat(), os.fstat(self._lock))
         except OSError:
@@ -168,7 +181,7 @@ class RunFolder:
 
 
 def _partial(target: Path) -> Iterator[Path]:
-    """Yield the `.partial` folders of live and ended runs to `target`."""
+    """Yield the `.partial` folders of all runs, live or ended, that were to write `target`."""
     return target.parent.glob(f"{glob.escape(target.name)}.*.partial")
 
 

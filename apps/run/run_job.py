@@ -1,10 +1,11 @@
 """One run of a scene, from a checked configuration to a complete run folder, and the check of its frames.
 
 Rule: a run folder is complete. If a run was interrupted or failed, its report says so, and the folder has the frames
-until then. A run without a presented frame leaves no folder.
+that were presented before. A run without a presented frame leaves no folder.
 
-`check_run` compares losslessly stored pictures of the run with two others. The truth is the clothed body that the
-avatar was trained on. The float path has no quantisation, no GPU raster and no plan, so it shows their cost.
+`check_run` compares losslessly stored pictures of the run with pictures of two kinds. The truth is the clothed body
+that the avatar was trained on. The float path is computed without quantisation, GPU raster and plan. The difference
+from the float path is therefore the image error that these three cause.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ STEPS = 255
 class Prepared:
     """A run whose options are checked.
 
-    `checked`: configuration that follows from `options`.
+    `options`: options of the run. `checked`: configuration that follows from the options.
     `pace`: pace of a chip that the jobs keep; None for a run at full speed.
     `command`: words of the command line.
     """
@@ -73,8 +74,9 @@ class Prepared:
 class Hooks:
     """Callbacks of a run.
 
-    `progress(what, done, total)`: gets numbers of frames; `what` is the policy, or `check` during the check.
-    `message(text)`: gets messages for a person.
+    `progress(what, done, total)`: function that gets the number of frames done and of all frames. `what` is the policy
+    during a run, and `check` during the check.
+    `message(text)`: function that gets messages for a person.
     """
 
     progress: Callable[[str, int, int], None]
@@ -85,9 +87,11 @@ class Hooks:
 class Watched:
     """The viewer of a live run, which shows and steers the run.
 
-    `frames`: number of frames; None for the scene's number. `window`: file of the `trilane.transport.live_window`.
-    `controls`: requests of the viewer to the run. `begins(folder, checked)`: function that is called after the units
-    are placed and before they start.
+    `frames`: number of frames; None for the scene's number.
+    `window`: path of the window (`trilane.transport.live_window`) that shows the run's newest picture.
+    `controls`: requests of the viewer to the run.
+    `begins(folder, checked)`: function that is called after the units are placed and before they start. It gets the
+    folder that will contain the journal, and the configuration of the run.
     """
 
     frames: int | None
@@ -98,7 +102,7 @@ class Watched:
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """How a run ended. `report`: report as written. `folder`: run folder. `exit_code`: exit code for the command."""
+    """The end of a run. `report`: report as written. `folder`: path of the run folder. `exit_code`: of the command."""
 
     report: Report
     folder: Path
@@ -115,16 +119,17 @@ def run_to_folder(
     starter: UnitStarter | None = None,
     watched: Watched | None = None,
 ) -> RunOutcome:
-    """Run what was prepared and leave the run folder at `target`.
+    """Do the prepared run and leave the run folder at `target`.
 
-    `target`: folder that does not exist yet.
+    `prepared`: run whose options are checked.
+    `target`: path of a folder that does not exist yet.
     `hooks`: callbacks of the run.
     `machine`: result of `machine_facts`.
     `made`: result of `trilane.apps.run.report_facts.made_facts`; None for a run without a command line.
-    `starter`: fork server that runs already. Without it, the units are not placed on cores for this run.
-    `watched`: viewer of the run, if any.
+    `starter`: fork server that runs already; None: the units are not placed on cores for this run.
+    `watched`: viewer of the run; None if nobody watches the run.
     Raises BadInputError if `target` cannot be written. Raises TrilaneError if no frame was presented, or if a file
-    could not be written. In the latter case, the written files stay in a folder that the message names.
+    could not be written. If a file could not be written, the written files stay in a folder that the message names.
     """
     options, checked, pace = prepared.options, prepared.checked, prepared.pace
     with RunFolder(target) as folder:
@@ -185,22 +190,25 @@ def run_to_folder(
 
 
 def _renamed(result: RunResult, named: Callable[[str], str]) -> RunResult:
-    """Return `result` after applying `named` to its texts, so that they name the final folder."""
+    """Return `result` with texts that name the final run folder.
+
+    `named`: function that replaces the temporary path in a text, `RunFolder.named`.
+    """
     failure = result.failure and replace(result.failure, message=named(result.failure.message))
     return replace(result, failure=failure, messages=tuple(map(named, result.messages)))
 
 
 class _Job:
-    """Runs the prepared run, and after it the baseline, a `sequential` run of the same scene."""
+    """Does the prepared run, and after it the baseline, which is a `sequential` run of the same scene."""
 
     def __init__(self, prepared: Prepared, hooks: Hooks, starter: UnitStarter | None, watched: Watched | None) -> None:
         self._options, self._checked, self._pace = prepared.options, prepared.checked, prepared.pace
         self._hooks, self._starter, self._watched = hooks, starter, watched
 
     def run(self, folder: Path, facts: Mapping[str, Any]) -> RunResult:
-        """Run the prepared run in `folder` and write its journal, which begins with `facts`.
+        """Do the prepared run in `folder`, and write its journal, which begins with `facts`.
 
-        Raises TrilaneError, or KeyboardInterrupt, if the run ended before any frame was presented.
+        If no frame was presented, raises KeyboardInterrupt after an interruption, and TrilaneError for another cause.
         """
         file, watched = JournalFile(folder / journal.NAME, facts, sensors), self._watched
         frames, controls = (None, None) if watched is None else (watched.frames, watched.controls)
@@ -211,8 +219,8 @@ class _Job:
     def run_baseline(self, folder: Path) -> tuple[RunResult | None, bool]:
         """Run the first frames of the scene again, one frame at a time, in a folder that is removed afterwards.
 
-        Returns two values: the result, and whether the baseline was interrupted. The result is None if no baseline was
-        requested or it did not complete.
+        Return (result, whether the baseline was interrupted). The result is None if no baseline was requested, if the
+        run itself was `sequential`, or if the baseline did not complete.
         """
         if not self._options.baseline_frames or self._options.policy == BASELINE_POLICY:
             return None, False
@@ -263,7 +271,10 @@ class _Job:
         raise error_of(result)
 
     def _release_fps(self, policy: str) -> float | None:
-        """Return the rate at which a paced policy releases frames at a chip's pace; None means the scene's rate."""
+        """Return the rate at which `policy` releases frames, in frames a second; None for the policy's usual rate.
+
+        A rate is only returned for a paced policy in a run at a chip's pace.
+        """
         if self._pace is None or not policy_named(policy).paced:
             return None
         from trilane.apps.run.pace import release_fps
@@ -272,10 +283,12 @@ class _Job:
 
 
 def _checked_frames(checked: Checked, work: Path, hooks: Hooks, interrupted: Callable[[], bool]) -> dict[str, Any]:
-    """Return facts for the report: `check`, or else `notes` that say why there is no check.
+    """Check the run's frames, and return {"check": block `check` of the report}.
 
-    `work`: run folder, whose lossless pictures are removed afterwards. `interrupted`: function that says whether the
-    check shall end; it is called before each frame.
+    If the check fails or is interrupted, return {"notes": all notes of the report, the last of which says why}.
+    `checked`: configuration of the run. `work`: run folder; its lossless pictures are removed after the check.
+    `hooks`: callbacks of the run. `interrupted`: function that returns whether the check shall end; it is called before
+    the check and after each frame.
     """
 
     def told(done: int, of: int) -> None:
@@ -305,7 +318,10 @@ def _notes(checked: Checked) -> list[str]:
 
 
 def sensors() -> dict[str, float]:
-    """Return the figures that the journal samples during a run: the temperature of the machine's sensor, in °C."""
+    """Return the figures that the journal samples during a run: the sensor's temperature in °C.
+
+    Without a sensor, the result is empty.
+    """
     celsius = machine.here.sensor_c()
     return {} if celsius is None else {"temperature_c.sensor": celsius}
 
@@ -328,7 +344,7 @@ def exit_code_of(result: RunResult) -> int:
 
 
 def _tell(report: Report, hooks: Hooks) -> None:
-    """Send messages about lost frames of the video, smaller tensors, and a scene without visible avatars."""
+    """Send messages about frames that the video lacks, smaller tensors, and a run in which no avatar was visible."""
     if report.video is not None and report.video.frames < report.frames.presented:
         shown = f"{report.video.frames} of {report.frames.presented} frames"
         hooks.message(f"video.mp4 holds {shown}: a writer was killed before its last")
@@ -339,7 +355,7 @@ def _tell(report: Report, hooks: Hooks) -> None:
 
 
 def _import_writers() -> None:
-    """Import the modules that write the run folder's files, in the time in which the units start."""
+    """Import the modules that write the run folder's files, while the units start."""
     from trilane.apps.run import run_files  # noqa: F401
 
 
@@ -350,19 +366,22 @@ def asked_frames(total: int, count: int) -> tuple[int, ...]:
 
 
 def require_parts(bundles: Iterable[Bundle]) -> None:
-    """Raise MissingPartError if a library is missing that the check of a run with avatars `bundles` needs."""
+    """Raise MissingPartError if the check of a run with the avatars `bundles` needs a library that is not installed."""
     from trilane.bench.lib.full_picture import require_float_network
 
     require([require_metrics, *(partial(require_float_network, bundle) for bundle in bundles)])
 
 
 def check_run(checked: Checked, folder: Path, told: Callable[[int, int], None] = lambda *_: None) -> dict[str, Any]:
-    """Compare the pictures stored in `folder` with the float path and, if it is known, the truth. Return `check`.
+    """Compare the pictures stored in `folder` with the float path and with the truth; return the block `check`.
 
-    The result is the block `check` of report.json. Frames without a visible avatar are left out. The figures count the
-    region that contains the avatars. The IoU compares masks of the pixels that differ from the background.
-    `told(done, total)`: function that is called after each frame.
-    Raises TrilaneError if no stored frame shows an avatar, MissingPartError, BadInputError.
+    The block belongs to report.json. Only bundled avatars have a truth; without it, the float path alone is compared.
+    Frames without a visible avatar are left out. The figures count the region that contains the avatars. The IoU
+    compares masks of the pixels that differ from the background.
+    `checked`: configuration of the run. `folder`: run folder with the stored pictures.
+    `told(done, total)`: function that gets the number of frames done and of all frames, after each frame.
+    Raises TrilaneError if no stored frame shows an avatar, MissingPartError if a library is not installed, and
+    BadInputError if an avatar cannot be read.
     """
     from trilane.apps.experiments.picture_errors import figures
     from trilane.apps.experiments.reference_path import ReferencePath
@@ -394,9 +413,9 @@ def check_run(checked: Checked, folder: Path, told: Callable[[int, int], None] =
 
 
 def summed_up(against: str, errors: Sequence[ErrorFigures]) -> dict[str, Any]:
-    """Return one comparison as in report.json, with means over `errors`, which has an element for each frame.
+    """Return the fields of `trilane.apps.run.report.FrameErrors` for frames with the given `errors`.
 
-    `against`: name of the pictures that the frames were compared with.
+    `against`: name of the pictures that the frames were compared with. `errors`: errors of each frame.
     """
     ssim = [error.ssim for error in errors if error.ssim is not None]
     return {

@@ -1,10 +1,10 @@
-"""The verdict of a run or a prediction: whether it holds its rate, what bounds it, whether to trust it, what to try.
+"""The verdict of a run or a prediction: does it hold its rate, what bounds it, can its times be trusted, what to try?
 
-Rule: pure, and the only place that judges. All commands, pages, notebooks and report.json show this verdict.
-`trilane.apps.run.verdict_facts` makes the facts that it rests on.
+Rule: the functions are pure, and only this module judges. All commands, pages, notebooks and report.json show its
+verdict. `trilane.apps.run.verdict_facts` makes the facts that the verdict rests on.
 
-The trust in a run is part of the verdict; sweeps and gates use it too. A run is not trusted if its machine was not
-quiet, or if nobody knows whether it was. Each reason states its figure.
+The trust in a run is part of the verdict; sweeps and gates use the trust too. A run is not trusted if its machine was
+not quiet, or if nobody knows whether the machine was quiet. Each reason states its figure.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ CLOCK_CHANGE = 0.1
 class Trust(NamedTuple):
     """The judgement whether the times of a run can be trusted.
 
-    `trusted`: whether the machine was quiet, or the times are computed.
-    `reasons`: reasons against trust, or the reason for it. Each is a sentence without a full stop.
+    `trusted`: whether the times can be trusted.
+    `reasons`: reasons against trust, or the only reason for trust. Each is a sentence without a full stop.
     """
 
     trusted: bool
@@ -41,10 +41,11 @@ class Trust(NamedTuple):
 
 
 def trust_of(report: Mapping[str, Any]) -> Trust:
-    """Return the judgement whether a run can be trusted.
+    """Return the judgement whether the times of a run can be trusted.
 
+    A run is trusted if its machine was quiet, or if its times were computed in virtual time.
     `report`: mapping with the keys `clock`, `other_programs`, `processor` and `temperature_c` of report.json, as far as
-    they are known.
+    their values are known.
     """
     if report.get("clock", HOST_CLOCK) != HOST_CLOCK:
         return Trust(True, ("computed in virtual time",))
@@ -82,7 +83,10 @@ def _of_heat(celsius: float | None) -> str:
 
 
 def percent(share: float | None) -> str:
-    """Return a share in percent, such as `0.4 %` and `27 %`. Values below 10 % have one decimal."""
+    """Return a share (0 to 1) as a text in percent, such as `0.4 %` or `27 %`; `unknown` for None.
+
+    Values below 10 % have one decimal.
+    """
     return "unknown" if share is None else f"{100 * share:.1f} %" if share < 0.1 else f"{100 * share:.0f} %"
 
 
@@ -112,7 +116,10 @@ MEANINGS: Final = {
 
 
 class Rate(NamedTuple):
-    """A rate in frames a second. `low`, `high`: bounds of its interval, None if unknown. `share`: the confidence."""
+    """A rate in frames a second.
+
+    `fps`: rate. `low`, `high`: ends of its interval; None if unknown. `share`: confidence of the interval, as a text.
+    """
 
     fps: float
     low: float | None = None
@@ -121,10 +128,10 @@ class Rate(NamedTuple):
 
 
 class LateFrames(NamedTuple):
-    """How many frames were not in time.
+    """The numbers of frames that were not in time.
 
-    `due`: number of frames that had to be in time. `late`: how many of them were presented late. `dropped`, `lost`: how
-    many of them were dropped or lost. `replaced`: number of frames that were evicted in a run without a fixed rate.
+    `due`: number of frames that had to be in time. `late`, `dropped`, `lost`: numbers of these frames that were
+    presented late, dropped and lost. `replaced`: number of frames that were dropped in a run that no rate releases.
     """
 
     due: int
@@ -141,12 +148,12 @@ class LateFrames(NamedTuple):
 class NamedBound(NamedTuple):
     """The bound of the frame time, as in the report's `bound`.
 
-    `unit`: the unit, or a name in MEANINGS.
-    `stages`: the stage that bounds, followed by other stages of the unit. The value is the stage's ms on the critical
-    path, None if unknown. `share`: share of the unit in the critical path.
+    `unit`: name of the unit, or a name in MEANINGS.
+    `stages`: ms on the critical path, by stage; None if unknown. The stage that bounds comes first, followed by other
+    stages of the unit. `share`: share of the unit in the critical path, 0 to 1.
     `cost`: relative growth of the frame time if the unit's jobs take 20 % longer; None if only the path is known.
-    `rivals`: units that may bound as much. `of_unit`: all stages of `unit`.
-    `path`: name with the largest share of the path, "" if that is `unit`.
+    `rivals`: names of units that may bound as much. `of_unit`: names of all stages of `unit`.
+    `path`: name of the unit with the largest share of the path; "" if this is `unit`.
     """
 
     unit: str
@@ -162,13 +169,17 @@ class NamedBound(NamedTuple):
 class Facts:
     """The facts that a verdict rests on.
 
-    `rate`: rate, None for fewer than two frames. `target_fps`: rate to hold.
-    `is_held_to_rate`: whether the target rate releases the frames. The rate then proves nothing, only lateness counts.
-    `lateness`: frames that were not in time, None if unknown. `failure`: reason for an early end, "" without one.
+    In all fields, None means that the value is unknown.
+    `rate`: rate of presented frames; None for fewer than two frames. `target_fps`: rate to hold, in frames a second.
+    `lateness`: numbers of frames that were not in time. `trust`: judgement whether the times can be trusted.
+    `is_held_to_rate`: whether a fixed rate releases the frames. In that case, `rate` proves nothing, and only
+    `lateness` counts.
+    `failure`: reason for an early end; "" for a run that did not fail.
     `frame_ms`: mean frame time. `slow`: result of `slow_percentile`. `latency_ms`: mean latency.
-    `alone`: rate (fps) and mean latency (ms) with one frame at a time. `bound`: None if unknown.
-    `idle`: idle share of each unit, and shares of its causes. `image`: image error in words.
-    `tries`: proposals, the most useful first. `source`: "" for a finished run, else SO_FAR or COMPUTED.
+    `alone`: rate (fps) and mean latency (ms) with one frame at a time. `bound`: bound of the frame time.
+    `idle`: (idle share, shares of the causes by cause) of each unit, by name. `image`: image error in words.
+    `tries`: proposals, the most useful first.
+    `source`: "" for a finished run, SO_FAR for a live run, COMPUTED for a prediction.
     """
 
     rate: Rate | None
@@ -194,7 +205,10 @@ class Facts:
 
 @dataclass(frozen=True)
 class Verdict:
-    """The judgement of `facts`. `passed`: whether the run passes. `why`: reasons in one line."""
+    """The judgement of a run or a prediction.
+
+    `facts`: facts that the judgement rests on. `passed`: whether the run passes. `why`: reasons in one line.
+    """
 
     facts: Facts
     passed: bool
@@ -212,7 +226,7 @@ class Verdict:
         }
 
     def lines(self) -> list[tuple[str, str]]:
-        """Return the lines of the verdict for people, each as a label, such as `BOUND`, and a text."""
+        """Return the lines of the verdict for people, each as (label, text), such as ("TIME", "10.4 ms a frame")."""
         facts = self.facts
         found = (
             (LABELS[not self.passed], _held(facts)),
@@ -226,7 +240,7 @@ class Verdict:
         return [(label, text) for label, text in found if text]
 
     def shown(self) -> dict[str, Any]:
-        """Return `as_json` with a further key `lines`, which has the lines for people."""
+        """Return the result of `as_json` with a further key `lines`: the [label, text] of each line for people."""
         return {**self.as_json(), "lines": [list(line) for line in self.lines()]}
 
     def __str__(self) -> str:
@@ -234,9 +248,10 @@ class Verdict:
 
 
 def judged(facts: Facts) -> Verdict:
-    """Return the verdict: a run passes if it did not fail, held its rate, and had 99 of 100 frames in time.
+    """Return the verdict on `facts`.
 
-    If a fixed rate releases the frames, the measured rate does not count, only the frames in time.
+    A run passes if it did not fail, held its rate, and had at least 99 of 100 frames in time. If a fixed rate releases
+    the frames, the measured rate does not count.
     """
     against = [reason for reason in (_ended(facts), _too_slow(facts), _too_late(facts)) if reason]
     said = against or [f"{_number(facts.target_fps)} fps are held"]
@@ -275,8 +290,8 @@ def _late(found: LateFrames) -> str:
 def _held(facts: Facts) -> str:
     """Return the rate and the late frames as a text, such as `96 fps (92 to 102), at 30 fps 0 of 299 frames late`.
 
-    For a run that ended early, return the reason. If frames come at the target rate, the text calls its first number
-    the rate shown; in a prediction, it is the rate that a source which always has a frame would give.
+    For a run that failed, the text is the reason. If a fixed rate releases the frames, the first number is followed by
+    `shown`. In a prediction that counts late frames, the first number is followed by ALWAYS_FED.
     """
     if facts.failure:
         return f"the run ended early: {facts.failure}"
@@ -306,7 +321,7 @@ def _times(facts: Facts) -> str:
 
 
 def _bound(facts: Facts) -> str:
-    """Return the bound of the frame time, its ms on the critical path, and its cost if it is slower."""
+    """Return a text on the bound: its name, its ms on the critical path, and the cost if its jobs take longer."""
     bound = facts.bound
     if bound is None:
         return UNKNOWN
@@ -328,10 +343,10 @@ def _bound(facts: Facts) -> str:
 
 
 def _stages(bound: NamedBound, *, is_own: bool) -> str:
-    """Return the bound's stages with their ms, and a space at the end; "" if there are none.
+    """Return a text with stages of `bound` and their ms, such as `infer 9.1 `; "" if there are no such stages.
 
-    `is_own`: whether to return the stages of the bound's unit, or those of other units. Stages whose ms are rounded to
-    0 are left out.
+    `is_own`: whether the text has the stages of the bound's own unit; if not, the text has the stages of other units.
+    Stages whose ms are rounded to 0 are left out.
     """
     rows = [(stage, ms) for stage, ms in bound.stages.items() if (stage in bound.of_unit) == is_own]
     rows = [(stage, ms) for stage, ms in rows if ms is None or _ms(ms) != _ms(0.0)]
@@ -358,8 +373,9 @@ def _idle_of(unit: str, share: float, causes: Mapping[str, float]) -> str:
 
 
 def slow_percentile(times: Mapping[str, Any]) -> tuple[str, float] | None:
-    """Return name and value (ms) of the highest percentile that has enough samples; else the maximum, or None.
+    """Return (name, value in ms) of the highest percentile that has enough samples, such as ("p99", 12.5).
 
+    If no percentile has enough samples, return the maximum, named `max`; None if the maximum is unknown.
     `times`: percentiles, `max` and `samples` of a frame time or a latency, as in the report.
     """
     samples = times.get("samples")
@@ -370,7 +386,7 @@ def slow_percentile(times: Mapping[str, Any]) -> tuple[str, float] | None:
 
 
 def _apart(one: float, other: float) -> tuple[str, str]:
-    """Return two numbers as texts of three digits, or of more if the texts would otherwise be equal."""
+    """Return two numbers as texts of three digits. If these texts are equal, more digits tell the numbers apart."""
     texts = _number(one), _number(other)
     for digits in range(4, 17) if one != other else ():
         if texts[0] != texts[1]:
@@ -380,7 +396,10 @@ def _apart(one: float, other: float) -> tuple[str, str]:
 
 
 def _number(value: float | None) -> str:
-    """Return `value` with three digits, such as `96.2` or `4.42`. Values from 100 on are rounded to whole numbers."""
+    """Return `value` as a text with three digits, such as `96.2` or `4.42`; UNKNOWN for None.
+
+    Values from 100 on are rounded to whole numbers.
+    """
     if value is None:
         return UNKNOWN
     return f"{value:.0f}" if value >= 100 else f"{value:.3g}"

@@ -1,7 +1,7 @@
 """Makes the facts of a verdict from a report, from the figures of a live run, or from a prediction.
 
-Rule: pure. All three sources have the keys of docs/report.md, as far as their values are known. The verdict leaves out
-unknown values. The bound is always the one that the source names.
+Rule: the functions are pure. All three sources have the keys of docs/report.md, as far as their values are known. The
+verdict leaves out unknown values. A report and a live run name their bound, and the verdict has the same bound.
 """
 
 from __future__ import annotations
@@ -47,15 +47,19 @@ NO_TRUTH: Final = "nothing to compare with: a pipeline of your own has no true p
 
 
 def verdict_of(report: Report, folder: str = "") -> Verdict:
-    """Return the verdict of a run. `folder`: run folder, which appears in commands that the verdict proposes."""
+    """Return the verdict of a run.
+
+    `report`: report of the run. `folder`: path of the run folder, which appears in commands that the verdict proposes;
+    "" if unknown.
+    """
     return judged(facts_of(report.as_json(), folder))
 
 
 def facts_of(document: Mapping[str, Any], folder: str = "", *, goes_on: bool = False) -> Facts:
-    """Return the facts of a run.
+    """Return the facts on which the verdict of a run rests.
 
-    `document`: mapping with the known keys of report.json. `folder`: as in `verdict_of`.
-    `goes_on`: whether the run has not ended; `document` then has the figures so far.
+    `document`: mapping with the known keys of report.json. `folder`: see `verdict_of`.
+    `goes_on`: whether the run has not ended yet; in that case, `document` has the figures so far.
     """
     frames, times, latency = (document.get(key) or {} for key in ("frames", "frame_time_ms", "latency_ms"))
     has_times = frames.get("presented", 0) > 1
@@ -85,9 +89,11 @@ def facts_of(document: Mapping[str, Any], folder: str = "", *, goes_on: bool = F
 
 
 def target_fps(document: Mapping[str, Any]) -> float:
-    """Return the rate that a run must hold, in frames a second, divided by the slow motion of its pace.
+    """Return the rate that a run must hold, in frames a second.
 
-    The rate comes from `--fps`, the scene or the pipeline file.
+    The rate comes from `--fps`, the scene or the pipeline file; if none of them has a rate, TARGET_FPS counts. In slow
+    motion, the rate is divided by the factor of the slow motion. `document`: mapping with the known keys of
+    report.json.
     """
     config = document.get("config") or {}
     fps = float((config.get("scene") or {}).get("fps") or TARGET_FPS)
@@ -95,7 +101,10 @@ def target_fps(document: Mapping[str, Any]) -> float:
 
 
 def _is_paced(document: Mapping[str, Any]) -> bool:
-    """Return whether a fixed rate or random arrivals released the frames, not the pipeline itself."""
+    """Return whether a fixed rate or random arrivals released the frames.
+
+    In other runs, the pipeline takes a frame as soon as it can. `document`: mapping with the keys of report.json.
+    """
     run = ((document.get("config") or {}).get("pipeline") or {}).get("run") or {}
     policy = POLICIES.get(document.get("policy", ""))
     return bool(run.get("fps") or run.get("arrivals") or (policy and policy.paced))
@@ -104,7 +113,8 @@ def _is_paced(document: Mapping[str, Any]) -> bool:
 def _lateness(document: Mapping[str, Any], *, is_paced: bool) -> LateFrames | None:
     """Return how many frames were not in time; None for a run in slow motion that is not paced.
 
-    Such a run counts its misses against another rate. `is_paced`: result of `_is_paced`.
+    A run in slow motion that is not paced counts its deadline misses at another rate than the target.
+    `document`: mapping with the keys of report.json. `is_paced`: result of `_is_paced`.
     """
     frames, late = document["frames"], document["deadline_misses"]
     dropped = wanted_drops(frames["dropped"])
@@ -117,7 +127,10 @@ def _lateness(document: Mapping[str, Any], *, is_paced: bool) -> LateFrames | No
 
 
 def bound_of(document: Mapping[str, Any]) -> NamedBound | None:
-    """Return the bound that a report names, with each stage's ms on the critical path; None if there is no path."""
+    """Return the bound that a report names, with each stage's ms on the critical path; None if no bound is named.
+
+    `document`: mapping with the known keys of report.json.
+    """
     bound = document.get("bound")
     if not bound:
         return None
@@ -145,7 +158,12 @@ def _causes(idle: Mapping[str, float | None]) -> dict[str, float]:
 
 
 def _image(document: Mapping[str, Any]) -> str:
-    """Return a text on the image error: of this run's frames if they were checked, else from the worst validation."""
+    """Return a text on the image error of a run.
+
+    If the run's frames were checked, the text has their error. If they were not, the text has the error from the
+    validation of the worst avatar, or says that the error is unknown. `document`: mapping with the known keys of
+    report.json.
+    """
     avatars = document.get("accuracy") or {}
     if check := document.get("check"):
         against = str(check["against"]).partition(":")[0]
@@ -163,10 +181,10 @@ def _image(document: Mapping[str, Any]) -> str:
 
 
 def _validated(facts: Mapping[str, Any]) -> tuple[float, float | None]:
-    """Return two PSNRs from the validation of an avatar, in dB.
+    """Return (usual PSNR, PSNR of the worst view) from the validation of an avatar, in dB.
 
-    The first is the mean, or the PSNR of the worst band of zoom if there is no mean. The second is the PSNR of the
-    worst view, None if unknown.
+    The usual PSNR is the mean; without a mean, it is the PSNR of the worst band of zoom. An unknown PSNR of the worst
+    view is None. `facts`: the avatar's entry in the block `accuracy` of the report.
     """
     mean = facts.get("psnr_db")
     known = min(facts["psnr_db_by_band"].values()) if mean is None else mean
@@ -174,7 +192,11 @@ def _validated(facts: Mapping[str, Any]) -> tuple[float, float | None]:
 
 
 def _tries(document: Mapping[str, Any], bound: NamedBound | None, target: float, folder: str) -> Iterator[str]:
-    """Yield proposals that follow from the run's figures, the most useful first. `target`: rate to hold, in fps."""
+    """Yield proposals that follow from the run's figures, the most useful first.
+
+    `document`: mapping with the known keys of report.json. `bound`: result of `bound_of`. `target`: rate to hold, in
+    frames a second. `folder`: see `verdict_of`.
+    """
     others = document.get("other_programs")
     if others is not None and others > MOST_OTHERS:
         yield f"end other programs ({percent(others)}) and run again"
@@ -190,7 +212,12 @@ def _tries(document: Mapping[str, Any], bound: NamedBound | None, target: float,
 
 
 def _shorter(document: Mapping[str, Any], bound: NamedBound | None) -> Iterator[str]:
-    """Yield proposals to shorten the bound; none if the bound is no stage of a unit, such as the rate."""
+    """Yield proposals to shorten the frame time.
+
+    For a run with one frame at a time, the first proposal is a policy under which the units work at once. If a unit
+    bounds the run, and not, for example, the rate, another proposal concerns the stage that bounds.
+    `document`: mapping with the known keys of report.json. `bound`: result of `bound_of`.
+    """
     if works_on_one_frame(document.get("policy", "")) and len(document["units"]) > 1:
         yield "--policy pipelined: the units then work at once"
     if bound is None or bound.unit not in document["units"] or not bound.stages:
@@ -209,7 +236,8 @@ def predicted_verdict(answer: Mapping[str, Any], of_run: Trust | None = None) ->
 
     `answer`: part of `trilane predict --json` that has this prediction. The prediction can be trusted if the 80 %
     interval of its rate is known and does not contain the target.
-    `of_run`: judgement of the run whose times the prediction uses, if any. The prediction is not trusted more than it.
+    `of_run`: judgement of the run whose times the prediction uses; None if it uses no run. If this run is not trusted,
+    the prediction is not trusted either.
     """
     times = _needed(answer)
     config = answer.get("config") or {}
@@ -236,15 +264,20 @@ def predicted_verdict(answer: Mapping[str, Any], of_run: Trust | None = None) ->
 
 
 def _predicted_lateness(answer: Mapping[str, Any]) -> LateFrames | None:
-    """Return how many frames of the simulated run were not in time; None if no rate released them.
+    """Return how many frames of the simulated run were not in time; None if no fixed rate released the frames.
 
-    Random times and other pipelines can make frames late although the mean frame is fast enough.
+    Random times and other pipelines can make frames late although the mean frame time is short enough.
+    `answer`: see `predicted_verdict`.
     """
     return _lateness(answer, is_paced=True) if "frames" in answer and "rate" in answer else None
 
 
 def _needed(answer: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the ms that a frame needs without limits by rate or display: `mean`, and 80 % interval `low` to `high`."""
+    """Return the frame time that neither the rate nor the display limits, in ms.
+
+    The keys are `mean`, and `low` and `high`, the 80 % interval, which are None if unknown. `answer`: see
+    `predicted_verdict`.
+    """
     if rate := answer.get("rate"):
         keys = {"mean": "reserve", "low": "reserve_high", "high": "reserve_low"}
         left = {name: rate[key] for name, key in keys.items()}
@@ -268,7 +301,7 @@ def _trust_in(low: float | None, high: float | None, target: float, *, is_held: 
 def _resting_on(of_run: Trust | None, trust: Trust) -> Trust:
     """Return `trust`, or a worse judgement if the prediction uses times of a run that is not trusted.
 
-    `of_run`: judgement of this run; None if the prediction uses no run.
+    `of_run`: judgement of the run whose times the prediction uses; None if it uses no run.
     """
     if of_run is None or of_run.trusted:
         return trust
@@ -282,10 +315,11 @@ def _is_held_by_display(answer: Mapping[str, Any]) -> bool:
 
 
 def _predicted_bound(answer: Mapping[str, Any], frame_ms: float) -> NamedBound | None:
-    """Return the unit whose stages take most of a frame's time, as the bound; None if no stage takes time.
+    """Return the bound of a prediction: the unit whose stages take most of a frame's time; None if none takes time.
 
-    For a pipeline file, only the stages that determine the period count, unless its rate does. A network by itself is
-    the only stage of its unit. `frame_ms`: time of a frame.
+    For a pipeline file, only the stages that determine the period count; if the file's rate determines the period, all
+    stages count. If the display limits the rate, the bound is the display. A network by itself is the only stage of its
+    unit. `answer`: see `predicted_verdict`. `frame_ms`: time of a frame.
     """
     stages = answer.get("stages")
     if not stages:

@@ -1,4 +1,4 @@
 """Parts that several benches share: fixtures, networks, reference pictures, and processes for variants.
 
-This folder may import what bench/ may import, but no module of bench/ itself.
+This folder may import from the same folders as bench/, but from no module of bench/ outside of lib/.
 """

@@ -1,6 +1,6 @@
 """The avatars in a frame: their places, and the layers of the picture that show them, made without the stages.
 
-Rule: motion, camera and media time are as in the pose stage, so a picture shows the same moment as the run's frame.
+Rule: motion, camera and time are as in the pose stage. Therefore a picture shows the same moment as a run's frame.
 """
 
 from __future__ import annotations
@@ -27,10 +27,11 @@ from trilane.stages.gpu.composite_painters import taps_of
 class CastView:
     """One visible avatar in one frame.
 
-    `index`: number of the avatar in the scene. `folder`: folder of its bundle. `pose` (55,3), `translation` (3,),
-    `world` (4,4): as in `Mover.sample` and `Mover`. `joints` (55,3,4): skinning matrices, as the pose stage computes
-    them. `box`: pixels of the picture around the avatar and its clothes; it may reach beyond the picture. `depth`:
-    camera z of the pelvis. `view` (4,4): view matrix. `projection` (4,4): projection to the box.
+    `index`: number of the avatar in the scene. `folder`: folder of the avatar's bundle.
+    `pose`, `translation`: pose (55,3) and translation (3,) from `Mover.sample`. `world`: matrix (4,4) of the `Mover`.
+    `joints`: skinning matrices (55,3,4), as the pose stage computes them.
+    `box`: rectangle of the picture around the avatar and its clothes; it may reach beyond the picture.
+    `depth`: camera z of the pelvis. `view`: view matrix (4,4). `projection`: matrix (4,4) of the projection to the box.
     """
 
     index: int
@@ -58,11 +59,11 @@ class _Actor:
 class Cast:
     """The avatars and the camera of the scene in `checked`.
 
-    `avatars`: distinct avatars, by the folder of the bundle.
+    `avatars`: loaded avatars, by the folder of the bundle.
     """
 
     def __init__(self, checked: Checked) -> None:
-        """Load the avatars. Raises BadInputError."""
+        """Load the avatars. Raises BadInputError if an avatar cannot be read."""
         scene, folders = checked.config.scene, checked.config.avatar_dirs
         self._fps = scene.fps
         self._output: Shape = (scene.output.height, scene.output.width)
@@ -85,7 +86,7 @@ class Cast:
         return [seen for seen in found if seen is not None]
 
     def boxes(self, frame: int) -> list[Box]:
-        """Return the boxes of the visible avatars in frame number `frame`, clipped to the picture."""
+        """Return the box of each visible avatar in frame number `frame`, clipped to the picture."""
         return [seen.box.on(self._output) for seen in self.seen(frame)]
 
     def projection(self, frame: int) -> F64:
@@ -130,25 +131,26 @@ class Box(NamedTuple):
         return self.bottom - self.top, self.right - self.left
 
     def rect(self, output: Shape) -> Rect:
-        """Return the box in normalised device coordinates of a picture of `output` (height, width)."""
+        """Return the box in normalised device coordinates of a picture. `output`: (height, width) of the picture."""
         across, down = 2.0 / output[1], 2.0 / output[0]
         return Rect(self.left * across - 1, 1 - self.bottom * down, self.right * across - 1, 1 - self.top * down)
 
     def within(self, other: Box) -> Rect:
-        """Return the box in normalised device coordinates in which `other` is the whole screen."""
+        """Return the box in the normalised device coordinates of a screen that shows exactly the box `other`."""
         moved = Box(self.top - other.top, self.left - other.left, self.bottom - other.top, self.right - other.left)
         return moved.rect(other.shape)
 
     def on(self, output: Shape) -> Box:
-        """Return the part of the box that lies on a picture of `output` (height, width)."""
+        """Return the part of the box that lies on a picture. `output`: (height, width) of the picture."""
         return Box(max(self.top, 0), max(self.left, 0), min(self.bottom, output[0]), min(self.right, output[1]))
 
 
 @dataclass(frozen=True)
 class RasterLayer:
-    """A layer of a picture, which covers the pixels of `box`.
+    """A layer of a picture.
 
-    `light` (h,w,4): linear light times alpha, then alpha, 0..1. `depth`: camera z; the farthest layer has the least.
+    `box`: pixels of the picture that the layer covers. `depth`: camera z; the farthest layer has the least value.
+    `light`: array (h,w,4) in 0..1: linear light of three colours times alpha, and alpha.
     """
 
     box: Box
@@ -157,9 +159,9 @@ class RasterLayer:
 
 
 def box_around(rect: Rect, output: Shape) -> Box:
-    """Return the smallest box around `rect` (NDC) on whole pixels, grown until both sides are multiples of 32.
+    """Return the smallest box of whole pixels around `rect`, grown until both sides are multiples of 32.
 
-    `output`: (height, width) of the picture.
+    `rect`: rectangle in normalised device coordinates. `output`: (height, width) of the picture.
     """
     top, bottom = np.floor((1 - rect.y1) / 2 * output[0]), np.ceil((1 - rect.y0) / 2 * output[0])
     left, right = np.floor((1 + rect.x0) / 2 * output[1]), np.ceil((1 + rect.x1) / 2 * output[1])
@@ -167,7 +169,11 @@ def box_around(rect: Rect, output: Shape) -> Box:
 
 
 def grown(box: Box, step: int) -> Box:
-    """Return `box`, grown evenly until `step` divides both sides. An odd pixel goes to the bottom or the right."""
+    """Return `box`, grown evenly until both sides are multiples of `step` pixels.
+
+    If an odd number of rows is added, the bottom gets one row more than the top. If an odd number of columns is added,
+    the right side gets one column more than the left side.
+    """
     rows, columns = _grown(box.top, box.bottom, step), _grown(box.left, box.right, step)
     return Box(rows[0], columns[0], rows[1], columns[1])
 
@@ -178,14 +184,17 @@ def _grown(first: int, last: int, step: int) -> tuple[int, int]:
 
 
 def premultiplied(rgba: Floats) -> F64:
-    """Return linear light premultiplied with alpha, and alpha (h,w,4). `rgba` (h,w,4): sRGB, straight alpha, 0..1."""
+    """Return an array (h,w,4): linear light times alpha, and alpha. `rgba`: (h,w,4) sRGB with straight alpha, 0..1."""
     straight = np.asarray(rgba, np.float64)
     alpha = straight[..., 3:]
     return np.concatenate([to_light(straight[..., :3]) * alpha, alpha], axis=-1)
 
 
 def shrunk(light: F64, factor: int) -> F64:
-    """Return `light` (h * factor, w * factor, C), reduced to (h,w,C) by means over `factor` x `factor` pixels."""
+    """Return an array (h,w,C) with the means over squares of `factor` x `factor` pixels.
+
+    `light`: array (h * factor, w * factor, C).
+    """
     height, width, channels = light.shape
     squares = light.reshape(height // factor, factor, width // factor, factor, channels)
     return np.asarray(squares.mean(axis=(1, 3)))
@@ -209,11 +218,13 @@ def _enlarged_down(light: F64, factor: int) -> F64:
 
 
 def placed(light: F64, rect: Rect, output: Shape, depth: float) -> RasterLayer:
-    """Return a layer with `light` (h,w,C), which fills `rect` (NDC), resampled at the pixels of the picture.
+    """Return a layer with the picture `light`, resampled at the pixels of the whole picture.
 
-    Each pixel whose centre lies in `rect` is the mean of bilinear reads, evenly spread over the pixel, as many as the
-    composite takes. Beyond the centres of the outermost pixels of `light`, their values are repeated. `output`:
-    (height, width) of the picture. `depth`: depth of the layer.
+    Each pixel whose centre lies in `rect` is the mean of bilinear reads, which are evenly spread over the pixel. The
+    number of reads is the same as in the composite stage. Beyond the centres of the outermost pixels of `light`, their
+    values are repeated.
+    `light`: array (h,w,4) that fills `rect`. `rect`: rectangle in normalised device coordinates. `output`: (height,
+    width) of the whole picture. `depth`: depth of the layer.
     """
     top, bottom = (1 - rect.y1) / 2 * output[0], (1 - rect.y0) / 2 * output[0]
     left, right = (1 + rect.x0) / 2 * output[1], (1 + rect.x1) / 2 * output[1]
@@ -227,11 +238,12 @@ def placed(light: F64, rect: Rect, output: Shape, depth: float) -> RasterLayer:
 
 
 def _reads(begin: float, end: float, count: int, side: int, taps: int) -> tuple[int, F64]:
-    """Return the resampling along one axis: the first pixel of the picture, and weights (n, count) for n pixels.
+    """Return (first, weights): how a layer is resampled along one axis of a picture.
 
-    A layer of `count` pixels lies from `begin` to `end` on a picture of `side` pixels. The n pixels of the picture have
-    their centres in [begin, end). Row k of the weights says how much each pixel of the layer counts for the first
-    pixel + k. `taps`: number of reads a pixel.
+    The n pixels of the picture with centres in [begin, end) get values; `first` is the number of the first of them. Row
+    k of `weights` (n, count) says how much each pixel of the layer counts for pixel `first` + k of the picture.
+    `begin`, `end`: place of the layer in pixels of the picture. `count`: number of the layer's pixels. `side`: number
+    of the picture's pixels. `taps`: number of reads for each pixel.
     """
     first, last = (min(max(int(np.ceil(place - 0.5)), 0), side) for place in (begin, end))
     middles = np.arange(first, last)[:, None] + 0.5
@@ -247,12 +259,18 @@ def _reads(begin: float, end: float, count: int, side: int, taps: int) -> tuple[
 
 
 def blended(background: U8, layers: Iterable[RasterLayer]) -> U8:
-    """Return `layers` blended over `background` (h,w,3) sRGB, the farthest first, as (h,w,3) uint8 sRGB."""
+    """Return a picture (h,w,3) uint8 sRGB: the `layers` over `background`, blended from the farthest to the nearest.
+
+    `background`: picture (h,w,3) uint8 sRGB.
+    """
     return np.asarray(np.rint(laid_over(background, layers)[0] * 255), np.uint8)
 
 
 def laid_over(background: U8, layers: Iterable[RasterLayer]) -> tuple[F64, F64]:
-    """Return the result of `blended` before rounding, (h,w,3) in 0..1, and each pixel's share under layers (h,w)."""
+    """Return (picture, cover): the result of `blended` before rounding, and how much the layers cover each pixel.
+
+    The picture is (h,w,3) sRGB in 0..1. The cover is (h,w), from 0, only background, to 1, no background.
+    """
     output = (background.shape[0], background.shape[1])
     light, seen_through = to_light(background / 255.0), np.ones(output)
     for layer in sorted(layers, key=lambda layer: layer.depth):
@@ -265,11 +283,11 @@ def laid_over(background: U8, layers: Iterable[RasterLayer]) -> tuple[F64, F64]:
 
 
 def to_light(code: F64) -> F64:
-    """Return the linear light of sRGB values in 0..1, by IEC 61966-2-1."""
+    """Return the linear light in 0..1 of sRGB values in 0..1, by IEC 61966-2-1."""
     return np.asarray(np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4))
 
 
 def to_code(light: F64) -> F64:
-    """Return the sRGB values in 0..1 of linear light, by IEC 61966-2-1. Light is clipped to 0..1 before."""
+    """Return the sRGB values in 0..1 of linear light, by IEC 61966-2-1. Light outside of 0..1 is clipped first."""
     light = np.clip(light, 0.0, 1.0)
     return np.asarray(np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055))

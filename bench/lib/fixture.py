@@ -1,8 +1,9 @@
-"""The scene that the GPU benches draw, its reference, and the timing of variants in turns.
+"""The fixture that the GPU benches draw, its ground truth, and the timing of variants in interleaved rounds.
 
-Rule: the default body fills the height of a square picture, with the same numbers every time; only size and channels
-vary. The functions of runs and of training make avatars and ground truth. A busy machine affects all variants alike. As
-in a run, successive inputs differ and slots alternate, because caches would speed up repetitions.
+Rule: the default body fills the height of a square picture. Only the size and the number of channels vary; all other
+numbers are the same every time. The functions of runs and of training make avatars and ground truth. A busy machine
+affects all variants alike. As in a run, successive inputs differ and slots alternate, because caches would speed up
+repetitions.
 """
 
 from __future__ import annotations
@@ -38,13 +39,13 @@ INPUTS, SLOTS = 5, 2
 
 @dataclass(frozen=True)
 class Fixture:
-    """The body of a bench, its texture and its camera.
+    """The body that a bench draws, with its neural texture and its camera.
 
-    `shaped`: the body.
-    `poses`: the body's joints in each of INPUTS poses.
+    `shaped`: default body after its shape blend shapes.
+    `poses`: joints of the body in each of INPUTS poses.
     `arrays`: mesh of the body for the GPU.
     `view`, `projection`: matrices of the camera, (4,4) float64.
-    `texture`: neural texture (512,512,C) float64, the same numbers every time.
+    `texture`: neural texture (512,512,C) float64, with the same numbers every time.
     """
 
     shaped: ShapedBody
@@ -55,14 +56,14 @@ class Fixture:
     texture: NDArray[np.float64]
 
     def joints(self, number: int) -> NDArray[np.float32]:
-        """Return the skinning matrices (55,3,4) float32 of input `number`."""
+        """Return the skinning matrices (55,3,4) float32 of input `number`; the inputs repeat after INPUTS numbers."""
         return self.poses[number % INPUTS].matrices
 
 
 def standing(channels: int, weights: int = 8) -> Fixture:
-    """Return the fixture: a standing body with its arms half down, a little higher in each further pose.
+    """Return the fixture: a standing body whose arms are half down, and a little higher in each further pose.
 
-    `channels`: channels of its texture. `weights`: number of skin weights a vertex, 4, 8 or 12.
+    `channels`: number of channels of the texture. `weights`: number of skin weights of a vertex: 4, 8 or 12.
     """
     body = load_body(bundle_folder("default") / "body.npz")
     shaped = body.shape()
@@ -106,7 +107,8 @@ def _texture(channels: int) -> NDArray[Any]:
 class Drawable:
     """The parts of an avatar that the GPU draws.
 
-    `texture`: neural texture (H,W,C) float32. `quantisation`: scale and zero point of the network's input.
+    `arrays`: mesh of the avatar for the GPU. `texture`: neural texture (H,W,C) float32. `quantisation`: scale and zero
+    point of the network's input.
     """
 
     arrays: MeshArrays
@@ -115,16 +117,17 @@ class Drawable:
 
 
 def load_drawable(name: str) -> Drawable:
-    """Load the parts of the avatar `name` that the GPU draws. Raises BadInputError."""
+    """Return the parts of the avatar `name` that the GPU draws. Raises BadInputError if the avatar cannot be read."""
     avatar = load_avatar(load_bundle(name))
     packed = avatar.bundle.manifest.network.input
     return Drawable(avatar_mesh(avatar.shaped), avatar.texture, Quantisation(packed.scale, packed.zero_point))
 
 
 def ground_truth(bundle: Bundle) -> tuple[Any, Any]:
-    """Return the renderer of the bundle's clothed body (`SampleRenderer`), and the function `image_error` of training.
+    """Return (renderer, function): what is needed to compare pictures of `bundle` with ground truth.
 
-    Raises MissingPartError.
+    The `SampleRenderer` draws the clothed body of the bundle. The function is `image_error` of training.
+    Raises MissingPartError if a library for training is not installed.
     """
     try:
         from trilane.training.clothing import look_of
@@ -140,10 +143,12 @@ def interleaved_ms(
     repeats: int,
     prepare: Callable[[int], object] = lambda _: None,
 ) -> dict[str, list[float]]:
-    """Return the times of each variant in `repeats` rounds, ms, after a warm-up.
+    """Return the times of each variant in ms, one for each round after a warm-up, by variant.
 
-    Each round runs every variant once. A variant is a function of the round's number, from 0, by which it chooses input
-    and slot. `prepare` is called with this number before each run, and is not timed.
+    Each round runs every variant once.
+    `variants`: functions of the round's number, by name. The number, from 0, selects the input and the slot.
+    `repeats`: number of timed rounds. `prepare`: function that is called with the same number before each run; its time
+    does not count.
     """
     times: dict[str, list[float]] = {name: [] for name in variants}
     for number in range(WARM_UP + repeats):
@@ -157,7 +162,7 @@ def interleaved_ms(
 
 
 def summary_ms(times_ms: list[float]) -> dict[str, float]:
-    """Return the median, the minimum and the 90th percentile of `times_ms`."""
+    """Return the median, the minimum and the 90th percentile: `median_ms`, `min_ms`, `p90_ms`."""
     return {
         "median_ms": float(np.median(times_ms)),
         "min_ms": float(np.min(times_ms)),

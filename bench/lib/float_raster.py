@@ -1,9 +1,9 @@
-"""A reference rasteriser in float64 NumPy, with which the GPU stage's pictures are compared.
+"""A reference rasteriser in float64 NumPy. The pictures of the stage raster are compared with its pictures.
 
-Rule: coordinates are not rounded, as they are in a driver. Pixel centres are at half-integers. The rasteriser uses the
-top-left rule and a less-than depth test, and does not snap vertices. Triangles are evaluated in homogeneous coordinates
-(Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates", 1997). Near and far planes cut them pixel
-by pixel.
+Rule: pixel centres are at half-integers. The rasteriser uses the top-left rule and a less-than depth test. Unlike a
+driver, it neither rounds coordinates nor snaps vertices to a grid. Triangles are evaluated in homogeneous coordinates
+(Olano and Greer, "Triangle scan conversion using 2D homogeneous coordinates", 1997). The near and the far plane cut
+triangles pixel by pixel.
 """
 
 from __future__ import annotations
@@ -23,10 +23,11 @@ BATCH_SAMPLES = 4_000_000
 
 @dataclass(frozen=True)
 class ReferenceImage:
-    """A rasterised image.
+    """The result of rasterising triangles, with a value for each pixel.
 
-    `coverage` (h,w): whether a triangle covers the pixel. `triangle` (h,w): number of the nearest triangle, -1 outside.
-    `uv` (h,w,2), `depth` (h,w): texture coordinates and z/w of its point, 0 outside.
+    `coverage`: whether a triangle covers the centre of the pixel, (h,w).
+    `triangle`: number of the nearest triangle, (h,w) int64; -1 where no triangle is.
+    `uv`, `depth`: texture coordinates (h,w,2) and z/w (h,w) of the point of this triangle; 0 where no triangle is.
     """
 
     coverage: NDArray[np.bool_]
@@ -36,7 +37,10 @@ class ReferenceImage:
 
 
 def skin(arrays: MeshArrays, joints: NDArray[np.floating[Any]]) -> F64:
-    """Return the skinned vertices (N,3) of `arrays` in the world. `joints`: skinning matrices (55,3,4)."""
+    """Return the skinned vertices (N,3) of the mesh `arrays` in the world, metres.
+
+    `joints`: skinning matrices (55,3,4).
+    """
     matrices = np.einsum("nk,nkij->nij", arrays.weight.astype(np.float64), joints.astype(np.float64)[arrays.joint])
     return np.asarray(np.einsum("nij,nj->ni", matrices[..., :3], arrays.position.astype(np.float64)) + matrices[..., 3])
 
@@ -49,13 +53,13 @@ def rasterise(
     shape: tuple[int, int],
     cull: bool = False,
 ) -> ReferenceImage:
-    """Return the image of triangles. Row 0 is at the top.
+    """Return the image of `triangles`. Row 0 is at the top.
 
-    `world`: vertices, (N,3) metres.
+    `world`: vertices in the world, (N,3) metres.
     `triangles`: indices of each triangle's vertices, (F,3).
     `uv`: texture coordinates of each vertex, (N,2).
-    `clip`: projection @ view, (4,4).
-    `shape`: (height, width) in pixels.
+    `clip`: matrix projection @ view, (4,4).
+    `shape`: (height, width) of the image in pixels.
     `cull`: whether to leave out triangles that wind clockwise in the picture.
     """
     corners = _target_corners(world, clip, shape)[triangles]
@@ -75,7 +79,10 @@ def rasterise(
 
 
 def sample(texture: F64, uv: F64) -> F64:
-    """Return bilinear samples (..., C) of `texture` (H,W,C) at `uv` (..., 2). Texels are clamped to the edge."""
+    """Return bilinear samples (..., C) of `texture` at `uv`. Beyond the edge, the texels of the edge are repeated.
+
+    `texture`: array (H,W,C). `uv`: texture coordinates (..., 2), column first, 0..1.
+    """
     height, width = texture.shape[:2]
     column, row = uv[..., 0] * width - 0.5, uv[..., 1] * height - 0.5
     left, top = np.floor(column).astype(np.int64), np.floor(row).astype(np.int64)
@@ -90,14 +97,14 @@ def sample(texture: F64, uv: F64) -> F64:
 
 
 def quantise(real: F64, scale: float, zero_point: int) -> NDArray[np.uint8]:
-    """Return q = clamp(round(real / scale) + zero_point, 0, 255) of real numbers (...). Halves round to even."""
+    """Return clamp(round(real / scale) + zero_point, 0, 255) of each real number. Halves round to even."""
     return np.asarray(np.clip(np.rint(real / scale) + zero_point, 0, 255), np.uint8)
 
 
 def tensor(image: ReferenceImage, texture: F64, scale: float, zero_point: int) -> NDArray[np.uint8]:
-    """Return the tensor (h,w,C) uint8: the quantised texture on the mesh, the zero point outside.
+    """Return the tensor (h,w,C) uint8: the quantised texture on the mesh, and the zero point outside of the mesh.
 
-    `image`: rasterised mesh.
+    `image`: result of rasterising the mesh.
     `texture`: neural texture (H,W,C).
     `scale`, `zero_point`: scale and zero point of the tensor.
     """
@@ -107,7 +114,11 @@ def tensor(image: ReferenceImage, texture: F64, scale: float, zero_point: int) -
 
 
 def _target_corners(world: F64, clip: F64, shape: tuple[int, int]) -> F64:
-    """Return vertices (N,4) as (column, row, z, w): column / w and row / w are pixels, z and w clip coordinates."""
+    """Return the vertices (N,4) as (column, row, z, w).
+
+    The place in the picture is column / w and row / w, in pixels. z and w are clip coordinates.
+    `world`: vertices (N,3). `clip`: matrix projection @ view, (4,4). `shape`: (height, width) of the picture.
+    """
     x, y, z, w = np.moveaxis(np.c_[world, np.ones(len(world))] @ (FLIP_Y @ clip).T, -1, 0)
     return np.stack([(x + w) * shape[1] / 2, (y + w) * shape[0] / 2, z, w], axis=-1)
 
@@ -115,9 +126,11 @@ def _target_corners(world: F64, clip: F64, shape: tuple[int, int]) -> F64:
 def _fragments(
     corners: F64, shape: tuple[int, int], cull: bool
 ) -> tuple[NDArray[np.int64], F64, NDArray[np.int64], F64]:
-    """Return the P pixels that triangles cover, once for each triangle.
+    """Return (pixel, depth, triangle, share) of all fragments: a fragment is one pixel that one triangle covers.
 
-    The result is pixel index (P,), depth z/w (P,), triangle (P,), and shares of the triangle's corners (P,3).
+    Each array has a row for each of P fragments. `pixel` (P,): index of the pixel in row-major order. `depth` (P,): z/w
+    of the point. `triangle` (P,): number of the triangle. `share` (P,3): shares of the triangle's corners in the point.
+    `corners`: result of `_target_corners` for the corners of each triangle, (F,3,4). `shape`, `cull`: see `rasterise`.
     """
     low, size = _boxes(corners, shape)
     if cull:
@@ -136,9 +149,9 @@ def _fragments(
 
 
 def _boxes(corners: F64, shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the square around each triangle: first column and row (F,2), and side (F,).
+    """Return (first, side) of a square around each triangle: first column and row (F,2), and side (F,), in pixels.
 
-    The side is 0 for a triangle outside the picture.
+    The side is 0 for a triangle outside of the picture. `corners`, `shape`: see `_fragments`.
     """
     limit = np.array([shape[1], shape[0]])
     w = corners[..., 3]
@@ -179,13 +192,17 @@ def _cross(points: F64, first: int, second: int) -> F64:
 
 
 def _determinant(points: F64) -> F64:
-    """Return a determinant (F,), which is positive for triangles that wind clockwise in the picture."""
+    """Return a determinant (F,) for each triangle, which is positive if the triangle winds clockwise in the picture.
+
+    `points`: corners of the triangles as in `_fragments`, (F,3,4).
+    """
     return np.asarray((_cross(points, 1, 2) * points[:, 0][:, [0, 1, 3]]).sum(axis=-1))
 
 
 def _top_left(edges: F64) -> NDArray[np.bool_]:
-    """Return which edges own the samples on them (F,3): left edges, and horizontal edges with the inside below.
+    """Return a mask (F,3): whether an edge of a triangle owns the samples that lie exactly on the edge.
 
-    `edges` (F,3,3): coefficients of the edge functions, whose values are positive inside.
+    Left edges own their samples, and horizontal edges at the top of a triangle.
+    `edges`: coefficients (F,3,3) of the edge functions. These functions are positive inside of the triangle.
     """
     return np.asarray((edges[..., 0] > 0) | ((edges[..., 0] == 0) & (edges[..., 1] > 0)))

@@ -1,14 +1,14 @@
 """Pictures by the plan `full`, in which everything is modelled, and true pictures. Other plans are compared with both.
 
-Rule: the plan `full` is a second, slow implementation where that is possible. The body has every weight and every blend
-shape in float64. The neural texture is read at SAMPLES x SAMPLES points of a tensor pixel, whose mean is not rounded.
-Each avatar has a tensor of its own, of about the size for which its network paints best. The tensor lies on the
-picture's grid: a pixel of the tensor covers a square of pixels of the picture, or the other way round. The network is
-in FP32; its picture is blended in linear light, in float64, over the run's own background.
+Rule: the plan `full` is a second, slow implementation, as far as possible. The body has every weight and every blend
+shape in float64. A tensor pixel is the unrounded mean of SAMPLES x SAMPLES reads of the neural texture. Each avatar has
+a tensor of its own, whose size is near the size that its network was trained for. The tensor lies on the picture's
+grid: a pixel of the tensor covers a square of pixels of the picture, or the other way round. The network is in FP32.
+The network's picture is blended in linear light, in float64, over the run's own background.
 
 A true picture shows the clothed body itself, drawn like a training sample. An avatar's network was trained to paint
-this picture, so it shows how good every plan is, including `full`. Only bundled avatars have true pictures. Clothes are
-put on the skin, not on an avatar's offsets, because the offsets are these clothes already.
+this picture. Therefore the true picture shows how good every plan is, including `full`. Only bundled avatars have true
+pictures. Clothes are put on the skin, not on an avatar's offsets, because the offsets are these clothes already.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class FullBody:
     """
 
     def __init__(self, body: Body, betas: Sequence[float] = (), expression: Sequence[float] = ()) -> None:
-        """Shape `body` by `betas` and `expression`; missing coefficients are 0."""
+        """Give `body` its shape. `betas`, `expression`: coefficients of blend shapes; missing coefficients are 0."""
         self._body = body
         self._weights = body.weights.astype(np.float64)
         self.rest = body.v_template.astype(np.float64)
@@ -68,9 +68,9 @@ class FullBody:
             self.rest = self.rest + body.offsets
 
     def vertices(self, pose: F64, translation: F64, world: F64) -> F64:
-        """Return the vertices (V,3) in the world, metres.
+        """Return the vertices (V,3) of the posed body in the world, metres.
 
-        `pose`: axis-angle (55,3), radians.
+        `pose`: rotation of each joint as axis-angle (55,3), radians.
         `translation`: translation (3,) of the root in body space, metres.
         `world`: matrix (4,4) from body space to the world.
         """
@@ -83,14 +83,14 @@ class FullBody:
         return np.asarray(np.einsum("vab,vb->va", moved[:, :, :3], rest) + moved[:, :, 3])
 
     def _placed(self, turns: F64, translation: F64, world: F64) -> F64:
-        """Return each joint's matrix (55,3,4) from the rest shape to the world.
+        """Return the matrices (55,3,4) of the joints from the body at rest to the world.
 
-        `turns`: rotations (55,3,3) of the joints. `translation`, `world`: see `vertices`.
+        `turns`: rotation matrices (55,3,3) of the joints. `translation`, `world`: see `vertices`.
         """
         placed: dict[int, F64] = {}
 
         def place(joint: int) -> F64:
-            """Return the matrix (4,4) of `joint`: its parent's matrix @ shift to the joint @ turn @ shift back."""
+            """Return the matrix (4,4) of `joint`: matrix of its parent @ shift to the joint @ turn @ shift back."""
             if joint not in placed:
                 parent = int(self._body.parents[joint])
                 above = world @ _shift(translation) if parent < 0 else place(parent)
@@ -111,9 +111,11 @@ def _shift(by: F64) -> F64:
 
 @dataclass(frozen=True)
 class _Avatar:
-    """One distinct avatar.
+    """The parts of an avatar that the plan `full` draws with.
 
-    `paint`: its FP32 network. `area`: pixels of the network's own tensor. `network`: source of the network in words.
+    `body`: body with every blend shape. `mesh`: triangles and texture coordinates. `texture`: neural texture (H,W,C).
+    `paint`: FP32 network. `area`: number of pixels of the tensor that the network was trained for. `network`: source of
+    the network in words.
     """
 
     body: FullBody
@@ -125,20 +127,23 @@ class _Avatar:
 
 
 class FullPictures:
-    """Makes pictures of a cast by the plan `full`."""
+    """Makes pictures of the avatars in `cast` by the plan `full`."""
 
     def __init__(self, cast: Cast) -> None:
-        """Load the networks. Raises BadInputError, MissingPartError."""
+        """Load the networks. Raises BadInputError if a file cannot be read, MissingPartError without PyTorch."""
         self._cast = cast
         self._avatars = {folder: _avatar(data) for folder, data in cast.avatars.items()}
 
     @property
     def networks(self) -> list[str]:
-        """The sources of the networks that paint the avatars, in words."""
+        """The source of each network that paints avatars, in words, sorted."""
         return sorted({avatar.network for avatar in self._avatars.values()})
 
     def frame(self, number: int, background: U8) -> U8:
-        """Return frame `number` over its `background` (h,w,3): (h,w,3) uint8, sRGB."""
+        """Return the picture (h,w,3) uint8 sRGB of frame `number` by the plan `full`.
+
+        `background`: picture (h,w,3) uint8 sRGB of the same frame without avatars.
+        """
         return blended(background, [self._layer(seen) for seen in self._cast.seen(number)])
 
     def _layer(self, seen: CastView) -> RasterLayer:
@@ -154,9 +159,11 @@ class FullPictures:
 
 
 def fineness(shape: Shape, area: int) -> Fraction:
-    """Return the number of tensor pixels per picture pixel, along a side: ..., 1/3, 1/2, 1, 2, 3, ...
+    """Return the density of an avatar's tensor, which is a whole number or 1 divided by a whole number.
 
-    The result makes the tensor of a box of `shape` (height, width) as near as possible to `area` pixels, as a ratio.
+    The density is the number of tensor pixels per picture pixel, along a side. It brings the number of the tensor's
+    pixels as near to `area` as possible, measured as a ratio.
+    `shape`: (height, width) of the avatar's box in the picture. `area`: wanted number of the tensor's pixels.
     """
     own = shape[0] * shape[1]
     larger, smaller = max(own, area), min(own, area)
@@ -177,13 +184,14 @@ def _avatar(data: AvatarData) -> _Avatar:
 def supersampled(vertices: F64, mesh: MeshArrays, clip: F64, shape: Shape, texture: F32, samples: int = SAMPLES) -> F64:
     """Return the tensor of a body in real numbers, (h,w,C) float64.
 
-    A pixel is the mean of `samples` x `samples` bilinear reads of the texture; reads off the mesh are 0.
+    A pixel is the mean of `samples` x `samples` bilinear reads of the texture. Reads outside of the mesh are 0.
 
-    `vertices`: vertices (V,3) of the body, in the world, metres.
+    `vertices`: vertices (V,3) of the body in the world, metres.
     `mesh`: triangles and texture coordinates of the body.
-    `clip`: projection of the tensor @ view, (4,4).
+    `clip`: matrix projection of the tensor @ view, (4,4).
     `shape`: (height, width) of the tensor.
     `texture`: neural texture (H,W,C).
+    `samples`: number of reads along each side of a pixel.
     """
     fine = (shape[0] * samples, shape[1] * samples)
     image = float_raster.rasterise(vertices[mesh.source], mesh.triangles, mesh.uv, clip, fine, mesh.closed)
@@ -199,19 +207,22 @@ def supersampled(vertices: F64, mesh: MeshArrays, clip: F64, shape: Shape, textu
 
 
 class TruePictures:
-    """Makes true pictures of a cast of bundled avatars: the clothed bodies that the avatars were trained on."""
+    """Makes true pictures of bundled avatars, which show the clothed bodies that the avatars were trained on."""
 
     def __init__(self, cast: Cast, ctx: Any) -> None:
-        """Prepare the clothed bodies. `cast`: only bundled avatars. `ctx`: OpenGL context in use."""
+        """Prepare the clothed bodies. `cast`: scene that only has bundled avatars. `ctx`: OpenGL context in use."""
         self._cast = cast
         self._clothed = {folder: _clothed(data, ctx) for folder, data in cast.avatars.items()}
 
     def frame(self, number: int, background: U8) -> U8:
-        """Return frame `number` over its `background` (h,w,3): (h,w,3) uint8, sRGB."""
+        """Return the true picture (h,w,3) uint8 sRGB of frame `number`.
+
+        `background`: picture (h,w,3) uint8 sRGB of the same frame without avatars.
+        """
         return blended(background, self.layers(number))
 
     def layers(self, number: int) -> list[RasterLayer]:
-        """Return the layers of the visible avatars in frame `number`, on the picture's grid."""
+        """Return a layer for each visible avatar in frame `number`. Its pixels are pixels of the picture."""
         layers = []
         for seen in self._cast.seen(number):
             rgba = self._clothed[seen.folder].render(seen.joints, seen.view, seen.projection, seen.box.shape) / 255.0
@@ -220,7 +231,7 @@ class TruePictures:
 
 
 def true_pictures(cast: Cast, ctx: Any) -> TruePictures | None:
-    """Return the true pictures of `cast`; None if an avatar in it is not bundled.
+    """Return an object that makes true pictures of `cast`; None if an avatar of `cast` is not bundled.
 
     `ctx`: OpenGL context in use.
     """
@@ -248,7 +259,10 @@ Paint = Callable[[F64], F32]
 
 
 def float_network(bundle: Bundle) -> tuple[Paint, str]:
-    """Return the FP32 network of `bundle`, and its source in words. Raises BadInputError, MissingPartError."""
+    """Return (FP32 network of `bundle`, source of the network in words).
+
+    Raises BadInputError if a file cannot be read, MissingPartError if the network needs PyTorch, which is absent.
+    """
     weights = require_float_network(bundle)
     if weights is None:
         return dequantised(
@@ -258,7 +272,7 @@ def float_network(bundle: Bundle) -> tuple[Paint, str]:
 
 
 def require_float_network(bundle: Bundle) -> Path | None:
-    """Return `float_weights` of `bundle`. Raises MissingPartError if they exist, but PyTorch is missing to run them."""
+    """Return the result of `float_weights`. Raises MissingPartError if the file exists, but PyTorch is absent."""
     weights = float_weights(bundle)
     if weights is not None and not machine.here.has_package("torch"):
         raise MissingPartError("the FP32 network needs torch", extra="train")
@@ -266,10 +280,10 @@ def require_float_network(bundle: Bundle) -> Path | None:
 
 
 def float_weights(bundle: Bundle) -> Path | None:
-    """Return the file of the float network that `bundle` was quantised from; None if no such file is here.
+    """Return the file of the float network that `bundle` was quantised from; None if this file is not in WEIGHTS.
 
-    The manifest must name the file with its digest: in the entry of `avatar validate --float-network`, or among the
-    facts about quantising.
+    The bundle's manifest must name the file with its digest: in the entry of `trilane avatar validate --float-network`,
+    or among the facts about quantising.
     """
     validation = bundle.manifest.validation
     validated = ((validation.model_extra or {}) if validation is not None else {}).get("float", {}).get("network", "")
@@ -280,14 +294,14 @@ def float_weights(bundle: Bundle) -> Path | None:
 
 
 def weights_name(weights: Path) -> str:
-    """Return the name and digest of a float network's file, as a manifest has them."""
+    """Return the name and the digest of a float network's file, as they stand in a manifest: `NAME, sha256 DIGEST`."""
     return f"{weights.name}, sha256 {sha256_of([weights])}"
 
 
 def trained(bundle: Bundle, weights: Path) -> Paint:
-    """Return the float network of `bundle` with the `weights` that training saved.
+    """Return the float network of `bundle` as a function. `weights`: file of the weights that training saved.
 
-    Raises BadInputError, ImportError without PyTorch.
+    Raises BadInputError if the file does not fit the bundle, ImportError without PyTorch.
     """
     import torch
 
@@ -305,7 +319,7 @@ def trained(bundle: Bundle, weights: Path) -> Paint:
 
 
 def dequantised(network: NetworkFile) -> Paint:
-    """Return `network` without rounding (`unrounded`), run by ONNX Runtime in FP32."""
+    """Return a function that runs `network` without rounding (`unrounded`), by ONNX Runtime in FP32."""
     sessions: dict[Shape, onnxruntime.InferenceSession] = {}
 
     def paint(tensor: F64) -> F32:
@@ -322,10 +336,10 @@ def dequantised(network: NetworkFile) -> Paint:
 
 
 def as_written(network: NetworkFile) -> Paint:
-    """Return the integer network as its file defines it, with every rounding to bytes: the reference of the runtimes.
+    """Return a function that runs the integer network as its file defines it, with every rounding to bytes.
 
-    ONNX Runtime runs node by node, in FP32, without optimisation. The input may have any real numbers, also numbers
-    that no byte represents.
+    The function is the reference of the runtimes. ONNX Runtime computes node by node, in FP32, without optimisation.
+    The input may have any real numbers, also numbers that no byte represents.
     """
     settings = onnxruntime.SessionOptions()
     settings.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
@@ -344,7 +358,7 @@ def as_written(network: NetworkFile) -> Paint:
 
 
 def from_real(network: NetworkFile) -> onnx.ModelProto:
-    """Return `network` with an input `IN` of real numbers, (N,H,W,C) float32, instead of bytes."""
+    """Return a model of `network` with an input of real numbers in place of bytes: `IN`, (N,H,W,C) float32."""
     model = onnx.ModelProto()
     model.CopyFrom(network.model)
     graph = model.graph
@@ -359,10 +373,10 @@ def from_real(network: NetworkFile) -> onnx.ModelProto:
 
 
 def unrounded(network: NetworkFile) -> onnx.ModelProto:
-    """Return `network` without rounding: input `IN` (N,H,W,C), output `OUT` (N,H,W,4), both float32.
+    """Return a model of `network` without rounding. Input: `IN` (N,H,W,C) float32. Output: `OUT` (N,H,W,4) float32.
 
-    Tensors that were rounded to bytes are still clipped to the range of these bytes, because a range from 0 on is a
-    rectifier. Weights and biases are the real numbers that the integers represent.
+    Tensors that `network` rounds to bytes are still clipped to the range of these bytes. Clipping at 0 matters, because
+    it replaces the network's rectifiers. Weights and biases are the real numbers that the integers represent.
     """
     model = onnx.ModelProto()
     model.CopyFrom(network.model)
@@ -401,7 +415,10 @@ def _keep_what_is_read(graph: onnx.GraphProto) -> None:
 
 
 def _range(node: onnx.NodeProto, constants: Mapping[str, onnx.TensorProto]) -> tuple[float, float]:
-    """Return the least and the largest real number that the output bytes of a QuantizeLinear represent."""
+    """Return (least, largest) of the real numbers that the output bytes of `node`, a QuantizeLinear, can represent.
+
+    `constants`: constants of the network by name.
+    """
     scale = float(numpy_helper.to_array(constants[node.input[1]]).item())
     zero = numpy_helper.to_array(constants[node.input[2]])
     limits = np.iinfo(zero.dtype)

@@ -1,6 +1,7 @@
-"""The channels that `bench handoff` compares: each has an end that writes and an end that reads.
+"""The channels that `trilane bench handoff` compares. Each has an end that writes and an end that reads.
 
-Rule: `Producer.buffer` is filled before the clock starts; `Consumer.receive` returns when every byte can be read.
+Rule: the array of `Producer.buffer` is filled before the clock starts. `Consumer.receive` returns when every byte can
+be read.
 """
 
 from __future__ import annotations
@@ -31,41 +32,44 @@ class Producer(Protocol):
     """The end of a channel that writes."""
 
     def buffer(self) -> U8:
-        """Return an array for the next bytes."""
+        """Return the array that the producer fills with the next bytes."""
 
     def hand_over(self) -> None:
-        """Announce or send the bytes in the array that `buffer` returned."""
+        """Announce or send the bytes in the array that `buffer` returned last."""
 
 
 class Consumer(Protocol):
     """The end of a channel that reads."""
 
     def receive(self) -> U8:
-        """Wait for the next bytes, and return them. They are valid until `release`."""
+        """Wait for the next bytes, and return them. They stay valid until the call of `release`."""
 
     def release(self) -> None:
-        """Give the bytes back, after they were read."""
+        """Give back the bytes that `receive` returned. The consumer calls this after it has read them."""
 
 
 class Channel(Protocol):
-    """A channel from one process to another. The parent makes it and sends it to both children, which open it."""
+    """A channel from one process to another.
+
+    The parent process makes the channel and sends it to both child processes. Each child process opens one end.
+    """
 
     def producer(self) -> Producer:
-        """Open and return the writing end; called in the child that writes."""
+        """Open and return the end that writes. The child process that writes calls this."""
 
     def consumer(self) -> Consumer:
-        """Open and return the reading end; called in the child that reads."""
+        """Open and return the end that reads. The child process that reads calls this."""
 
     def close(self) -> None:
-        """Release the channel; called in the parent when both children have ended."""
+        """Release the channel. The parent process calls this after both child processes have ended."""
 
 
 class SlotChannel:
-    """Trilane's channel: a slot of a sealed memfd region, announced by a message over a `JobPipe`.
+    """Trilane's channel: a slot in shared memory (a sealed memfd region), announced by a message over a `JobPipe`.
 
-    There is only one slot. A run reuses the slot that was given back last (transport/slots.py), and here the slot is
-    given back before the next hand-over. iceoryx2 reuses its samples in the same way. Two slots in turns would double
-    the memory that passes through the caches, and the time of reading.
+    There is only one slot, which is given back before the next hand-over. A run also reuses the slot that was given
+    back last (transport/slots.py), and iceoryx2 reuses its samples in the same way. Two slots in turns would double the
+    memory that passes through the caches, and the time of reading.
     """
 
     def __init__(self, size: int, _context: SpawnContext) -> None:
@@ -119,11 +123,14 @@ class _SlotEnd:
                 raise EOFError
 
     def release(self) -> None:
-        """Do nothing: the acknowledgement of the bench gives the slot back."""
+        """Do nothing, because the bench's acknowledgement of each frame gives the slot back."""
 
 
 class _OwnEnd:
-    """An end of a channel that copies bytes: its array belongs to its own process."""
+    """An end of a channel that copies bytes. Its array belongs to its own process.
+
+    `size`: number of bytes of the array.
+    """
 
     def __init__(self, size: int) -> None:
         self._own = np.zeros(size, np.uint8)
@@ -132,11 +139,11 @@ class _OwnEnd:
         return self._own
 
     def release(self) -> None:
-        """Do nothing: the bytes belong to this process."""
+        """Do nothing, because the bytes belong to this process."""
 
 
 class QueueChannel:
-    """A `multiprocessing.Queue`: the array is pickled, copied through a pipe, and unpickled."""
+    """A channel through a `multiprocessing.Queue`: the array is pickled, copied through a pipe, and unpickled."""
 
     def __init__(self, size: int, context: SpawnContext) -> None:
         self._size, self._queue = size, context.Queue()
@@ -165,7 +172,7 @@ class _QueueEnd(_OwnEnd):
 
 
 class PipeChannel:
-    """A `multiprocessing.Pipe` in its best form: raw bytes, received into an existing array."""
+    """A channel through a `multiprocessing.Pipe` in its best form: raw bytes are received into an existing array."""
 
     def __init__(self, size: int, context: SpawnContext) -> None:
         self._size, self._ends = size, context.Pipe()
@@ -197,7 +204,7 @@ class _PipeEnd(_OwnEnd):
 
 
 class ZmqChannel:
-    """The bytes as a ZeroMQ frame. pyzmq itself copies neither sent nor received bytes."""
+    """A channel that sends the bytes as a ZeroMQ frame. pyzmq itself copies neither sent nor received bytes."""
 
     def __init__(self, size: int, _context: SpawnContext) -> None:
         self._folder = SocketFolder()
@@ -231,12 +238,13 @@ class _ZmqEnd(_OwnEnd):
 
 
 class IceoryxChannel:
-    """iceoryx2: a loaned sample is written in place and sent, and an event wakes the other end. Nothing is copied.
+    """A channel through iceoryx2. A loaned sample is written in place and sent, and an event wakes the other end.
 
-    Polling would be faster than the event, but would keep a core busy without work.
+    Nothing is copied. Polling would be faster than the event, but would keep a core busy without work.
 
-    iceoryx2 leaves files for the user's next program. Here they get their own folder and prefix, and are removed. Both
-    names are short, because the path of a Unix socket must be short.
+    iceoryx2 leaves files for the user's next program. In this bench, these files get their own folder and prefix, so
+    that `close` can remove them. The names of the folder and the prefix are short, because the path of a Unix socket
+    must be short. The constructor raises ModuleNotFoundError if iceoryx2 is not installed.
     """
 
     def __init__(self, size: int, _context: SpawnContext) -> None:
@@ -253,7 +261,7 @@ class IceoryxChannel:
         return _IceoryxConsumer(self._folder, self._prefix)
 
     def close(self) -> None:
-        """Remove the files that iceoryx2 left."""
+        """Remove the files that iceoryx2 left for this channel."""
         shutil.rmtree(self._folder, ignore_errors=True)
         for left in SHM.glob(f"{self._prefix}*"):
             left.unlink(missing_ok=True)

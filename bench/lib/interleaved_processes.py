@@ -1,8 +1,10 @@
-"""Variants of inference that run interleaved, each in a process of its own: no variant's threads disturb another's.
+"""Variants of inference that run in interleaved rounds.
 
-Rule: only one process computes at a time; the others wait on a pipe. An answer that is text is an error message. The
-processes end with the block that started them. As in a run, successive inputs differ and slots alternate, because
-caches would speed up repetitions. An input is copied into its slot before the time counts.
+Each variant has a process of its own, so that its threads do not disturb the other variants.
+
+Rule: only one process computes at a time; the others wait for a message. An answer that is text is an error message.
+The processes end with the `with` block that started them. As in a run, successive inputs differ and slots alternate,
+because caches would speed up repetitions. An input is copied into its slot before the time counts.
 """
 
 from __future__ import annotations
@@ -29,9 +31,10 @@ INPUTS, SLOTS = 5, 2
 
 
 def answer_of(pipe: Connection, name: str, wait_s: float) -> Any:
-    """Return the next answer of the process `name`.
+    """Return the next answer of a process.
 
-    Raises TrilaneError if no answer comes within `wait_s`, if the process ended, or if the answer is an error message.
+    `pipe`: pipe to the process. `name`: name of the process in error messages. `wait_s`: longest time to wait, s.
+    Raises TrilaneError if no answer comes within this time, if the process ended, or if the answer is an error message.
     """
     if not pipe.poll(wait_s):
         raise TrilaneError(f"{name}: no answer in {wait_s:g} s")
@@ -46,9 +49,9 @@ def answer_of(pipe: Connection, name: str, wait_s: float) -> Any:
 
 @contextmanager
 def asked_processes() -> Iterator[Callable[[Callable[..., None], Any], Connection]]:
-    """Yield a function that starts processes and returns their pipes. The processes end with the block.
+    """Yield a function `start(serve, given)`, which starts a process and returns a pipe to the process.
 
-    Its parameters are the function to run in the process, which gets a pipe and a value, and this value.
+    The process calls `serve(pipe, given)`, with its own end of the pipe. All processes end with the `with` block.
     """
     context = multiprocessing.get_context("spawn")
     processes, pipes = [], list[Connection]()
@@ -74,11 +77,11 @@ def asked_processes() -> Iterator[Callable[[Callable[..., None], Any], Connectio
 
 @dataclass(frozen=True)
 class ProcessVariant:
-    """A variant of inference, to be run in a process.
+    """A variant of inference that runs in a process.
 
     `kind`: key of `KINDS`.
-    `network`: ONNX file.
-    `runtime`: name of the runtime, for the kind `runtime`.
+    `network`: path of the ONNX file.
+    `runtime`: name of the runtime, for the kind `runtime`; "" for other kinds.
     `threads`: number of threads; None for the library's default.
     `spin`: whether the threads may spin between runs.
     """
@@ -93,7 +96,8 @@ class ProcessVariant:
 class Runner:
     """The process of a variant, as the parent process sees it.
 
-    `startup_ms`: time to import libraries and load the network.
+    `startup_ms`: time that the process took to import libraries and load the network.
+    The constructor waits for this time. It raises TrilaneError if the process does not start.
     """
 
     def __init__(self, pipe: Connection, name: str) -> None:
@@ -101,13 +105,13 @@ class Runner:
         self.startup_ms = float(answer_of(pipe, name, START_S))
 
     def run(self, count: int) -> list[float]:
-        """Infer `count` times in succession, and return the times, ms."""
+        """Infer `count` times in succession, and return the time of each, ms. Raises TrilaneError if a run fails."""
         self._pipe.send(count)
         times: list[float] = answer_of(self._pipe, self._name, START_S)
         return times
 
     def run_for(self, seconds: float) -> list[float]:
-        """Infer for about `seconds`, at least once, and return the times, ms."""
+        """Infer for about `seconds`, and return the time of each inference, ms. Raises TrilaneError if a run fails."""
         times: list[float] = []
         end = time.monotonic() + seconds
         while (left := end - time.monotonic()) > 0:
@@ -117,7 +121,7 @@ class Runner:
 
 @contextmanager
 def runners(variants: Mapping[str, ProcessVariant]) -> Iterator[dict[str, Runner]]:
-    """Start a waiting process for each variant. The processes end with the block.
+    """Start a process for each of `variants`, and yield the processes by variant. They end with the `with` block.
 
     Raises TrilaneError if a process does not start.
     """
@@ -126,9 +130,10 @@ def runners(variants: Mapping[str, ProcessVariant]) -> Iterator[dict[str, Runner
 
 
 def serve(pipe: Connection, variant: ProcessVariant) -> None:
-    """Run the process: load the network, send the start-up time, then infer as often as each message asks.
+    """Run the process of a variant: load the network, send the start-up time in ms, and answer messages.
 
-    It ends when `pipe` closes.
+    A message is a number of inferences. The answer is the time of each inference in ms, or an error message. The
+    process ends when `pipe` closes.
     """
     try:
         begin = time.perf_counter()
@@ -157,7 +162,10 @@ def _timed(runs: Runs, count: int) -> list[float]:
 
 
 def _runtime(variant: ProcessVariant) -> Runs:
-    """Return calls of a Trilane runtime, as in a run: the arrays of each slot are bound once."""
+    """Return an endless iterator of calls, each of which infers once with the Trilane runtime of `variant`.
+
+    As in a run, the arrays of each slot are bound once.
+    """
     from trilane.avatars.network_file import read_network
     from trilane.bench.lib.networks import random_tensors
     from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
@@ -177,7 +185,10 @@ def _runtime(variant: ProcessVariant) -> Runs:
 
 
 def _ort_default(variant: ProcessVariant) -> Runs:
-    """Return calls as in ONNX Runtime's introductory example: a session with defaults, `run` with an array."""
+    """Return an endless iterator of calls, each of which infers once as in ONNX Runtime's introductory example.
+
+    The session has the library's defaults, except for the threads of `variant`, and its `run` gets an array.
+    """
     import onnxruntime
 
     settings = onnxruntime.SessionOptions()
@@ -195,7 +206,10 @@ def _ort_default(variant: ProcessVariant) -> Runs:
 
 
 def _openvino_default(variant: ProcessVariant) -> Runs:
-    """Return calls as in OpenVINO's introductory example: compile a file, call the model with an array."""
+    """Return an endless iterator of calls, each of which infers once as in OpenVINO's introductory example.
+
+    The file is compiled with the library's defaults, except for the threads of `variant`. Each call gets an array.
+    """
     from trilane.stages.dsp.runtime import quiet_openvino
 
     openvino = quiet_openvino()

@@ -1,6 +1,7 @@
 """The networks that the inference benches run: untrained, with the shapes and operators of trained networks.
 
-Rule: weights and inputs are random and the same every time. The time of a network does not depend on them.
+Rule: weights and inputs are random, and the same every time. The time that a network takes does not depend on their
+values.
 """
 
 from __future__ import annotations
@@ -34,9 +35,9 @@ SIDE = 64  # any side works, because a run reshapes the network
 class NetworkFixture:
     """A network to be timed.
 
-    `label`: settings of the network, as in a bench's rows.
+    `label`: settings of the network by name, as in the rows of a bench.
     `integer`: quantised network, with bytes as input and output.
-    `parameters`, `gmac`: number of parameters, and 1e9 multiply-accumulates of a frame.
+    `parameters`: number of parameters. `gmac`: 1e9 multiply-accumulates of a frame.
     """
 
     label: dict[str, Any]
@@ -48,12 +49,12 @@ class NetworkFixture:
 def untrained(
     encoder: str, norm: str, width: int, size: tuple[int, int], channels: int = 16, batch: int = 1
 ) -> NetworkFixture:
-    """Return an untrained, quantised network. Its `gmac` leaves out work that the file adds for layout.
+    """Return an untrained, quantised network. Its `gmac` only counts convolutions that the network defines.
 
-    `encoder`, `norm`: see `trilane.training.network.UNet`.
-    `width`: 64 is the paper's network; every number of channels scales with the width.
+    `encoder`, `norm`: kind of the encoder and of its normalisation, as in `trilane.training.network.UNet`.
+    `width`: width of the network, with which every number of channels grows; 64 for the paper's network.
     `size`: (height, width) of the tensor in pixels.
-    `channels`: channels of the tensor.
+    `channels`: number of channels of the tensor.
     `batch`: number of frames that are inferred at once.
     Raises MissingPartError without PyTorch, BadInputError for wrong settings.
     """
@@ -71,7 +72,7 @@ def untrained(
 
 
 def untrained_float(encoder: str, norm: str, width: int, size: tuple[int, int], channels: int = 16) -> onnx.ModelProto:
-    """Return the float network that `untrained` quantises, with an input (1, C, H, W) float32.
+    """Return the float network that `untrained` quantises. Its input is (1, C, H, W) float32.
 
     Parameters and errors: see `untrained`.
     """
@@ -81,9 +82,9 @@ def untrained_float(encoder: str, norm: str, width: int, size: tuple[int, int], 
 
 
 def fixture_of_file(network: NetworkFile, batch: int = 1) -> NetworkFixture:
-    """Return `network` as a fixture. Its `gmac` counts all layers of the file.
+    """Return a fixture with the network of a file. Its `gmac` counts all layers of the file.
 
-    `batch`: number of frames that are inferred at once.
+    `network`: network of the file. `batch`: number of frames that are inferred at once.
     """
     facts = graph_facts(network.model)
     size = network.shape[1:3]
@@ -108,7 +109,10 @@ def _unet(encoder: str, norm: str, width: int, channels: int) -> tuple[Any, Any]
 
 
 def _defined_macs(network: Any, torch: Any, channels: int) -> float:
-    """Return the multiply-accumulates of the convolutions, divided by the pixels of the tensor."""
+    """Return the multiply-accumulates of all convolutions of `network`, divided by the number of the tensor's pixels.
+
+    `torch`: the module. `channels`: number of channels of the tensor.
+    """
     total = 0
 
     def add(module: Any, _inputs: Any, output: Any) -> None:
@@ -124,7 +128,7 @@ def _defined_macs(network: Any, torch: Any, channels: int) -> float:
 
 
 def full_width_bundle() -> Path:
-    """Return the folder of the avatar `FULL_WIDTH`, which is made once and cached. Its pictures mean nothing.
+    """Return the folder of the avatar `FULL_WIDTH`. The avatar is made once and cached. Its pictures mean nothing.
 
     Raises MissingPartError without PyTorch, TrilaneError if the cache folder cannot be written.
     """

@@ -1,10 +1,11 @@
 """Errors of pictures against reference pictures: PSNR, SSIM and FLIP.
 
-Rule: all pictures count alike, also with nobody in view; the PSNR follows from the mean square over all pictures. Box
-figures only count the pixels in the boxes around avatars.
+Rule: all pictures count alike, also pictures without a visible avatar. The PSNR over several pictures follows from the
+mean square error over all their pixels. Box figures only count the pixels in the boxes around avatars.
 
-Sources: Wang et al., "Image Quality Assessment", IEEE TIP 13 (2004), by scikit-image; Andersson et al., "FLIP: A
-Difference Evaluator for Alternating Images", HPG 2020, by its authors' flip-evaluator, at 67 pixels a degree.
+SSIM: Wang et al., "Image Quality Assessment", IEEE TIP 13 (2004), computed by scikit-image. FLIP: Andersson et al.,
+"FLIP: A Difference Evaluator for Alternating Images", HPG 2020, computed by the authors' package flip-evaluator, at 67
+pixels a degree.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ MODULES = ("skimage", "flip_evaluator")
 
 
 class PictureErrors:
-    """Sums up the errors of pictures that are added one after the other."""
+    """The image errors over all pictures that were added."""
 
     def __init__(self) -> None:
         # Number of pixels, first of the whole frames, then of the boxes.
@@ -30,7 +31,10 @@ class PictureErrors:
         self._squares, self._similar, self._flip = np.zeros(2), np.zeros(2), np.zeros(2)
 
     def add(self, picture: U8, reference: U8, boxes: Sequence[Box]) -> None:
-        """Count `picture` against `reference`, both (h,w,3) sRGB, with avatars in `boxes`."""
+        """Add the errors of `picture` against `reference`, both (h,w,3) uint8 sRGB.
+
+        `boxes`: rectangles of the visible avatars; empty if no avatar is in view.
+        """
         maps = error_maps(picture, reference)
         for part, mask in enumerate((np.ones(picture.shape[:2], bool), inside(boxes, picture))):
             self._pixels[part] += mask.sum()
@@ -38,9 +42,10 @@ class PictureErrors:
                 total[part] += values[mask].sum()
 
     def figures(self, plan: str) -> dict[str, float | None]:
-        """Return the errors so far: `psnr_PLAN_db`, `ssim_PLAN`, `flip_PLAN`, and the same with `box_` in front.
+        """Return the errors over all pictures added until now, under keys that contain the name `plan`.
 
-        `plan`: PLAN in these keys. Box figures are None without boxes.
+        The keys are `psnr_PLAN_db` (dB), `ssim_PLAN` and `flip_PLAN` for the whole pictures, and the same keys after
+        `box_` for the boxes. Box figures are None if no picture had a box, and all figures are None without pictures.
         """
         found: dict[str, float | None] = {}
         for part, prefix in enumerate(("", "box_")):
@@ -53,10 +58,10 @@ class PictureErrors:
 
 
 def psnr_of_frames(psnr_db: Sequence[float]) -> dict[str, float]:
-    """Return the mean, the worst and the 1st percentile (linear between ranks) of single frames' PSNR.
+    """Return the mean, the least and the 1st percentile of a PSNR: `psnr_db`, `worst_psnr_db` and `p1_psnr_db`, in dB.
 
-    A mean hides single bad frames, which people see. The worst frame depends on the number of frames, the percentile
-    hardly does. `psnr_db`: at least one.
+    A mean hides single bad frames, which people see. The least value depends on the number of frames; the percentile
+    hardly does. The percentile is linear between ranks. `psnr_db`: PSNR of each frame, at least one.
     """
     return {
         "psnr_db": float(np.mean(psnr_db)),
@@ -66,23 +71,29 @@ def psnr_of_frames(psnr_db: Sequence[float]) -> dict[str, float]:
 
 
 def require_metrics() -> None:
-    """Raise MissingPartError if a library for errors is missing. Call it before long work."""
+    """Raise MissingPartError if a library that computes image errors is not installed.
+
+    A caller with long work can call this function before that work.
+    """
     for module in MODULES:
         if not machine.here.has_package(module):
             raise MissingPartError(f"image errors need {module}", extra="metrics")
 
 
 def error_maps(picture: U8, reference: U8) -> tuple[F64, F64, F64]:
-    """Return, for each pixel (h,w), the mean square difference of values in 0..1, the SSIM and the FLIP.
+    """Return three maps (h,w): the mean square error of the colours, the SSIM and the FLIP error of each pixel.
 
-    `picture`, `reference`: (h,w,3) sRGB.
+    The mean square error refers to colours in 0..1. `picture`, `reference`: pictures (h,w,3) uint8 sRGB.
     """
     shown, wanted = picture / 255, reference / 255
     return ((shown - wanted) ** 2).mean(axis=2), ssim_map(shown, wanted), flip_map(shown, wanted)
 
 
 def ssim_map(picture: F64, reference: F64) -> F64:
-    """Return the SSIM (h,w) of two pictures (h,w,3) in 0..1: windows of 7 x 7 pixels, mean over the colours."""
+    """Return the SSIM (h,w) of two pictures (h,w,3) sRGB in 0..1, as the mean over the three colours.
+
+    The windows have 7 x 7 pixels.
+    """
     from skimage.metrics import structural_similarity
 
     _, similar = structural_similarity(picture, reference, channel_axis=2, data_range=1.0, full=True)
@@ -99,7 +110,7 @@ def flip_map(picture: F64, reference: F64) -> F64:
 
 
 def inside(boxes: Sequence[Box], picture: U8) -> Mask:
-    """Return a mask (h,w) of the pixels of `picture` that lie in any of `boxes`."""
+    """Return a mask (h,w) of the pixels that lie in any of `boxes`. `picture`: picture (h,w,3)."""
     mask = np.zeros(picture.shape[:2], bool)
     for box in boxes:
         mask[box.top : box.bottom, box.left : box.right] = True
@@ -107,6 +118,9 @@ def inside(boxes: Sequence[Box], picture: U8) -> Mask:
 
 
 def box_psnr_db(picture: U8, reference: U8, boxes: Sequence[Box]) -> float:
-    """Return the PSNR of `picture` against `reference`, both (h,w,3) sRGB, over the pixels in `boxes`, at least one."""
+    """Return the PSNR in dB of `picture` against `reference`, both (h,w,3) uint8 sRGB, over the pixels in `boxes`.
+
+    `boxes`: at least one rectangle with pixels of the picture.
+    """
     mask = inside(boxes, picture)
     return psnr_db(float((((picture[mask] / 255) - reference[mask] / 255) ** 2).mean()))

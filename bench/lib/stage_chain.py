@@ -1,8 +1,8 @@
 """The composited frames of a run, made by its own stages, one after the other in this process.
 
-Rule: the pipeline's factories build the stages, and the stages are bound as in a unit's process, so a frame has the
-bytes that a run presents. Frames may be made in any order, so no frame reuses an earlier frame's picture. A frame with
-nobody in view takes the pipeline's bypass, as in a run.
+Rule: the pipeline's factories build the stages, and the stages are bound as in a unit's process. Therefore a frame has
+the same bytes as in a run. Frames may be made in any order. Therefore no frame reuses an earlier frame's picture. A
+frame without a visible avatar takes the pipeline's bypass, as in a run.
 """
 
 from __future__ import annotations
@@ -32,21 +32,25 @@ RASTER = 1
 
 
 def units_of(pipeline: Pipeline, assets: Assets) -> Units:
-    """Return the context of each unit, which the unit's stages share, such as an OpenGL context.
+    """Return the context of each unit of `pipeline`, by unit.
 
-    Chains in one process must share these contexts, because a process has one OpenGL context.
+    The stages of a unit share its context, which contains, for example, the OpenGL context. All chains in one process
+    must share these contexts, because a process has one OpenGL context. `assets`: arrays that the stages may read.
     """
     return {name: UnitContext(name, settings, assets) for name, settings in pipeline.units.items()}
 
 
 class StageChain:
-    """All stages of a pipeline except the last, with one slot per edge.
+    """All stages of a pipeline except the last, with one slot for each edge.
 
-    `made`: the stages in their order. `packets`: slot of each edge.
+    `made`: stages in their order. `packets`: slot of each edge, in the order of the stages that write.
     """
 
     def __init__(self, pipeline: Pipeline, units: Units) -> None:
-        """Build and bind the stages. Raises what their factories raise."""
+        """Build and bind the stages. Raises the errors of the stages' factories.
+
+        `pipeline`: pipeline with these stages. `units`: contexts of its units, from `units_of`.
+        """
         self.packets = [_packet(SlotLayout(edge.header, edge.payload_bytes)) for edge in pipeline.edges]
         named = dict(zip(pipeline.edge_names, self.packets, strict=True))
         begin, end = pipeline.bypass or (None, None)
@@ -61,15 +65,16 @@ class StageChain:
             self._stages.append(BoundStage(stage.name, made, inputs, [output], 0, unit, stage.name == begin))
 
     def run(self, frame: int, last: int | None = None) -> Packet:
-        """Run frame `frame` from the first stage to stage number `last`; return the output of the last stage that ran.
+        """Run frame number `frame` from the first stage to stage number `last`, and return the last stage's output.
 
-        `last`: None for all stages of the chain.
+        If the frame takes the bypass past stage `last`, the output of the stage where the bypass begins is returned.
+        `last`: number of the stage, from 0; None for the last stage of the chain.
         """
         self._next, self._slot_in = 0, -1
         return self.go_on(frame, last)
 
     def go_on(self, frame: int, last: int | None = None) -> Packet:
-        """Go on after a `run` of the same frame, up to stage number `last`; return as `run` does."""
+        """Go on after a `run` of the same frame, and return the output as `run` does. `frame`, `last`: see `run`."""
         last = len(self._stages) - 1 if last is None else last
         while self._next <= last:
             number = self._next
@@ -81,12 +86,17 @@ class StageChain:
 
 
 class AvatarFrames:
-    """Makes the frames of the scene in `checked`, as a run presents them. `units`: contexts of its units, by name."""
+    """Makes the frames of the scene in `checked`, as a run presents them.
+
+    `units`: contexts of the pipeline's units, by unit.
+    """
 
     def __init__(self, checked: Checked, units: Units | None = None) -> None:
-        """Build the stages. Raises BadInputError, MissingPartError.
+        """Build the stages.
 
-        `units`: contexts of another object's units in this process, to be shared; None for new ones.
+        `checked`: configuration of a run.
+        `units`: contexts of another object in this process, which this object then shares; None for new contexts.
+        Raises BadInputError if a file cannot be read, MissingPartError if a library is not installed.
         """
         pipeline = avatar_pipeline(checked.config, checked.assets)
         self.units = units_of(pipeline, checked.assets) if units is None else units
@@ -97,7 +107,7 @@ class AvatarFrames:
         self._shape = (checked.config.scene.output.height, checked.config.scene.output.width, 3)
 
     def frame(self, number: int) -> U8:
-        """Return frame `number` after composite: (h,w,3) uint8, sRGB."""
+        """Return frame `number` as the stage composite makes it: a picture (h,w,3) uint8 sRGB."""
         return self._picture(self._chain.run(number))
 
     @property
@@ -106,14 +116,15 @@ class AvatarFrames:
         return self.units["gpu"].shared(CONTEXT, open_context)
 
     def background(self, number: int) -> U8:
-        """Return frame `number` without its avatars, but with their shadows: (h,w,3) uint8, sRGB."""
+        """Return frame `number` without its avatars, but with their shadows: a picture (h,w,3) uint8 sRGB."""
         self._chain.run(number, self._composite - 1).payload[:] = 0
         return self._picture(self._chain.go_on(number))
 
     def tensor_of(self, number: int, network: int = 0) -> U8:
-        """Return the tensor (h,w,C) uint8 of frame `number` by the raster stage. The frame must show an avatar.
+        """Return the tensor (h,w,C) uint8 of a frame, as the stage raster draws it.
 
-        `network`: number of the network that reads the tensor.
+        `number`: number of the frame, which must show an avatar. `network`: number of the network that reads the
+        tensor.
         """
         payload = self._chain.run(number, RASTER).payload
         (height, width), channels = self.posed["tensor_shape"].tolist(), self._channels[network]
@@ -122,9 +133,10 @@ class AvatarFrames:
         return tensor
 
     def composited(self, number: int, painted: Mapping[int, U8]) -> U8:
-        """Return frame `number`, (h,w,3) uint8, composited from the given pictures instead of the networks' pictures.
+        """Return frame `number`, (h,w,3) uint8 sRGB, with given pictures in place of the networks' pictures.
 
-        `painted`: pictures (h,w,4) uint8 by the number of the network.
+        `painted`: pictures (h,w,4) uint8 to composite, by the number of the network. A network without a picture in
+        `painted` keeps its own picture.
         """
         payload = self._chain.run(number, self._composite - 1).payload
         parts = network_parts(payload, len(self._channels), self._buckets, PAINTED_CHANNELS)
@@ -134,18 +146,18 @@ class AvatarFrames:
 
     @property
     def levels(self) -> Mapping[int, int]:
-        """Return the index into `DETAILS` of each visible avatar in the latest frame, by the avatar's number."""
+        """The detail of each visible avatar in the latest frame, as an index into `DETAILS`, by the avatar's number."""
         pose = cast(PoseStage, self._chain.made[0])
         return {index: seen.level for index, seen in pose.plan.seen.items()}
 
     @property
     def posed(self) -> NDArray[np.void]:
-        """Return the header that the pose stage wrote for the latest frame (`pose_dtype` of `stages/config.py`)."""
+        """The header that the stage pose wrote for the latest frame (`pose_dtype` of `stages/config.py`)."""
         return self._chain.packets[0].header
 
     @property
     def tensor(self) -> str:
-        """The size of the latest frame's tensor as `HxW`; `none` if the frame needed no tensor."""
+        """The size of the latest frame's tensor, such as `256x192` (height x width); `none` if it needed no tensor."""
         height, width = self.posed["tensor_shape"].tolist()
         return f"{height}x{width}" if int(self.posed["work"]) == FrameWork.FULL else "none"
 
