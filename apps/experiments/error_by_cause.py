@@ -72,7 +72,8 @@ def error_by_cause(
     `remainder`: error of the run's own frame against the frame with all causes.
     `truth`: errors of the reference and of the run against the ground truth; None if the scene has no ground truth.
     `frames`: numbers of the frames. `empty_frames`: frames with nobody in view, which do not count.
-    `network`: names of the networks that paint the reference. `sources`: source of each key. `config`: facts of the scene.
+    `network`: names of the networks that paint the reference. `sources`: source of each key. `config`: facts of the
+    scene.
 
     Keys of a row:
     `cause`, `what`: name and description of the cause. `needs`: names of the causes that the cause needs.
@@ -188,8 +189,8 @@ class _Moved:
 def _pixels(vertices: F64, clip: F64, output: Shape) -> tuple[F64, Any]:
     """Return (places, on screen): the places (V,2) of `vertices` in the picture, and which of them are in it (V,) bool.
 
-    A place is (x, y) in pixels from the middle of the picture, x to the right and y up. `vertices` (V,3): metres, in the
-    world. `clip`: projection @ view (4,4). `output`: (height, width) of the picture.
+    A place is (x, y) in pixels from the middle of the picture, x to the right and y up. `vertices` (V,3): metres, in
+    the world. `clip`: projection @ view (4,4). `output`: (height, width) of the picture.
     """
     x, y, _, w = (np.c_[vertices, np.ones(len(vertices))] @ clip.T).T
     in_front = w > 0
@@ -200,8 +201,8 @@ def _pixels(vertices: F64, clip: F64, output: Shape) -> tuple[F64, Any]:
 class _Split:
     """The figures of the added frames, by cause.
 
-    `output`: (height, width) of the picture. `out`: folder for heat maps; None for no maps. `lpips`: function that computes
-    LPIPS; None leaves LPIPS out.
+    `output`: (height, width) of the picture. `out`: folder for heat maps; None for no maps. `lpips`: function that
+    computes LPIPS; None leaves LPIPS out.
     """
 
     def __init__(self, output: Shape, out: Path | None, lpips: Perceived | None = None) -> None:
@@ -326,8 +327,8 @@ def write_heat_map(file: Path, title: str, picture: F64, reference: F64) -> None
 def heat_map(title: str, picture: F64, reference: F64) -> U8:
     """Return a sheet (H,W,3) uint8 with the picture, the reference, a heat map of their difference, and its colour bar.
 
-    The map shows the mean absolute difference of the three channels, multiplied by a power of two. The sheet states this
-    factor. A product above 1 gets the bar's last colour.
+    The map shows the mean absolute difference of the three channels, multiplied by a power of two. The sheet states
+    this factor. A product above 1 gets the bar's last colour.
 
     `title`: first line of the sheet. `picture`, `reference`: (h,w,3) sRGB in 0..1.
     """
@@ -363,7 +364,10 @@ def shown_factor(difference: F64) -> int:
 
 
 def coloured(values: F64) -> U8:
-    """Return the colours (..., 3) uint8 of `values` (...). Values above 1 have the colour of 1, values below 0 that of 0."""
+    """Return the colours (..., 3) uint8 of `values` (...).
+
+    Values above 1 have the colour of 1, values below 0 that of 0.
+    """
     place = np.clip(values, 0, 1) * (len(COLOURS) - 1)
     channels = [np.interp(place, np.arange(len(COLOURS)), COLOURS[:, channel]) for channel in range(3)]
     return np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
@@ -372,8 +376,8 @@ def coloured(values: F64) -> U8:
 def _draw_bar(sheet: Image.Image, draw: Any, place: tuple[int, int, int], most: float, font: Any) -> None:
     """Draw the colour bar on `sheet`, with the values at its two ends and its middle.
 
-    `draw`: Pillow's drawing object of `sheet`. `place`: (left, top, height) of the bar, pixels. `most`: value at the bar's
-    upper end, in steps of 1/255. `font`: font of the values.
+    `draw`: Pillow's drawing object of `sheet`. `place`: (left, top, height) of the bar, pixels. `most`: value at the
+    bar's upper end, in steps of 1/255. `font`: font of the values.
     """
     left, top, height = place
     bar = coloured(np.linspace(1, 0, height))[:, None].repeat(BAR_PX, axis=1)

@@ -32,7 +32,8 @@ LEAST_JOBS = 6
 class SizeRow:
     """The results of one tensor size on one runtime.
 
-    `size`: size as given by the user. `pictures`: object that makes the frames. `threads`: number of the runtime's threads.
+    `size`: size as given by the user. `pictures`: object that makes the frames. `threads`: number of the runtime's
+    threads.
     `infer_ms`: time of the infer stages for each timed frame. `frame_ms`: time of all stages except present, for each
     timed frame. `errors`: errors of each frame's picture.
     """
@@ -83,8 +84,8 @@ def measure(
 
     Keys of a row in `rows`: `size`, `runtime`, `threads`. `infer_ms`: median time of the infer stage, with its 95 %
     interval `infer_low_ms`, `infer_high_ms` (null for fewer than 6 jobs). `frame_ms`: median time of all stages except
-    present. Errors cover the part of the picture with avatars. Means over the frames: `psnr_db`, `mae` (steps of 1/255),
-    `ssim`, `flip`. `worst_psnr_db`: PSNR of the worst frame. `p1_psnr_db`: 1st percentile of the PSNR.
+    present. Errors cover the part of the picture with avatars. Means over the frames: `psnr_db`, `mae` (steps of
+    1/255), `ssim`, `flip`. `worst_psnr_db`: PSNR of the worst frame. `p1_psnr_db`: 1st percentile of the PSNR.
 
     Other keys: `against`: name of the reference. `frames`: numbers of the frames. `empty_frames`: frames with nobody in
     view, which do not count. `sources`: source of the rows. `config`: scene, plan, filter of the texture, rounds.
@@ -128,7 +129,10 @@ def measure(
 
 
 def refuse_twice(option: str, values: Sequence[str]) -> None:
-    """Raise BadInputError if `values` is empty, or if a value occurs twice. `option`: name of the option for the message."""
+    """Raise BadInputError if `values` is empty, or if a value occurs twice.
+
+    `option`: name of the option for the message.
+    """
     if not values or len(set(values)) < len(values):
         raise BadInputError(option, ", ".join(values) or "none", "one or more, each once")
 

@@ -41,7 +41,8 @@ def flicker(before: F64, now: F64) -> float:
 class FlickerRow:
     """The results of one variant: a runtime, a calibration and a filter of the neural texture.
 
-    `pictures`: object that makes the variant's pictures. `changes`: flicker of each pair of successive frames, in order.
+    `pictures`: object that makes the variant's pictures. `changes`: flicker of each pair of successive frames, in
+    order.
     """
 
     def __init__(self, runtime: str, calibration: str, texture_filter: str, pictures: ScenePictures) -> None:
@@ -54,7 +55,8 @@ class FlickerRow:
     def add(self, error: F64, part: tuple[slice, slice]) -> None:
         """Count the next frame.
 
-        `error` (h,w,3): picture minus reference. `part`: rows and columns that hold the avatars of this and the last frame.
+        `error` (h,w,3): picture minus reference. `part`: rows and columns that hold the avatars of this and the last
+        frame.
         """
         if self._before is not None:
             self.changes.append(flicker(self._before[part], error[part]))
@@ -80,17 +82,20 @@ def measure(
     calibration: tuple[str, ...] = (AS_IT_IS,),
     texture_filter: tuple[str, ...] = ("linear",),
 ) -> dict[str, Any]:
-    """Return the flicker of the first `frames` frames of a scene, by runtime, calibration and filter of the neural texture.
+    """Return the flicker of the first `frames` frames of a scene, by runtime, calibration and texture filter.
 
     Figures cover the part of the picture with avatars, in steps of 1/255.
 
-    Keys of a row in `rows`: `runtime`, `calibration`, `texture_filter`. `flicker`: mean over the pairs of frames. `worst`:
-    largest flicker of a pair. `worst_frame`: later frame of that pair. `mae`: mean absolute error of the frames.
+    Keys of a row in `rows`: `runtime`, `calibration`, `texture_filter`. `flicker`: mean over the pairs of frames.
+    `worst`: largest flicker of a pair. `worst_frame`: later frame of that pair. `mae`: mean absolute error of the
+    frames.
 
-    Other keys: `scene_change`: mean change of the reference between successive frames. `against`: name of the reference.
+    Other keys: `scene_change`: mean change of the reference between successive frames. `against`: name of the
+    reference.
     `frames`: numbers of the frames. `sources`: source of the figures. `config`: scene, plan, size, frames a second.
 
-    Raises BadInputError for an option out of range, an unknown name, a value given twice, or a frame with nobody in view.
+    Raises BadInputError for an option out of range, an unknown name, a value given twice, or a frame with nobody in
+    view.
     Raises MissingPartError if a runtime or OpenGL is missing.
     """
     refuse_twice("--runtime", runtime)

@@ -169,8 +169,8 @@ def hard_cases(runtimes: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Yield a row for each network of `NETWORKS`, input of `INPUTS` and runtime of `runtimes`.
 
     Keys: `name`; `error`, `bound`: mean error and its bound; `unit`: unit of both; `source`: source of the bound;
-    `predicted_error`: expected error; the keys of `wrong_answers`; `verdict`: text; `passed`: whether the bound holds. An
-    `error` that is not a finite number is None, and counts as above every bound.
+    `predicted_error`: expected error; the keys of `wrong_answers`; `verdict`: text; `passed`: whether the bound holds.
+    An `error` that is not a finite number is None, and counts as above every bound.
     Raises MissingPartError without PyTorch or a runtime.
     """
     for network in NETWORKS:
@@ -221,8 +221,8 @@ def _flat(rng: np.random.Generator) -> F32:
 def _in_figure(rng: np.random.Generator, texture: Callable[[np.random.Generator], F32], size: float = 1.0) -> F32:
     """Return a frame (SIDE,SIDE,CHANNELS) with a texture inside a randomly placed ellipse, and 0 outside the ellipse.
 
-    `rng`: random numbers. `texture`: function that draws the texture from `rng`. `size`: size of the ellipse, as a share of
-    the usual size.
+    `rng`: random numbers. `texture`: function that draws the texture from `rng`. `size`: size of the ellipse, as a
+    share of the usual size.
     """
     row, column = np.mgrid[:SIDE, :SIDE] / SIDE - 0.5
     down, right = rng.uniform(-OFF_CENTRE, OFF_CENTRE, 2)

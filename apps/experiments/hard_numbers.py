@@ -133,8 +133,8 @@ def _body_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
 def _shapes(body: Body) -> Iterator[HardNumber]:
     """Yield rows about extreme shapes of `body`, with random shape directions.
 
-    A rest vertex is a sum in float64, rounded to float32. The sum has S + 1 numbers and an offset, where S is the number of
-    directions.
+    A rest vertex is a sum in float64, rounded to float32. The sum has S + 1 numbers and an offset, where S is the
+    number of directions.
     """
     rng = np.random.default_rng(9)
     drawn = rng.normal(0, DRAWN_M, (2, *body.v_template.shape, DRAWN_DIRECTIONS)).astype(np.float32)
@@ -171,9 +171,9 @@ def _skinned(shaped: ShapedBody, matrices: F64, feature: F64) -> tuple[F64, F64]
 
     `matrices` (55,3,4): skinning matrices. `feature` (486,): entries of R - I of joints 1 to 54.
 
-    Let a vertex have n weights other than 0. In float32, the blended matrix M is off by gamma_(n+1) of sum w |matrix|; this
-    includes one rounding for the float32 matrices. M [p, 1] is off by four roundings more. Pose blend shapes move p by a
-    sum of 486 products, which is off by gamma_488 of the sum of their absolute values.
+    Let a vertex have n weights other than 0. In float32, the blended matrix M is off by gamma_(n+1) of sum w |matrix|;
+    this includes one rounding for the float32 matrices. M [p, 1] is off by four roundings more. Pose blend shapes move
+    p by a sum of 486 products, which is off by gamma_488 of the sum of their absolute values.
     """
     body = shaped.body
     rest = shaped.vertices.astype(np.float64)
@@ -196,8 +196,8 @@ def _left_out(shaped: ShapedBody) -> Iterator[HardNumber]:
     """Yield rows about skinning with only the largest weights of each vertex.
 
     One row keeps four weights of the body `shaped`, whose vertices have seven weights at most. In the other rows, each
-    vertex has random weights, and each count of `WEIGHT_COUNTS` is kept. There the body is 200 m away. At this distance, an
-    error would show if the kept weights did not sum to 1.
+    vertex has random weights, and each count of `WEIGHT_COUNTS` is kept. There the body is 200 m away. At this
+    distance, an error would show if the kept weights did not sum to 1.
     """
     rng = np.random.default_rng(5)
     poses = [rng.normal(0, 1.0, (JOINTS, 3)) for _ in range(POSES)]
@@ -215,8 +215,8 @@ def _fewer(shaped: ShapedBody, count: int, poses: Sequence[F64], metres: float, 
 
     The bound is `weight_error_bound`, plus the rounding of the weighted sums: gamma_n times the reach of the body.
 
-    `shaped`: body. `poses`: axis-angle vectors (55,3) of each pose. `metres`: distance of the body from the origin. `what`:
-    description of the weights for the row's name.
+    `shaped`: body. `poses`: axis-angle vectors (55,3) of each pose. `metres`: distance of the body from the origin.
+    `what`: description of the weights for the row's name.
     """
     skeleton = Skeleton(shaped.joints, shaped.body.parents)
     few, whole = CpuSkinner(shaped, count, pose_blend=False), CpuSkinner(shaped, pose_blend=False)
@@ -289,8 +289,8 @@ def _outside(bounds: MeshBounds, posed: Posed, vertices: F64, clip: F64) -> floa
 
     A vertex is visible if it is on the screen and in front of the near plane. Without a visible vertex, return 0.
 
-    `bounds`: object that computes the rectangle. `posed`: posed skeleton. `vertices` (V,3): metres. `clip`: projection @
-    view (4,4).
+    `bounds`: object that computes the rectangle. `posed`: posed skeleton. `vertices` (V,3): metres. `clip`: projection
+    @ view (4,4).
     """
     found = bounds.rect(posed, clip)
     x, y, z, w = clip @ np.concatenate([vertices, np.ones((len(vertices), 1))], axis=1).T
@@ -363,8 +363,8 @@ def time_cases() -> Iterator[HardNumber]:
 
     Frame 5,000,000 must show the same as the same moment in the first period of the motion. The reference reduces the
     frame's time by the period in fractions, which are exact. The tested time t = frame / fps is off by at most U t, and
-    its remainder is exact. The error of a shown value is at most the error of the time, multiplied by the value's largest
-    change in a second, plus a few roundings.
+    its remainder is exact. The error of a shown value has two parts: a few roundings, and the error of the time
+    multiplied by the value's largest change in a second.
     """
     motion, camera = walk_wave_turn(), load_builtin("orbit", CameraSpec())
     assert camera is not None
@@ -432,7 +432,10 @@ RUNTIME = "ort"
 
 
 def tensor_cases(shaped: ShapedBody, ctx: Any) -> Iterator[HardNumber]:
-    """Yield rows about packing a tensor to bytes and about texels, drawn in the OpenGL context `ctx`. `shaped`: body."""
+    """Yield rows about packing a tensor to bytes and about texels, drawn in the OpenGL context `ctx`.
+
+    `shaped`: body.
+    """
     mesh, view, placement = _scene(shaped, ctx)
     rows = {name: (s, z, [step * s for step in steps]) for name, (s, z, steps) in STEPS.items()} | NUMBERS
     for name, (scale, zero_point, numbers) in rows.items():
@@ -478,7 +481,10 @@ def _steps_off(pixels: U8, values: F64, scale: float, zero_point: int) -> float:
 
 
 def _texels(ctx: Any) -> Iterator[HardNumber]:
-    """Yield rows about a texture's values on the GPU, and a row about values that must be refused. `ctx`: OpenGL context."""
+    """Yield rows about a texture's values on the GPU, and a row about values that must be refused.
+
+    `ctx`: OpenGL context.
+    """
     rng = np.random.default_rng(11)
     for name, exponents in {"usual numbers": (-6, 6), "subnormals": (-24, -14), "large numbers": (10, 15)}.items():
         sizes = 2.0 ** rng.uniform(*exponents, (8, 8, 4)) * rng.choice([-1.0, 1.0], (8, 8, 4))
@@ -499,7 +505,10 @@ def _is_taken(value: float) -> bool:
 
 
 def scene_cases() -> Iterator[HardNumber]:
-    """Yield a row for each scene of `JUMPS`. Its error is the number of tensor bytes that depend on the frames drawn before."""
+    """Yield a row for each scene of `JUMPS`.
+
+    Its error is the number of tensor bytes that depend on the frames drawn before.
+    """
     for scene, frames in JUMPS.items():
         checked = configure(RunOptions(scene=scene, runtime=RUNTIME), Path.cwd())
         last = checked.config.scene.frames - 1

@@ -90,8 +90,8 @@ def gamma(n: float, unit: float = U) -> float:
 def worst(errors: ArrayLike, bounds: ArrayLike) -> tuple[float, float]:
     """Return (error, bound): the error with the largest ratio to its bound, and this bound.
 
-    If an error is NaN, return NaN and its bound. If all errors are 0, return 0 and the largest bound. `errors`, `bounds`:
-    arrays that can be broadcast to the same shape.
+    If an error is NaN, return NaN and its bound. If all errors are 0, return 0 and the largest bound. `errors`,
+    `bounds`: arrays that can be broadcast to the same shape.
     """
     found: Any = np.broadcast_arrays(np.asarray(errors, np.float64), np.asarray(bounds, np.float64))
     error, bound = (each.ravel() for each in found)
@@ -123,9 +123,9 @@ def rotation_cases() -> Iterator[HardNumber]:
 def turn_bound(angle: F64) -> F64:
     """Return the bound on the error of an entry of R - I (...), for rotations by `angle` (...), radians.
 
-    h = |v| / 2 is off by at most 2.5 U of itself: it is the root of a sum of three squares. Let s = min(1, h). The first
-    part of the quaternion is off by at most f = U (2.5 h + 2). Each other part is off by at most e = U (2.5 h + 7.5 s). An
-    entry of R - I is a sum of at most two products of parts, doubled. Therefore the entry is off by at most
+    h = |v| / 2 is off by at most 2.5 U of itself: it is the root of a sum of three squares. Let s = min(1, h). The
+    first part of the quaternion is off by at most f = U (2.5 h + 2). Each other part is off by at most e = U (2.5 h +
+    7.5 s). An entry of R - I is a sum of at most two products of parts, doubled. Therefore the entry is off by at most
 
         (4 s + 2) e + 2 s f + 6 s U
 
@@ -139,9 +139,9 @@ def turn_bound(angle: F64) -> F64:
 def return_bound(angle: F64) -> F64:
     """Return the bound on the error of an entry of the axis-angle vector from a quaternion (...), radians.
 
-    `angle` (...): angle of the rotation, up to pi. Let w be the quaternion's first part, and sine the length of its other
-    parts. With e and f as in `turn_bound`, the angle 2 atan2(sine, w) is off by 2 (f sine + sqrt(3) e) and four roundings.
-    The axis is the other parts divided by sine.
+    `angle` (...): angle of the rotation, up to pi. Let w be the quaternion's first part, and sine the length of its
+    other parts. With e and f as in `turn_bound`, the angle 2 atan2(sine, w) is off by 2 (f sine + sqrt(3) e) and four
+    roundings. The axis is the other parts divided by sine.
     """
     _, e, f = _parts(np.asarray(angle, np.float64))
     sine = np.sin(np.minimum(angle / 2, np.pi / 2))
@@ -166,9 +166,9 @@ def _axes() -> F64:
 def _random_cases() -> Iterator[HardNumber]:
     """Yield rows about R^T R = I and det R = 1 for random rotations by 0 to 2 pi.
 
-    Let each entry of R be off by at most b. An entry of R^T R is off by at most 2 sqrt(3) b, because columns have length 1,
-    and by four roundings. The determinant is off by b times the sum of all cofactors, at most 3 sqrt(3), and by ten
-    roundings.
+    Let each entry of R be off by at most b. An entry of R^T R is off by at most 2 sqrt(3) b, because columns have
+    length 1, and by four roundings. The determinant is off by b times the sum of all cofactors, at most 3 sqrt(3), and
+    by ten roundings.
     """
     rng = np.random.default_rng(SEED)
     square, volume = [], []
@@ -189,8 +189,8 @@ def _random_cases() -> Iterator[HardNumber]:
 def exact_turn(rotvec: Sequence[float]) -> list[list[Decimal]]:
     """Return R - I, a list of three rows, of the axis-angle vector `rotvec` (3,), radians, to `DIGITS` digits.
 
-    R - I = a [v]x + b [v]x^2, where a = sin(t) / t, b = (1 - cos(t)) / t^2 and t = |v|, below 1e9. t is first reduced by
-    multiples of 2 pi. After that, series compute sin and cos.
+    Let t = |v|, below 1e9. R - I = a [v]x + b [v]x^2, where a = sin(t) / t and b = (1 - cos(t)) / t^2. First, t is
+    reduced by multiples of 2 pi. After that, series compute sin and cos.
     """
     with localcontext() as context:
         context.prec = DIGITS
@@ -242,7 +242,10 @@ def _series(angle: Decimal) -> tuple[Decimal, Decimal]:
 
 
 def chain_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
-    """Yield rows about the joints of the whole body, and about the float32 skinning matrices for the GPU. `shaped`: body."""
+    """Yield rows about the joints of the whole body, and about the float32 skinning matrices for the GPU.
+
+    `shaped`: body.
+    """
     skeleton = Skeleton(shaped.joints, shaped.body.parents)
     axis = np.array([1.0, 2.0, 3.0]) / np.sqrt(14.0)
     poses = {name: np.tile(axis * angle, (len(shaped.joints), 1)) for name, angle in TURNS.items()}
@@ -289,10 +292,10 @@ def walked(shaped: ShapedBody, pose: F64, root: F64) -> Wide:
 def joint_bounds(shaped: ShapedBody, pose: F64, root_m: float) -> F64:
     """Return the bounds on the errors of the joints' places (55,), metres.
 
-    A local rotation is off by at most 3 b in norm. b is the bound of `turn_bound`, plus U for adding I. A product of a row
-    and a column rounds by gamma_4 of its size. The size is at most sqrt(3) * sqrt(3) for rotations, and sqrt(3) |place| +
-    |place| for places. Over d joints these errors add up. With L the length of the chain's bones, the place of the last
-    joint is off by at most
+    A local rotation is off by at most 3 b in norm. b is the bound of `turn_bound`, plus U for adding I. A product of a
+    row and a column rounds by gamma_4 of its size. The size is at most sqrt(3) * sqrt(3) for rotations, and sqrt(3)
+    |place| + |place| for places. Over d joints these errors add up. With L the length of the chain's bones, the place
+    of the last joint is off by at most
 
         L sum (3 b + 12 U) + d gamma_4 (sqrt(3) + 1) (|root| + L)
 

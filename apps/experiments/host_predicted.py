@@ -46,11 +46,11 @@ def measure(
 ) -> dict[str, Any]:
     """Return predicted and measured times of an avatar, with its own network and with an untrained one of each `width`.
 
-    Each network has two rows in `rows`. `name`: name of the avatar, or `width` with the number. `what`: `run` (mean frame
-    time of a run of `frames` frames) or `network` (median time of calls during `seconds` seconds). `predicted_ms`, with the
-    80 % interval `low_ms`, `high_ms`. `measured_ms`. `error`: predicted / measured - 1. `inside`: whether the measured time
-    is in the interval. `others`: share of the cores that other programs had in the run; null for calls of a network. If
-    `others` is above 0.1, the row says little.
+    Each network has two rows in `rows`. `name`: name of the avatar, or `width` with the number. `what`: `run` (mean
+    frame time of a run of `frames` frames) or `network` (median time of calls during `seconds` seconds).
+    `predicted_ms`, with the 80 % interval `low_ms`, `high_ms`. `measured_ms`. `error`: predicted / measured - 1.
+    `inside`: whether the measured time is in the interval. `others`: share of the cores that other programs had in the
+    run; null for calls of a network. If `others` is above 0.1, the row says little.
 
     `run`, `network`: summaries of the rows of that kind. `inside`: number of rows in their interval, out of `of` rows.
     `median_error`: median of the absolute errors. `leave_one_out_error`: root mean square of log(predicted / measured).
@@ -58,8 +58,8 @@ def measure(
 
     `config`: values of the options.
 
-    Raises BadInputError for fewer than 100 frames or an avatar that cannot be read, MissingPartError without PyTorch, and
-    TrilaneError if a run fails.
+    Raises BadInputError for fewer than 100 frames or an avatar that cannot be read, MissingPartError without PyTorch,
+    and TrilaneError if a run fails.
     """
     if frames < MIN_FRAMES:
         raise BadInputError("--frames", str(frames), f"at least {MIN_FRAMES}")
@@ -124,7 +124,10 @@ def _row(name: str, what: str, predicted: Predicted, measured_ms: float, others:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the summary of the rows of one kind. `rows`: two or more `rows` of `measure`, which also describes the keys."""
+    """Return the summary of the rows of one kind.
+
+    `rows`: two or more `rows` of `measure`, which also describes the keys.
+    """
     squares = [math.log1p(row["error"]) ** 2 for row in rows]
     left_out = [(sum(squares) - one) / (len(squares) - 1) for one in squares]
     return {

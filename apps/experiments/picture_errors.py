@@ -90,7 +90,8 @@ def figures(
 
     `mask`, `reference_mask`: masks to compare; None for either leaves `dice` and `iou` out.
     `lpips`: function that computes LPIPS; None leaves LPIPS out.
-    Raises ValueError if the pictures differ in shape or an argument is no picture, ImportError without the extra `metrics`.
+    Raises ValueError if the pictures differ in shape or an argument is no picture, ImportError without the extra
+    `metrics`.
     """
     masks = None if mask is None or reference_mask is None else (mask, reference_mask)
     if np.array_equal(*_pair(picture, reference)):
@@ -151,7 +152,8 @@ def ssim(picture: Floats, reference: Floats) -> float | None:
 def ms_ssim(picture: Floats, reference: Floats) -> float | None:
     """Return MS-SSIM of five scales, mean over the colours; None if a side is shorter than `LEAST_MS_SSIM_PX`.
 
-    From each scale to the next, squares of 2 x 2 pixels are averaged. A mean contrast-structure term below 0 counts as 0.
+    From each scale to the next, squares of 2 x 2 pixels are averaged. A mean contrast-structure term below 0 counts as
+    0.
     Raises ValueError as `figures`.
     """
     shown, wanted = _pair(picture, reference)
@@ -271,7 +273,10 @@ class Lpips:
             )
 
     def _features(self, picture: F64) -> Iterator[Any]:
-        """Yield the features (1,C,h,w) of each layer for `picture` (h,w,3). The vector of each pixel has length 1 along C."""
+        """Yield the features (1,C,h,w) of each layer for `picture` (h,w,3).
+
+        The vector of each pixel has length 1 along C.
+        """
         import torch
         from torch.nn import functional
 
