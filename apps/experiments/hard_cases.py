@@ -100,7 +100,10 @@ class Case:
 
     @property
     def tells(self) -> bool:
-        """Whether the bound tells wrong pictures from right ones: the error of every wrong picture is above the bound."""
+        """Whether the bound tells wrong pictures from right ones.
+
+        This holds if the error of every kind of wrong picture is above the bound.
+        """
         return self.bound < min(self.wrong.values())
 
     def verdict(self, error: float) -> str:

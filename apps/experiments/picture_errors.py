@@ -185,7 +185,7 @@ def iou(mask: Mask, reference: Mask) -> float:
 
 
 def _similarity(picture: F64, reference: F64) -> tuple[F64, F64]:
-    """Return (mean SSIM (3,), mean contrast-structure term (3,)), by colour, over all windows that lie in the picture."""
+    """Return (mean SSIM, mean contrast-structure term) over all windows that lie in the picture, each (3,), by colour."""
     from skimage.metrics import structural_similarity
 
     _, whole = structural_similarity(
@@ -206,7 +206,10 @@ def _similarity(picture: F64, reference: F64) -> tuple[F64, F64]:
 
 
 def _means(picture: F64) -> F64:
-    """Return the weighted mean (h,w,3) of the window around each pixel, as skimage's `structural_similarity` computes it."""
+    """Return the weighted mean (h,w,3) of the window around each pixel.
+
+    The window and its weights are those of skimage's `structural_similarity`.
+    """
     from skimage.filters import gaussian
 
     reach = WINDOW_PX // 2 / DEVIATION_PX
