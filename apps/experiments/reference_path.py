@@ -51,7 +51,7 @@ HALF = 0.5
 
 
 class Cause(StrEnum):
-    """The causes of the difference between a run's picture and the reference, in the order in which they are switched on."""
+    """The causes of the difference between a run's picture and the reference, in the order of switching on."""
 
     WEIGHTS = "skin weights"
     BLEND = "blend shapes"
@@ -180,7 +180,10 @@ class RunBody:
         return vertices
 
     def _by_gpu(self, detail: Detail, posed: Posed) -> F32:
-        """Return the vertices (V,3) float32, metres, by the vertex shader's formula, rounded to float32 after each step."""
+        """Return the vertices (V,3) float32, metres, by the formula of the vertex shader.
+
+        The result of each step is rounded to float32.
+        """
         rest, blend = self._data.shaped.vertices.astype(np.float32), self._blend(detail)
         if blend is not None:
             rest = rest + (blend.reshape(-1, POSE_FEATURES) @ posed.feature).reshape(-1, 3)
@@ -302,7 +305,10 @@ class ReferenceMoment:
         ]
 
     def _own_layer(self, seen: CastView, causes: Causes) -> RasterLayer:
-        """Return the layer of an avatar, painted from a tensor of its own on the picture's grid, as in the plan `full`."""
+        """Return the layer of an avatar, painted from a tensor of its own on the picture's grid.
+
+        The plan `full` makes its layers in the same way.
+        """
         avatar = self._path.avatars[seen.folder]
         times = fineness(seen.box.shape, avatar.area)
         box = grown(seen.box, BUCKET_STEP * times.denominator)
@@ -324,7 +330,7 @@ class ReferenceMoment:
         return [(self.seen[int(row["avatar"])], Rect(*map(float, row["rect"])), _cell(row)) for row in visible]
 
     def _painted(self, causes: Causes) -> dict[int, F32]:
-        """Return, by network number, the picture (h,w,4) that the network paints from the run's tensor, with `causes` on."""
+        """Return the pictures (h,w,4) that the networks paint from the run's tensors, by network number, with `causes` on."""
         avatars = {self._path.network_of(seen): self._path.avatars[seen.folder] for seen, _, _ in self._cells()}
         return {
             network: self._paint(avatar, self._tensor(network, avatar, causes), causes)

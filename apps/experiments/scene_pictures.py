@@ -69,9 +69,10 @@ class ScenePictures:
         return self.gpu.shared(CONTEXT, open_context)
 
     def frame(self, number: int) -> tuple[U8, Mapping[str, float]]:
-        """Return frame `number`, (h,w,3) uint8 sRGB, and the time in ms of each stage before present, by the stage's name.
+        """Return (picture, times) of frame `number`: (h,w,3) uint8 sRGB, and the time in ms by stage.
 
-        A skipped stage takes almost no time. Time in which a ready thread had no core does not count.
+        The stage present does not run. A skipped stage takes almost no time. Time in which a ready thread had no core
+        does not count.
         """
         cores, times = len(machine.here.cores()), {}
         with closing(CoreMeter()) as meter:
