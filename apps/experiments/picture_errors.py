@@ -185,7 +185,7 @@ def iou(mask: Mask, reference: Mask) -> float:
 
 
 def _similarity(picture: F64, reference: F64) -> tuple[F64, F64]:
-    """Return (mean SSIM, mean contrast-structure term), each (3,) by colour, over all windows that lie in the picture."""
+    """Return (mean SSIM, mean contrast-structure term), each (3,) by colour, over all windows inside the picture."""
     from skimage.metrics import structural_similarity
 
     _, whole = structural_similarity(

@@ -145,7 +145,7 @@ def _count(definition: Definition) -> int:
 
 
 def _numbers(definition: Definition) -> Sequence[int]:
-    """Return the numbers of the combinations to try, ascending: all numbers of the grid or, for RANDOM, a sample of them."""
+    """Return the numbers of the combinations to try, ascending: the whole grid or, for RANDOM, a sample of the grid."""
     whole = math.prod(len(values) for values in definition.axes.values())
     if definition.kind is SweepKind.RANDOM:
         return sorted(random.Random(definition.seed).sample(range(whole), _count(definition)))

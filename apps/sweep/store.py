@@ -32,11 +32,11 @@ Engine = Callable[[Sequence[Trial]], Generator[Record]]
 
 
 def whole_lines(text: bytes, where: str | Path) -> tuple[list[Record], int]:
-    """Return (records, size) of the content `text` of a `trials.jsonl`: its records, and its bytes up to the last record.
+    """Return (records, size) of a `trials.jsonl`: its records, and the number of bytes up to the last record.
 
     Text after the last line feed is left out. The last line is also left out if it is no record.
 
-    `where`: name of the file for the message of the error.
+    `text`: content of the file. `where`: name of the file for the message of the error.
 
     Raises BadInputError, which names the line, for an earlier line that is no record.
     """

@@ -334,7 +334,7 @@ class Search:
     def is_hopeless(self, asked: Any, trial: Trial, record: Record, frames: int) -> bool:
         """Return whether the result of a short run ends `trial`. If so, count the trial as tried and pruned.
 
-        The short run ends the trial if its first goal is worse than the median of earlier short runs.
+        The short run ends the trial if its first goal is worse than the median of the short runs of completed trials.
 
         `asked`: Optuna's trial. `record`: record of the short run. `frames`: number of its frames.
         """
