@@ -330,7 +330,10 @@ class ReferenceMoment:
         return [(self.seen[int(row["avatar"])], Rect(*map(float, row["rect"])), _cell(row)) for row in visible]
 
     def _painted(self, causes: Causes) -> dict[int, F32]:
-        """Return the pictures (h,w,4) that the networks paint from the run's tensors with `causes` on, by network number."""
+        """Return the picture (h,w,4) that each network paints from the run's tensor, by network number.
+
+        `causes`: causes that are on.
+        """
         avatars = {self._path.network_of(seen): self._path.avatars[seen.folder] for seen, _, _ in self._cells()}
         return {
             network: self._paint(avatar, self._tensor(network, avatar, causes), causes)

@@ -208,10 +208,11 @@ class RunExplanation:
         }
 
     def _of_cores(self, frame_ms: float | None, efficiency: float | None) -> dict[str, Any] | None:
-        """Return figures of the run's cores; None if the mean frame time, the efficiency or a unit's cores are not known.
+        """Return figures of the run's cores; None if the mean frame time, the efficiency or a unit's cores are unknown.
 
-        Keys: `numbers`: numbers of the cores. `had_ms`: mean frame time multiplied by the number of cores. `cpu_ms`: CPU time
-        of all jobs of a mean frame.
+        Keys: `numbers`: numbers of the cores.
+        `had_ms`: mean frame time multiplied by the number of cores.
+        `cpu_ms`: CPU time of all jobs of a mean frame.
 
         `frame_ms`: mean frame time. `efficiency`: machine efficiency.
         """
@@ -448,10 +449,12 @@ class Joins:
                 del kept[next(iter(kept))]
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return a row for each stage with several inputs: `stage` is its name, and `inputs` maps each input to two figures.
+        """Return a row for each stage with several inputs.
 
-        An input is named after the stage that writes it. `last`: number of jobs in which the input came last. `after_ms`: mean
-        time from the input before it until it came, in these jobs.
+        Keys: `stage`: name of the stage. `inputs`: for each input, by the name of the stage that writes it, two
+        figures.
+        `last`: number of jobs in which this input came last. `after_ms`: mean time in these jobs from the input before
+        it until it came.
         """
         return [
             {

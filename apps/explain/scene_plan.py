@@ -105,8 +105,8 @@ class ScenePlan:
     def measured_px(self, frame: int, avatar: int) -> float:
         """Return the largest distance by which the plan moves a vertex of an avatar in the picture, in pixels.
 
-        Call it after `decide(frame)`. Vertices that the level of the mesh leaves out do not count. If the CPU unit
-        draws no vertices, return 0. `frame`, `avatar`: numbers.
+        Call it after `decide(frame)`. Vertices that the level of the mesh leaves out do not count. If the GPU unit
+        skins, or if all vertices are outside of the picture, return 0. `frame`, `avatar`: numbers.
         """
         if not self._drawn:
             return 0.0
@@ -147,7 +147,10 @@ def _packet(config: RunConfig) -> Packet:
 
 
 def phases(frames: Sequence[PlannedFrame]) -> list[list[PlannedFrame]]:
-    """Return groups of successive frames with the same work, tensor shape, visible avatars and levels of detail and mesh."""
+    """Return the phases: groups of successive frames with the same work, tensor shape and visible avatars.
+
+    The visible avatars must also have the same levels of detail and mesh.
+    """
     groups: list[list[PlannedFrame]] = []
     for planned in frames:
         if groups and _kind(groups[-1][-1]) == _kind(planned):

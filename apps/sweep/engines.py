@@ -277,7 +277,7 @@ def _remove(own: Path) -> None:
 
 
 def at_once(clock: TrialClock) -> int:
-    """Return how many trials run at once on this machine: 1 for the host clock, 1 on each core for the virtual clock."""
+    """Return how many trials run at once on this machine: 1 for the host clock, 1 on each core for the virtual one."""
     return 1 if clock is TrialClock.HOST else len(machine.here.cores())
 
 
