@@ -418,7 +418,7 @@ class Lanes:
         self._until_ns: list[int] = []
 
     def place(self, begin_ns: int, end_ns: int) -> tuple[int, int]:
-        """Return (lane, begin) of a slice: the number of its lane, and the time in ns at which the slice begins in this lane."""
+        """Return (number of the lane of a slice, time in ns at which the slice begins in this lane)."""
         for lane, until_ns in enumerate(self._until_ns):
             if until_ns <= begin_ns:
                 self._until_ns[lane] = end_ns

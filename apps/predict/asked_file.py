@@ -38,7 +38,7 @@ APART: Final = "networks are priced alone: units that work at once share memory 
 
 
 def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str], None]) -> dict[str, Any]:
-    """Return the document of `trilane predict FILE.toml --json`: predictions for the pipeline file `path` and its variants.
+    """Return the document of `trilane predict FILE.toml --json`, which predicts the file `path` and its variants.
 
     `options`: options of the prediction. `say`: function that gets a message before an action that takes seconds.
 

@@ -72,9 +72,10 @@ def _with_run(chip: Profile, request: RunOptions, say: Say) -> tuple[Profile, Ne
 
 
 def with_first(chip: Profile, text: str, say: Say) -> Profile:
-    """Return `chip` with measurements of the pipeline that `text` describes: a scene, a network file or a pipeline file.
+    """Return `chip` with measurements of the first pipeline that shares it: a scene, a network or a pipeline file.
 
-    A pipeline file is not measured here. `text`: as typed on the command line. `chip`, `say`: as in `with_avatar`.
+    A pipeline file is not measured here. `text`: pipeline as typed on the command line. `chip`, `say`: as in
+    `with_avatar`.
 
     Raises BadInputError for a text that describes no pipeline, and a scene or network that cannot be used.
     """
