@@ -68,12 +68,13 @@ def error_by_cause(
     Keys of the result:
     `causes`: a row for each cause, in the order of `Cause`.
     `whole`: error of the frame with all causes against the reference.
-    `sums`: sums of the rows `in_order` and `alone`, and what the whole error has beyond them.
+    `sums`: sums over the causes, `in_order` and `alone`, and `whole` minus these sums, `left_in_order` and
+    `left_alone`.
     `remainder`: error of the run's own frame against the frame with all causes.
     `truth`: errors of the reference and of the run against the ground truth; None if the scene has no ground truth.
     `frames`: numbers of the frames. `empty_frames`: frames with nobody in view, which do not count.
-    `network`: names of the networks that paint the reference. `sources`: source of each key. `config`: facts of the
-    scene.
+    `network`: names of the networks that paint the reference. `sources`: source of each key.
+    `config`: name, plan, size and runtime of the scene.
 
     Keys of a row:
     `cause`, `what`: name and description of the cause. `needs`: names of the causes that the cause needs.

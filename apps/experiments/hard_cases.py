@@ -172,8 +172,9 @@ def hard_cases(runtimes: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Yield a row for each network of `NETWORKS`, input of `INPUTS` and runtime of `runtimes`.
 
     Keys: `name`; `error`, `bound`: mean error and its bound; `unit`: unit of both; `source`: source of the bound;
-    `predicted_error`: expected error; the keys of `wrong_answers`; `verdict`: text; `passed`: whether the bound holds.
-    An `error` that is not a finite number is None, and counts as above every bound.
+    `predicted_error`: expected error; the keys of `wrong_answers`; `verdict`: text; `passed`: whether the verdict is
+    HOLDS. An `error` that is not a finite number is None, and counts as above every bound.
+
     Raises MissingPartError without PyTorch or a runtime.
     """
     for network in NETWORKS:

@@ -507,7 +507,7 @@ def _is_taken(value: float) -> bool:
 def scene_cases() -> Iterator[HardNumber]:
     """Yield a row for each scene of `JUMPS`.
 
-    Its error is the number of tensor bytes that depend on the frames drawn before.
+    The error of a row is the number of tensor bytes that depend on the frames drawn before.
     """
     for scene, frames in JUMPS.items():
         checked = configure(RunOptions(scene=scene, runtime=RUNTIME), Path.cwd())

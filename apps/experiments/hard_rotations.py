@@ -123,9 +123,10 @@ def rotation_cases() -> Iterator[HardNumber]:
 def turn_bound(angle: F64) -> F64:
     """Return the bound on the error of an entry of R - I (...), for rotations by `angle` (...), radians.
 
-    h = |v| / 2 is off by at most 2.5 U of itself: it is the root of a sum of three squares. Let s = min(1, h). The
-    first part of the quaternion is off by at most f = U (2.5 h + 2). Each other part is off by at most e = U (2.5 h +
-    7.5 s). An entry of R - I is a sum of at most two products of parts, doubled. Therefore the entry is off by at most
+    Let v be the axis-angle vector, and U the unit roundoff of float64. h = |v| / 2 is off by at most 2.5 U of itself,
+    because it is the root of a sum of three squares. Let s = min(1, h). The first part of the quaternion is off by at
+    most f = U (2.5 h + 2). Each other part is off by at most e = U (2.5 h + 7.5 s). An entry of R - I is a sum of at
+    most two products of parts, doubled. Therefore the entry is off by at most
 
         (4 s + 2) e + 2 s f + 6 s U
 

@@ -54,7 +54,8 @@ class ScenePictures:
     def __init__(self, checked: Checked, gpu: UnitContext | None = None) -> None:
         """Build the stages.
 
-        Raises BadInputError for a stage that cannot be built, MissingPartError without a library of it.
+        Raises BadInputError for a stage that cannot be built, MissingPartError if a library that a stage needs is
+        missing.
         """
         pipeline, output = avatar_pipeline(checked.config, checked.assets), checked.config.scene.output
         units = units_of(pipeline, checked.assets)
@@ -224,7 +225,7 @@ class _Sessions:
 def _tensors(checked: Checked, frames: Sequence[int]) -> Iterator[tuple[int, int, U8]]:
     """Yield (frame number, network number, tensor) for each network that paints an avatar in one of `frames`.
 
-    A tensor is (h,w,C) uint8, and valid until the next one is yielded.
+    A tensor is (h,w,C) uint8, and valid until a tensor of the next frame is yielded.
     """
     painter = DrawnTensors(checked)
     for frame in frames:

@@ -270,7 +270,10 @@ def bound_text(bound: Mapping[str, Any]) -> str:
 
 
 def part_text(part: Mapping[str, Any]) -> str:
-    """Return `part`, the unit or the stage of a report's `bound`, in words, with its interval and its rivals."""
+    """Return a part of a report's `bound` in words: what slowing it costs, its share of the path, and its rivals.
+
+    `part`: value of `unit` or `stage` in the `bound`, or in the `path` of the `bound`, which has no cost.
+    """
     cost = part.get("cost")
     key, value = ("share", part["share"]) if cost is None else ("cost", cost)
     low, high = part[f"{key}_low"], part[f"{key}_high"]

@@ -1,9 +1,9 @@
-"""The trace of a run from the records of its journal: tracks of units, stages and frames, on either clock.
+"""The trace of a run from the records of its journal: tracks of units, stages and frames, on the host or virtual clock.
 
 Rule: memory is bounded by what the run has in flight. A slice is a recorded job, or the time between two jobs with its
 cause; only recorded times are drawn. The slices of a unit do not overlap, so they sum to the unit's accounts. A frame
 is late as in the report: it was presented past its deadline. Without a deadline, it is late if its frame time is longer
-than the scene's rate allows. A file is complete or absent.
+than the scene's rate allows. A trace file is complete or absent.
 """
 
 from __future__ import annotations

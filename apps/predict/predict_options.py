@@ -296,20 +296,23 @@ class PredictOptions(Options):
 
     @property
     def is_published(self) -> bool:
-        """Return whether the application runs a published network, not the network of an avatar or a file."""
+        """Return whether the application runs a published network, not the network of an avatar or a file.
+
+        A table counts as a published network.
+        """
         return bool(self.model_fields_set & (OF_A_FILE | {"table"}))
 
     @property
     def is_as_run(self) -> bool:
-        """Return whether network, policy and edge are those of `trilane run` without options."""
+        """Return whether network, policy, edge and batch are those of `trilane run` without options."""
         return not (self.is_published or self.model_fields_set & {"avatar", "network", "policy", "edge", "batch"})
 
     @property
     def variant(self) -> Variant:
         """Return policy, edge and batch of the application.
 
-        If no policy is given, it is `pipelined`, as in a run. For a published network on another chip than this
-        machine, it is `reference`.
+        If no policy is given, the policy is `pipelined`, as in a run. For a published network on another chip than this
+        machine, the default policy is `reference`.
 
         Raises BadInputError for the policy `reference` with an edge that the published application does not have.
         """

@@ -115,8 +115,8 @@ def with_file(
 
     `chip`, `say`: as in `with_avatar`. `shapes`: shapes of inputs by name, in place of the file's own.
     `counts`: numbers of threads to measure with; if empty, the number of threads of the unit for networks.
-    `runtime`: runtime of the pipeline stage that has this network. "" means that the network is no stage; the fastest
-    installed runtime that can compute the network is then used.
+    `runtime`: runtime of the pipeline stage that has this network; "" if the network is no stage. In this case, an
+    avatar's integer network uses the fastest installed runtime, and any other network uses ONNX Runtime.
     """
     why = _why_not(chip, graph)
     if why:

@@ -188,9 +188,9 @@ def _once(trial: Trial, own: Path, place: TrialPlace, children: Children) -> Rec
 
 
 def trust_in(ended: Record) -> Trust:
-    """Return whether the times of a trial can be trusted. `ended`: result of `ended_as`.
+    """Return whether the times of a trial can be trusted, with reasons. `ended`: result of `ended_as`.
 
-    A trial that is not done counts as trusted. A trial whose result lacks the share of other programs also does.
+    A trial counts as trusted if it is not done, or if its result lacks the share of other programs.
     """
     result = ended["result"] or {}
     is_judged = ended["status"] == "done" and "other_programs" in result

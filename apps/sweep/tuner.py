@@ -115,9 +115,10 @@ def keep_of(text: str) -> Keep:
 
 @dataclass(frozen=True)
 class Aim:
-    """What a search is asked for.
+    """The goals and limits of a search.
 
-    `goals`: keys of `METRICS`; the first chooses the answer. `keeps`: limits that the answer keeps.
+    `goals`: keys of `METRICS`; the best value of the first goal decides which trial is the answer. `keeps`: limits that
+    the answer keeps.
     """
 
     goals: tuple[str, ...] = ("fps",)
