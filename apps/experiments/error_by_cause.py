@@ -69,8 +69,7 @@ def error_by_cause(
     `causes`: a row for each cause, in the order of `Cause`.
     `whole`: error of the frame with all causes against the reference.
     `sums`: sums over the causes, `in_order` and `alone`, and `whole` minus these sums, `left_in_order` and
-    `left_alone`.
-    `remainder`: error of the run's own frame against the frame with all causes.
+    `left_alone`. `remainder`: error of the run's own frame against the frame with all causes.
     `truth`: errors of the reference and of the run against the ground truth; None if the scene has no ground truth.
     `frames`: numbers of the frames. `empty_frames`: frames with nobody in view, which do not count.
     `network`: names of the networks that paint the reference. `sources`: source of each key.

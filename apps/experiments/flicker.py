@@ -91,12 +91,11 @@ def measure(
     frames.
 
     Other keys: `scene_change`: mean change of the reference between successive frames. `against`: name of the
-    reference.
-    `frames`: numbers of the frames. `sources`: source of the figures. `config`: scene, plan, size, frames a second.
+    reference. `frames`: numbers of the frames. `sources`: source of the figures. `config`: scene, plan, size, frames a
+    second.
 
     Raises BadInputError for an option out of range, an unknown name, a value given twice, or a frame with nobody in
-    view.
-    Raises MissingPartError if a runtime or OpenGL is missing.
+    view. Raises MissingPartError if a runtime or OpenGL is missing.
     """
     refuse_twice("--runtime", runtime)
     refuse_twice("--texture-filter", texture_filter)

@@ -147,8 +147,8 @@ def wrong_answers(wanted: F32) -> dict[str, float]:
     """Return the least error of each kind of wrong picture against `wanted` (H,W,4), all in steps of 1/255.
 
     `constant_error`: error of the best picture of one colour, which is the median of each channel.
-    `shifted_error`: least error of `wanted` moved by `SHIFT` pixels up, down, left or right, either wrapped or with its
-    edge repeated.
+    `shifted_error`: least error of `wanted` moved by `SHIFT` pixels up, down, left or right, wrapped or with its edge
+    repeated.
     `swapped_error`: error of `wanted` with red and blue exchanged.
     """
     shifted = (

@@ -127,24 +127,24 @@ def _no_error(side: int, masks: tuple[Mask, Mask] | None, lpips: Perceived | Non
 
 
 def mae(picture: Floats, reference: Floats) -> float:
-    """Return the mean absolute difference of all values, in steps of 1/255. Raises ValueError as `figures`."""
+    """Return the mean absolute difference of all values, in steps of 1/255. Raises ValueError as `figures` does."""
     shown, wanted = _pair(picture, reference)
     return float(np.abs(shown - wanted).mean() * 255)
 
 
 def mse(picture: Floats, reference: Floats) -> float:
-    """Return the mean square difference of all values, as numbers in 0..1. Raises ValueError as `figures`."""
+    """Return the mean square difference of all values, as numbers in 0..1. Raises ValueError as `figures` does."""
     shown, wanted = _pair(picture, reference)
     return float(((shown - wanted) ** 2).mean())
 
 
 def psnr_db(picture: Floats, reference: Floats) -> float:
-    """Return the PSNR in dB, -10 log10 of the mean square difference; at most 100. Raises ValueError as `figures`."""
+    """Return the PSNR in dB, -10 log10 of the mean square difference; at most 100. Raises ValueError as `figures` does."""
     return arrays.psnr_db(mse(picture, reference))
 
 
 def ssim(picture: Floats, reference: Floats) -> float | None:
-    """Return the mean SSIM; None if a side is shorter than `LEAST_SSIM_PX`. Raises ValueError as `figures`."""
+    """Return the mean SSIM; None if a side is shorter than `LEAST_SSIM_PX`. Raises ValueError as `figures` does."""
     shown, wanted = _pair(picture, reference)
     return None if min(shown.shape[:2]) < LEAST_SSIM_PX else float(ssim_map(shown, wanted).mean())
 
@@ -153,8 +153,7 @@ def ms_ssim(picture: Floats, reference: Floats) -> float | None:
     """Return MS-SSIM of five scales, mean over the colours; None if a side is shorter than `LEAST_MS_SSIM_PX`.
 
     From each scale to the next, squares of 2 x 2 pixels are averaged. A mean contrast-structure term below 0 counts as
-    0.
-    Raises ValueError as `figures`.
+    0. Raises ValueError as `figures` does.
     """
     shown, wanted = _pair(picture, reference)
     if min(shown.shape[:2]) < LEAST_MS_SSIM_PX:
@@ -168,7 +167,7 @@ def ms_ssim(picture: Floats, reference: Floats) -> float | None:
 
 
 def flip(picture: Floats, reference: Floats) -> float:
-    """Return the mean of the FLIP map; 0 means no visible difference. Raises ValueError as `figures`."""
+    """Return the mean of the FLIP map; 0 means no visible difference. Raises ValueError as `figures` does."""
     return float(flip_map(*_pair(picture, reference)).mean())
 
 

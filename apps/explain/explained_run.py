@@ -452,9 +452,8 @@ class Joins:
         """Return a row for each stage with several inputs.
 
         Keys: `stage`: name of the stage. `inputs`: for each input, by the name of the stage that writes it, two
-        figures.
-        `last`: number of jobs in which this input came last. `after_ms`: mean time in these jobs from the input before
-        it until it came.
+        figures. `last`: number of jobs in which this input came last. `after_ms`: mean time in these jobs from the
+        input before it until it came.
         """
         return [
             {

@@ -98,9 +98,9 @@ class _Chips:
 
     `options`, `say`: as in `predict_asked_file`.
     `name`: name of the requested chip. If no chip was requested, it is HOST with times of a run, and the default chip
-    without.
-    `used`: profile of the chip; None until it is loaded. It is loaded if it was requested, or when a network needs it.
-    `assumed`: texts "STAGE PRECISION", in order, for networks whose file states no precision; the values are None.
+    without. `used`: profile of the chip; None until it is loaded. It is loaded if it was requested, or when a network
+    needs it. `assumed`: texts "STAGE PRECISION", in order, for networks whose file states no precision; the values are
+    None.
     """
 
     def __init__(self, options: PredictOptions, say: Callable[[str], None]) -> None:
