@@ -214,7 +214,7 @@ class _Split:
         self._truth = {"reference": _Pooled(lpips), "run": _Pooled(lpips)}
 
     def add(self, moment: ReferenceMoment) -> None:
-        """Count `moment`, a frame with a visible avatar, and write its heat maps."""
+        """Count `moment`, a frame with a visible avatar. If there is a folder for heat maps, write its heat maps."""
         box = region(moment.boxes, self._output)
         reference = _cut(moment.frame(NOTHING), box)
         end = _cut(moment.frame(frozenset(Cause)), box)
@@ -240,7 +240,8 @@ class _Split:
     def add_truth(self, moment: ReferenceMoment, true: Sequence[RasterLayer]) -> None:
         """Count `moment` against its ground truth: once the reference, once the run's picture.
 
-        `true`: layers of the clothed bodies, which lie over the run's background in the ground truth.
+        If there is a folder for heat maps, write both heat maps. `true`: layers of the clothed bodies, which lie over
+        the run's background in the ground truth.
         """
         box = region(moment.boxes, self._output)
         picture, cover = laid_over(moment.background, true)

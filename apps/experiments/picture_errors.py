@@ -139,7 +139,10 @@ def mse(picture: Floats, reference: Floats) -> float:
 
 
 def psnr_db(picture: Floats, reference: Floats) -> float:
-    """Return the PSNR in dB, -10 log10 of the mean square difference; at most 100. Raises ValueError as `figures` does."""
+    """Return the PSNR in dB, -10 log10 of the mean square difference; at most 100.
+
+    Raises ValueError as `figures` does.
+    """
     return arrays.psnr_db(mse(picture, reference))
 
 

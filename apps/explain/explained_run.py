@@ -350,7 +350,7 @@ def _slow_row(shown: ShownFrame, usual: Usual) -> dict[str, Any]:
 def figure_names(folder: Path) -> list[str]:
     """Return the names of the metrics that the stages of a run report, sorted. `folder`: run folder.
 
-    Raises BadInputError as `open_journal`.
+    Raises BadInputError as `open_journal` does.
     """
     _, records = open_journal(folder)
     return sorted({name for record in records if isinstance(record, Worked) for name in record.figures})
@@ -361,7 +361,7 @@ def job_rows(folder: Path, figures: Sequence[str]) -> Iterator[tuple[Any, ...]]:
 
     A row has the values of COLUMNS, then those of `figures`. The value of a metric that the job's stage lacks is None.
 
-    `figures`: names of metrics of the stages. Raises BadInputError as `open_journal`.
+    `figures`: names of metrics of the stages. Raises BadInputError as `open_journal` does.
     """
     values = [value for _, value in COLUMNS.values()]
     for one in _explained_jobs(*open_journal(folder)):

@@ -132,14 +132,14 @@ class _Chips:
 
 
 def _measured(folder: Path, chip: str) -> MeasuredStages:
-    """Return the times of a run's jobs by stage, to predict a run on a chip. `folder`: run folder.
-
-    `chip`: name of the chip.
+    """Return the times of a run's jobs by stage, to predict a run on a chip.
 
     On this machine, a job's time counts from the moment when the unit gets the job. If the core is busy with other
     work, the unit begins later, and this delay counts too. On a chip, other programs of this machine take no core.
     Therefore the time in which the unit had no core is left out for a chip. This time is exact for a unit with one
     thread (docs/decisions/preempted-time.md).
+
+    `folder`: run folder. `chip`: name of the chip; HOST for this machine.
 
     Raises BadInputError for a folder without a journal, or a broken journal.
     """

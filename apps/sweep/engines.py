@@ -81,7 +81,7 @@ class Children:
     """
 
     def __init__(self, inherited: tuple[int, ...] = ()) -> None:
-        """Begin without a process."""
+        """Keep the parameter; no process runs yet."""
         self._inherited = inherited
         self._lock = threading.Lock()
         self._going: set[subprocess.Popen[bytes]] = set()

@@ -86,9 +86,9 @@ class Store:
     `folder`: absolute path of the folder. `done`: last records by the trial's name, from the folder and from `add`.
 
     Entering makes the folder, or opens a folder with the same trials. Entering raises BadInputError if:
-    - the folder cannot be written, or another process works in it;
+    - the folder cannot be written, its files are broken, or another process works in it;
     - the folder has other trials, or a file that the trials name has changed;
-    - some but not all trials have ended and `resume` is false;
+    - the folder has records, but not all trials have ended, and `resume` is false;
     - the folder has no sweep and `resume` is true.
     """
 

@@ -194,7 +194,8 @@ class Space:
     def __init__(self, definition: Definition, words: Callable[[Options], Sequence[str]]) -> None:
         """Make the trials of `definition`. `words`: as for `trials_of`.
 
-        Raises BadInputError for another kind than a grid, for repeats, for a single configuration, and as `trials_of`.
+        Raises BadInputError for another kind than a grid, for repeats, for a single configuration, and as `trials_of`
+        does.
         """
         if definition.kind is not SweepKind.GRID or definition.repeats > 1:
             found = f"kind = '{definition.kind}', repeats = {definition.repeats}"
