@@ -5,11 +5,11 @@ float64. A bound counts the roundings of the computation, and never follows from
 
 If a texture has constant channels, every covered pixel of a tensor is a known byte: q = clamp(round(x / scale) + zero
 point, 0, 255), rounded to even. The values x are FP16 numbers. Some values are halves of a step. Their scale is a power
-of two, so every driver divides x / scale exactly. All other x / scale are at least a tenth of a step from a half. This
+of two, so every driver divides x / scale exactly. All other quotients are at least a tenth of a step from a half. This
 is more than the error of a driver's division (2.5 units in the last place, Vulkan 1.3 and OpenCL 3.0 for float32).
 
-A frame of a scene must be the same to the byte, whatever was drawn before. Its reference comes from stages that have
-drawn no other frame.
+A scene's frame must be the same to the byte, no matter which frames were drawn before. Its reference comes from stages
+that have drawn no other frame.
 """
 
 from __future__ import annotations

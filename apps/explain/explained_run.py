@@ -451,9 +451,9 @@ class Joins:
     def rows(self) -> list[dict[str, Any]]:
         """Return a row for each stage with several inputs.
 
-        Keys: `stage`: name of the stage. `inputs`: for each input, by the name of the stage that writes it, two
-        figures. `last`: number of jobs in which this input came last. `after_ms`: mean time in these jobs from the
-        input before it until it came.
+        Keys: `stage`: name of the stage. `inputs`: two figures of each input, by the name of the stage that writes it.
+        `last`: number of jobs in which this input came last. `after_ms`: in these jobs, the mean time by which it came
+        after the input before it.
         """
         return [
             {

@@ -84,9 +84,7 @@ class Reason(NamedTuple):
 
 
 class EvenSample(Generic[T]):
-    """At most MOST_SAMPLES of the added values, evenly spaced.
-
-    All values are kept while there are at most MOST_SAMPLES.
+    """At most MOST_SAMPLES of the added values, evenly spaced; all of them if no more than MOST_SAMPLES were added.
 
     `values`: kept values, in the order of adding.
     """

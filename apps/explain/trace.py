@@ -316,7 +316,7 @@ class _UnitTracks:
         self._write(piece.unit)
 
     def count(self, at_ns: int, waiting: Mapping[str, int]) -> None:
-        """Write how many frames wait before each stage at `at_ns`, if the number of the stage has changed.
+        """Write how many frames wait before each stage at `at_ns`. A stage whose number has not changed is left out.
 
         `waiting`: number of waiting frames by stage.
         """
