@@ -32,9 +32,9 @@ LEAST_JOBS = 6
 class SizeRow:
     """The results of one tensor size on one runtime.
 
-    `size`: size as given by the user. `pictures`: object that makes the frames. `threads`: number of the runtime's
-    threads. `infer_ms`: time of the infer stages for each timed frame. `frame_ms`: time of all stages except present,
-    for each timed frame. `errors`: errors of each frame's picture.
+    `size`: size as given by the user. `runtime`: name of the runtime. `pictures`: object that makes the frames.
+    `threads`: number of the runtime's threads. `infer_ms`: time of the infer stages for each timed frame. `frame_ms`:
+    time of all stages except present, for each timed frame. `errors`: errors of each frame's picture.
     """
 
     size: str

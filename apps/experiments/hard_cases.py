@@ -71,7 +71,8 @@ INPUTS: dict[str, Callable[[np.random.Generator], F32]] = {
 class NetworkPair:
     """A float network, its integer network, and the noise model of the integer network.
 
-    `quantised`: integer network, calibrated on usual frames. `noise`: model of the integer network's rounding errors.
+    `network`: float network. `quantised`: integer network, calibrated on usual frames. `noise`: model of the integer
+    network's rounding errors.
     """
 
     network: onnx.ModelProto
@@ -83,8 +84,8 @@ class NetworkPair:
 class Case:
     """A pair of networks with an input, the expected picture, and the bound on a picture's error.
 
-    `tensor`: input (1,H,W,C) uint8. `wanted`: picture of the float network (1,H,W,4), in steps of 1/255.
-    `predicted`, `bound`: expected error and bound by one of two noise models, the one with the smaller bound.
+    `pair`: the networks. `tensor`: input (1,H,W,C) uint8. `wanted`: picture of the float network (1,H,W,4), in steps of
+    1/255. `predicted`, `bound`: expected error and bound by one of two noise models, the one with the smaller bound.
     `source`: name of this noise model. `own_bound`: bound by the model with the integer network's steps.
     `wrong`: result of `wrong_answers`. All errors and bounds are means, in steps of 1/255.
     """

@@ -169,7 +169,7 @@ def _skinning(shaped: ShapedBody) -> Iterator[HardNumber]:
 def _skinned(shaped: ShapedBody, matrices: F64, feature: F64) -> tuple[F64, F64]:
     """Return (vertices, bounds): skinned vertices (V,3) in float64, and bounds on the errors of float32 (V,3), metres.
 
-    `matrices` (55,3,4): skinning matrices. `feature` (486,): entries of R - I of joints 1 to 54.
+    `shaped`: body. `matrices` (55,3,4): skinning matrices. `feature` (486,): entries of R - I of joints 1 to 54.
 
     Let a vertex have n weights other than 0. In float32, the blended matrix M is off by gamma_(n+1) of sum w |matrix|;
     this includes one rounding for the float32 matrices. M [p, 1] is off by four roundings more. Pose blend shapes move
@@ -273,7 +273,8 @@ def _camera_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
 def _drawn(skeleton: Skeleton, fov_deg: float, metres: float) -> Iterator[tuple[Posed, F64]]:
     """Yield (pose, clip) for `DRAWN_POSES` random poses. `clip` is the projection @ view (4,4) of a camera.
 
-    `fov_deg`: field of view of the camera. `metres`: distance of the camera from one of the joints.
+    `skeleton`: skeleton to pose. `fov_deg`: field of view of the camera, degrees. `metres`: distance of the camera from
+    one of the joints.
     """
     rng = np.random.default_rng(round(1e3 * metres + fov_deg))
     for _ in range(DRAWN_POSES):

@@ -120,7 +120,7 @@ def spread(total: int, frames: int) -> list[int]:
 
 
 def around(boxes: Sequence[Box], output: Shape) -> tuple[slice, slice]:
-    """Return the result of `region` as (rows, columns), two slices. `boxes`: at least one box."""
+    """Return the result of `region` as (rows, columns), two slices. Parameters: see `region`."""
     box = region(boxes, output)
     return slice(box.top, box.bottom), slice(box.left, box.right)
 
@@ -189,7 +189,8 @@ def runtime_differences(checked: Checked, runtimes: Sequence[str], frames: int) 
 def _row(pair: tuple[str, str], steps: list[tuple[float, int, int]]) -> dict[str, Any]:
     """Return the row of `runtime_differences` for a pair of runtimes.
 
-    `steps`: for each tensor, (mean difference, largest difference, number of the frame).
+    `pair`: names of the two runtimes. `steps`: for each tensor, (mean difference, largest difference, number of the
+    frame).
     """
     return {
         "first": pair[0],

@@ -244,7 +244,7 @@ def _work(shown: ShownFrame, usual: Usual, job: JobRecord, longer_ns: float) -> 
 
     Either the job took longer than usual, or less of it overlapped with the frame before.
 
-    `shown`, `usual`: as in `reasons`. `longer_ns`: time of the part beyond the usual.
+    `shown`, `usual`: as in `reasons`. `job`: the job. `longer_ns`: time of the part beyond the usual.
     """
     service_ns, usual_ns = job.end_ns - job.begin_ns, usual.service_ns.get(job.stage, 0.0)
     times = f"{service_ns / NS_PER_MS:.1f} ms, median {usual_ns / NS_PER_MS:.1f}"

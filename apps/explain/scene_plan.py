@@ -136,7 +136,7 @@ class ScenePlan:
 def _kept(assets: Assets, number: int) -> list[I64 | slice]:
     """Return, for each level of an avatar's mesh, the vertices that the level keeps, as indices. Level 0 keeps all.
 
-    `number`: number of the avatar among the distinct avatars.
+    `assets`: arrays of the run. `number`: number of the avatar among the distinct avatars.
     """
     return [slice(None), *(np.unique(level.faces).astype(np.int64) for level in mesh_levels_of(assets, number))]
 
@@ -488,7 +488,8 @@ class CostModel:
     ) -> None:
         """Load the hardware profile. Raises BadInputError for an unknown profile, or for one without a chip.
 
-        `painters`: function from the numbers of avatars to the numbers of the networks that paint them.
+        `painters`: function from the numbers of avatars to the numbers of the networks that paint them. Other
+        parameters: see `CostModel`.
         """
         self._networks, self._chip, self._painters = networks, load_runnable(profile), painters
         self._corners = corners_of(self._chip, performance_profile)

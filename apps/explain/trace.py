@@ -382,7 +382,7 @@ class Tiles(Generic[Item]):
         self._count = 0
 
     def add(self, begin_ns: int, end_ns: int, item: Item) -> None:
-        """Add a slice of the track. `item`: content of the slice, which `take` yields."""
+        """Add a slice of the track, from `begin_ns` to `end_ns`. `item`: content of the slice, which `take` yields."""
         self._count += 1
         heappush(self._waiting, (begin_ns, end_ns, self._count, item))
 

@@ -52,7 +52,7 @@ class Sink(Protocol):
         """Begin a group of tracks named `name`, and return the number of its top track."""
 
     def track(self, name: str, parent: int, rank: int = 0) -> int:
-        """Begin a track below the track `parent`, and return its number.
+        """Begin a track named `name` below the track `parent`, and return its number.
 
         A viewer may show tracks of equal name as one track.
 
@@ -60,7 +60,7 @@ class Sink(Protocol):
         """
 
     def counter_track(self, name: str, parent: int, rank: int = 0, unit: str = "") -> int:
-        """Begin a track of a counter below the track `parent`, and return its number.
+        """Begin a track of a counter `name` below the track `parent`, and return its number.
 
         `rank`: as in `track`. `unit`: unit of the values, such as "B"; "" for none.
         """
@@ -68,7 +68,10 @@ class Sink(Protocol):
     def slice(
         self, track: int, begin_ns: int, end_ns: int, name: str, notes: Notes = NO_NOTES, flow: FlowArrow | None = None
     ) -> None:
-        """Write a slice of a track. `flow`: arrow that goes through the slice; None for no arrow."""
+        """Write the slice `name` of the track number `track`, from `begin_ns` to `end_ns`.
+
+        `notes`: notes of the slice. `flow`: arrow that goes through the slice; None for no arrow.
+        """
 
     def begin(self, track: int, at_ns: int, name: str, notes: Notes = NO_NOTES) -> None:
         """Begin a slice of the track at `at_ns`; a call of `end` ends the slice."""
@@ -210,7 +213,10 @@ def _varint(number: int) -> bytes:
 
 
 def _packet(track: int, at_ns: int, kind: int) -> Any:
-    """Return a packet with an event of a track. `kind`: type of the event in `TrackEvent`, such as TYPE_INSTANT."""
+    """Return a packet with an event at `at_ns` on the track number `track`.
+
+    `kind`: type of the event in `TrackEvent`, such as TYPE_INSTANT.
+    """
     packet = TracePacket(timestamp=at_ns, trusted_packet_sequence_id=SEQUENCE)
     event = packet.track_event
     event.type, event.track_uuid = kind, track
@@ -220,7 +226,7 @@ def _packet(track: int, at_ns: int, kind: int) -> Any:
 def _intern(numbers: dict[str, int], name: str, packet: Any, table: str) -> int:
     """Give `name` the next number, define it in `packet`, and return the number.
 
-    `table`: field of the packet's interned data that defines such names.
+    `numbers`: numbers by name so far. `table`: field of the packet's interned data that defines such names.
     """
     numbers[name] = number = len(numbers) + 1
     getattr(packet.interned_data, table).add(iid=number, name=name)

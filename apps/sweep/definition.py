@@ -86,7 +86,7 @@ def trials_of(definition: Definition, words: Callable[[Options], Sequence[str]])
 
     All configurations run once before any is repeated: if the machine slows down, all configurations slow down.
 
-    `words`: function that returns options as the words of a command line.
+    `definition`: the sweep. `words`: function that returns options as the words of a command line.
 
     Raises BadInputError for axes that do not fit each other, a `count` out of range, more than `MOST_TRIALS` trials,
     and a trial given twice.

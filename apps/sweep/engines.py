@@ -243,7 +243,7 @@ def ended_as(code: int, out: str, messages: str) -> Record:
 
 
 def lost(trial: Trial, why: str) -> Record:
-    """Return the record of a trial whose Ray worker ended without a record. `why`: message of the error."""
+    """Return the record of `trial`, whose Ray worker ended without a record. `why`: message of the error."""
     return {
         **about(trial),
         **{"status": "lost", "exit_code": None, "error": why, "result": None, "repeated": 0, "unsure": []},

@@ -95,8 +95,8 @@ class Store:
     def __init__(self, folder: Path, trials: Sequence[Trial], about: Mapping[str, Any], *, resume: bool) -> None:
         """Keep the parameters; entering opens the folder.
 
-        `trials`: all trials of the sweep. `about`: content of `sweep.json` besides the trials. `resume`: whether to go
-        on with a sweep that has begun.
+        `folder`: folder of the sweep. `trials`: all its trials. `about`: content of `sweep.json` besides the trials.
+        `resume`: whether to go on with a sweep that has begun.
         """
         self.folder = folder.absolute()
         self.done: dict[str, Record] = {}
@@ -248,7 +248,8 @@ def summary(trials: Sequence[Trial], store: Store, before: set[str]) -> dict[str
     Keys: `folder`: folder of the sweep. `counts`: numbers of trials, in all and by status. `trials`: results of
     `row_of`.
 
-    `before`: names of the trials that ended before this call of the sweep; they count as `skipped` too.
+    `store`: open folder of the sweep. `before`: names of the trials that ended before this call of the sweep; they
+    count as `skipped` too.
     """
     rows = [row_of(trial, store.done.get(trial.id)) for trial in trials]
     counts = Counter(row["status"] for row in rows)
@@ -264,7 +265,7 @@ def summary(trials: Sequence[Trial], store: Store, before: set[str]) -> dict[str
 
 
 def row_of(trial: Trial, record: Record | None) -> dict[str, Any]:
-    """Return a trial as a row of a summary: its options, and how it ended.
+    """Return `trial` as a row of a summary: its options, and how it ended.
 
     `record`: record of the trial; None for a trial that was not tried, whose status is `planned`.
     """

@@ -376,8 +376,8 @@ class Search:
 def tune(search: Search, do: Do, budget: int, together: int = 1, short: int | None = None) -> Mapping[str, Record]:
     """Try at most `budget` configurations, and return the records of all trials that were done in full, by name.
 
-    `do`: function that does trials. `together`: number of configurations that are proposed and done at once. `short`:
-    number of frames of a short run before each full run; None for no short runs.
+    `search`: search without results. `do`: function that does trials. `together`: number of configurations that are
+    proposed and done at once. `short`: number of frames of a short run before each full run; None for no short runs.
 
     Raises BadInputError if the first results all lack the same figure of a goal or limit.
     """
@@ -422,7 +422,8 @@ def answer(search: Search, records: Mapping[str, Record]) -> dict[str, Any]:
     the limits least; None if there is a `best`. `weighed`: names of the figures that the frontier compares. `frontier`:
     trials that no other trial beats. `trials`: rows of all trials. `not_tried`: result of `_not_tried`.
 
-    `records`: all known records of the space by the trial's name, also from an earlier search or sweep.
+    `search`: search that has ended. `records`: all known records of the space by the trial's name, also from an earlier
+    search or sweep.
     """
     aim, space = search.aim, search.space
     found = [trial for trial in space.trials if trial.id in records and trial.id not in search.tried]
