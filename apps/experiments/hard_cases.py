@@ -108,7 +108,10 @@ class Case:
         return self.bound < min(self.wrong.values())
 
     def verdict(self, error: float) -> str:
-        """Return the verdict on a picture's `error`: HOLDS, EXCEEDED or UNTOLD. NaN counts as above the bound."""
+        """Return the verdict on a picture's `error`: HOLDS, EXCEEDED or UNTOLD. NaN counts as above the bound.
+
+        UNTOLD means that a wrong picture could also stay within the bound (`tells` is false).
+        """
         if not self.tells:
             return UNTOLD
         return HOLDS if error <= self.bound else EXCEEDED

@@ -190,8 +190,8 @@ def _random_cases() -> Iterator[HardNumber]:
 def exact_turn(rotvec: Sequence[float]) -> list[list[Decimal]]:
     """Return R - I, a list of three rows, of the axis-angle vector `rotvec` (3,), radians, to `DIGITS` digits.
 
-    Let t = |v|, below 1e9. R - I = a [v]x + b [v]x^2, where a = sin(t) / t and b = (1 - cos(t)) / t^2. First, t is
-    reduced by multiples of 2 pi. After that, series compute sin and cos.
+    Let v be this vector, and t = |v|, below 1e9. R - I = a [v]x + b [v]x^2, where a = sin(t) / t and b = (1 - cos(t)) /
+    t^2. First, t is reduced by multiples of 2 pi. After that, series compute sin and cos.
     """
     with localcontext() as context:
         context.prec = DIGITS

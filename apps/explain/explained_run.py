@@ -252,10 +252,12 @@ def explain_run(folder: Path, slowest: int = 10) -> dict[str, Any]:
 def explain_frame(folder: Path, number: int) -> dict[str, Any]:
     """Return what became of frame `number` of the run in `folder`, as plain data.
 
-    Keys: `schema`, `run`: folder, `frame`: number. `outcome`: `presented`, `dropped`, `lost` or `under way`. `cause`:
-    key of the report that counts the dropped or lost frame; None for any other frame. `after_ms`: time from the frame's
-    release until it was presented, dropped or lost; None while it is under way. `latency_ms`: latency; None if not
-    known. `jobs`: a row for each job of the frame, whose `begin_ms` counts from the release too.
+    Keys: `schema`, `run`: folder, `frame`: number.
+    `outcome`: `presented`, `dropped`, `lost` or `under way`.
+    `cause`: key of the report that counts the dropped or lost frame; None for any other frame.
+    `after_ms`: time from the frame's release until it was presented, dropped or lost; None for a frame under way.
+    `latency_ms`: latency; None if not known.
+    `jobs`: a row for each job of the frame. Its `begin_ms` counts from the frame's release.
 
     Raises BadInputError as `explain_run` does, and for a frame that is not in the journal.
     """
@@ -468,7 +470,7 @@ class Joins:
 
 
 def join_text(row: dict[str, Any]) -> str:
-    """Return a sentence about `row`, one of `Joins.rows`. It names the input first that came last most often."""
+    """Return a sentence about `row`, one of `Joins.rows`. The input that came last in most jobs is named first."""
     inputs = sorted(row["inputs"].items(), key=lambda each: -each[1]["last"])
     jobs = sum(each["last"] for _, each in inputs)
     found = [

@@ -233,8 +233,8 @@ ALWAYS = ("pose", "composite", "present")
 class PlanExplanation:
     """An explained plan.
 
-    `document`: document of `trilane plan --json`. `plan`: the plan. `first_frames`: first frame of each phase. The
-    drawing needs the last two.
+    `document`: document of `trilane plan --json`. `plan`, `first_frames`: the plan and the first frame of each phase,
+    for `draw_plan`.
     """
 
     document: dict[str, Any]
@@ -476,7 +476,7 @@ class CostModel:
     """The costs of frames on a chip, by the model of `trilane predict`.
 
     `networks`: networks of the scene. `profile`: name of the chip's hardware profile. `performance_profile`:
-    performance profile of its units. `of`: cached function with the parameters of `_of`, the cost of a frame.
+    performance profile of its units. `of`: the function `_of`, which returns the cost of a frame, with a cache.
     """
 
     def __init__(
