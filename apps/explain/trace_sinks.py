@@ -170,7 +170,12 @@ class PacketSink:
         return self._tracks
 
     def _named(self, track: int, at_ns: int, kind: int, name: str, notes: Notes) -> Any:
-        """Return a packet with an event of the type `kind`. Recurring names and the names of notes are interned."""
+        """Return a packet with the event `name` on the track number `track`.
+
+        Recurring names and names of notes are interned.
+
+        `kind`: as in `_packet`.
+        """
         packet = _packet(track, at_ns, kind)
         event = packet.track_event
         if name in self._recurring:

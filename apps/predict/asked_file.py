@@ -97,9 +97,14 @@ class _Chips:
     """The chip of a prediction, with its units in the precision that each network needs.
 
     `options`, `say`: as in `predict_asked_file`.
-    `name`: name of the requested chip. If no chip was requested, it is HOST with times of a run, and the default chip
-    without. `used`: profile of the chip; None until it is loaded. It is loaded if it was requested, or when a network
-    needs it. `assumed`: texts "STAGE PRECISION", in order, for networks whose file states no precision; the values are
+
+    `name`: name of the requested chip. If no chip is requested, the name is HOST if the options name a measured run,
+    and the default chip if they name no run.
+
+    `used`: profile of the chip; None until the profile is loaded. It is loaded if it is requested, or when a network
+    needs it.
+
+    `assumed`: texts "STAGE PRECISION" as keys, in order, for networks whose file states no precision; the values are
     None.
     """
 
@@ -114,7 +119,8 @@ class _Chips:
     def chip_for(self, name: str, stage: OnnxStage, graph: GraphFile, unit: UnitName) -> Profile:
         """Return the chip whose unit `unit` has the precision and runtime of the network `graph` of `stage`.
 
-        If the chip is this machine, calls of the network are measured first. `name`: name of the stage.
+        If the chip is this machine, `unit` is its unit for networks, and no precision is requested, calls of the
+        network are measured first. `name`: name of the stage.
         """
         options, asked = self._options, stage.precision or self._options.numbers
         key = graph.path, tuple(sorted(stage.shapes.items())), unit, asked, stage.runtime

@@ -29,7 +29,8 @@ def predict_networks(
 ) -> list[dict[str, Any]]:
     """Return a prediction for each network of `options` by itself, on each unit of `options`.
 
-    With the profile `host`, calls of each network on this machine's unit for networks are measured first.
+    With the profile `host` and no requested precision, calls of each network on this machine's unit for networks are
+    measured first.
 
     Raises BadInputError for a network that cannot be read, and for an unknown unit or input.
     """
@@ -61,7 +62,8 @@ def application_of(
 ) -> tuple[Profile, Plan]:
     """Return (chip in the network's precision, avatar application with the network that `options` select).
 
-    With the profile `host`, this machine is measured with this network.
+    With the profile `host`, this machine is measured with this network, except for a published network, a requested
+    precision or another unit than the one for networks.
 
     Raises BadInputError for a network or avatar that cannot be read, and for options that no application has.
     """
@@ -102,9 +104,10 @@ def _network_of(chip: Profile, options: PredictOptions, say: Callable[[str], Non
 
 
 def _is_measured(chip: Profile, options: PredictOptions, unit: UnitName) -> bool:
-    """Return whether the network on `unit` is measured.
+    """Return whether the network is to be measured on this machine.
 
-    It is if the chip is this machine, and a run would use the network with the same unit and precision.
+    It is measured if the chip is this machine, `unit` is the unit for networks, and `options` request no precision. A
+    run then uses the network in the same way.
     """
     return chip.name == HOST and unit == INFER[1] and options.precision is None
 
