@@ -2,9 +2,9 @@
 
 Rule: causes are counted in two ways, and each way states its remainder. Alone: each cause is switched on in the
 reference, with only the causes that it needs; the errors may not sum to the whole error. In order: causes are switched
-on one after the other, so the picture changes in steps from the reference to the run. Three figures of the steps sum to
-the whole error, up to float64's rounding: differences of MAE, differences of mean squares, and products of a step with
-the whole difference. Figures cover the region with the avatars.
+on one after the other, so the picture changes in steps from the reference to the run's picture. Three figures of the
+steps sum to the whole error, up to float64's rounding: the changes of the MAE, the changes of the mean square, and the
+products of a step's difference with the whole difference. All figures cover the region with the avatars.
 """
 
 from __future__ import annotations
@@ -62,15 +62,29 @@ def error_by_cause(
 ) -> dict[str, Any]:
     """Return the error of `frames` frames, evenly spread over the scene in `checked`, split by cause.
 
-    `out`: folder for heat maps; None for no maps. `shown`: iterates over the frames' numbers, such as a progress bar.
-    `lpips`: computes LPIPS; None leaves it out.
-    Keys: `causes`, with a row for each cause; `whole`, the frame with all causes against the reference; `sums` of the
-    rows; `remainder`, the run's own frame against the frame with all causes; `truth`, both against the ground truth;
-    `frames`; `empty_frames` (nobody in view); `network`; `sources`; `config`.
-    A row has `cause`, `what`, `needs`; `alone` and `step`, the picture with the cause against the picture without it,
-    in the reference and in order; `so_far`, the step's picture against the reference; `adds`, the step's `mae`,
-    `square` and `product`; `moved`, for causes of the body.
-    Raises BadInputError, MissingPartError.
+    `out`: folder for heat maps; None for no maps. `shown`: function that iterates over the frames' numbers, such as a
+    progress bar. `lpips`: function that computes LPIPS; None leaves LPIPS out.
+
+    Keys of the result:
+    `causes`: a row for each cause, in the order of `Cause`.
+    `whole`: error of the frame with all causes against the reference.
+    `sums`: sums over the causes, `in_order` and `alone`, and `whole` minus these sums, `left_in_order` and
+    `left_alone`. `remainder`: error of the run's own frame against the frame with all causes.
+    `truth`: errors of the reference and of the run against the ground truth; None if the scene has no ground truth.
+    `frames`: numbers of the frames. `empty_frames`: frames with nobody in view, which do not count.
+    `network`: names of the networks that paint the reference. `sources`: source of each key.
+    `config`: name, plan, size and runtime of the scene.
+
+    Keys of a row:
+    `cause`, `what`: name and description of the cause. `needs`: names of the causes that the cause needs.
+    `alone`: error of the picture with the cause and its needs against the picture with the needs.
+    `step`: error of the picture with all causes up to this cause against the picture without this cause.
+    `so_far`: error of the picture with all causes up to this cause against the reference.
+    `adds`: what the step adds to the whole error, as `mae`, `square` and `product`.
+    `moved`: how far the cause moves vertices; None for a cause that moves none.
+
+    Raises BadInputError for a number of frames out of range, nobody in view, or a folder that cannot be written. Raises
+    MissingPartError if the libraries of the metrics or OpenGL are missing.
     """
     numbers = spread(checked.config.scene.frames, frames)
     require_metrics()
@@ -99,7 +113,10 @@ def error_by_cause(
 
 
 def _truth(path: ReferencePath) -> Any:
-    """Return the pictures of the scene's clothed bodies, which are the ground truth; None if these are unknown."""
+    """Return the object that makes the pictures of the ground truth; None if the scene has no ground truth.
+
+    The ground truth is the clothed bodies of the scene. They are known for bundled avatars only.
+    """
     from trilane.bench.lib.full_picture import true_pictures
 
     return true_pictures(path.cast, path.gl)
@@ -107,7 +124,12 @@ def _truth(path: ReferencePath) -> Any:
 
 @dataclass
 class _Pooled:
-    """Figures of all frames together: MAE and mean square over all pixels, other figures as means over the frames."""
+    """The errors of the added frames. MAE and mean square are over all pixels, other figures are means over the frames.
+
+    `lpips`: function that computes LPIPS; None leaves LPIPS out.
+    `values`: number of the compared values. `absolute`, `square`: sums of their absolute and squared differences.
+    `each`: figures of each frame.
+    """
 
     lpips: Perceived | None = None
     values: int = 0
@@ -139,7 +161,11 @@ class _Pooled:
 
 @dataclass
 class _Moved:
-    """How far a cause moves the vertices of visible avatars."""
+    """How far a cause moves the vertices of visible avatars.
+
+    `largest_mm`: largest distance in the world. `largest_px`: largest distance in the picture.
+    `sum_mm`, `count`: sum of the distances in the world, and number of the vertices, over all frames.
+    """
 
     largest_mm: float = 0.0
     largest_px: float = 0.0
@@ -161,7 +187,11 @@ class _Moved:
 
 
 def _pixels(vertices: F64, clip: F64, output: Shape) -> tuple[F64, Any]:
-    """Return the places of `vertices` (V,3) in the picture, (V,2) pixels from its middle, and which are inside (V,)."""
+    """Return (places, on screen): the places (V,2) of `vertices` in the picture, and which of them are in it (V,) bool.
+
+    A place is (x, y) in pixels from the middle of the picture, x to the right and y up. `vertices` (V,3): metres, in
+    the world. `clip`: projection @ view (4,4). `output`: (height, width) of the picture.
+    """
     x, y, _, w = (np.c_[vertices, np.ones(len(vertices))] @ clip.T).T
     in_front = w > 0
     place = np.stack([x, y], axis=1) / np.where(in_front, w, 1.0)[:, None]
@@ -169,7 +199,11 @@ def _pixels(vertices: F64, clip: F64, output: Shape) -> tuple[F64, Any]:
 
 
 class _Split:
-    """The figures of the added frames, by cause. `out`: folder for heat maps, or None."""
+    """The figures of the added frames, by cause.
+
+    `output`: (height, width) of the picture. `out`: folder for heat maps; None for no maps. `lpips`: function that
+    computes LPIPS; None leaves LPIPS out.
+    """
 
     def __init__(self, output: Shape, out: Path | None, lpips: Perceived | None = None) -> None:
         self._output, self._out = output, out
@@ -180,7 +214,7 @@ class _Split:
         self._truth = {"reference": _Pooled(lpips), "run": _Pooled(lpips)}
 
     def add(self, moment: ReferenceMoment) -> None:
-        """Count a frame with a visible avatar."""
+        """Count `moment`, a frame with a visible avatar. If there is a folder for heat maps, write its heat maps."""
         box = region(moment.boxes, self._output)
         reference = _cut(moment.frame(NOTHING), box)
         end = _cut(moment.frame(frozenset(Cause)), box)
@@ -204,7 +238,11 @@ class _Split:
         self._show(moment.number, WHOLE, own, reference)
 
     def add_truth(self, moment: ReferenceMoment, true: Sequence[RasterLayer]) -> None:
-        """Count a frame against its ground truth. `true`: layers of the truth, to be laid over the background."""
+        """Count `moment` against its ground truth: once the reference, once the run's picture.
+
+        If there is a folder for heat maps, write both heat maps. `true`: layers of the clothed bodies, which lie over
+        the run's background in the ground truth.
+        """
         box = region(moment.boxes, self._output)
         picture, cover = laid_over(moment.background, true)
         wanted = _cut(ReferenceFrame(moment.number, picture, cover >= HALF, moment.boxes), box)
@@ -214,7 +252,7 @@ class _Split:
             self._show(moment.number, f"{name} against truth", shown, wanted)
 
     def document(self) -> dict[str, Any]:
-        """Return the figures, by keys of `error_by_cause`."""
+        """Return the figures: the keys `causes`, `whole`, `sums`, `remainder` and `truth` of `error_by_cause`."""
         rows = [self._row(cause, before) for before, cause in zip([None, *Cause], Cause, strict=False)]
         last = list(Cause)[-1]
         whole = self._so_far[last]
@@ -259,7 +297,7 @@ class _Split:
 
 
 def _run(moment: ReferenceMoment) -> ReferenceFrame:
-    """Return the run's own frame, with the mask of the frame with all causes."""
+    """Return the run's own frame. Its mask is that of the frame with all causes."""
     return ReferenceFrame(moment.number, moment.own, moment.frame(frozenset(Cause)).mask, moment.boxes)
 
 
@@ -278,17 +316,22 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 def write_heat_map(file: Path, title: str, picture: F64, reference: F64) -> None:
-    """Write the `heat_map` of two pictures as the PNG `file`. Raises BadInputError."""
+    """Write the `heat_map` of a picture and its reference as the PNG `file`.
+
+    Parameters: see `heat_map`. Raises BadInputError if `file` cannot be written.
+    """
     content = io.BytesIO()
     Image.fromarray(heat_map(title, picture, reference)).save(content, "PNG")
     write_bytes(file, content.getvalue())
 
 
 def heat_map(title: str, picture: F64, reference: F64) -> U8:
-    """Return a sheet (h,w,3) with the picture, the reference, a heat map of their difference, and its colour bar.
+    """Return a sheet (H,W,3) uint8 with the picture, the reference, a heat map of their difference, and its colour bar.
 
-    The map shows the mean absolute difference of the channels, times a power of two, which is written on the sheet.
-    Values beyond the bar have the bar's last colour. `picture`, `reference`: (h,w,3) sRGB in 0..1.
+    The map shows the mean absolute difference of the three channels, multiplied by a power of two. The sheet states
+    this factor. A product above 1 gets the bar's last colour.
+
+    `title`: first line of the sheet. `picture`, `reference`: (h,w,3) sRGB in 0..1.
     """
     difference = np.abs(picture - reference).mean(axis=2)
     factor = shown_factor(difference)
@@ -313,7 +356,7 @@ def heat_map(title: str, picture: F64, reference: F64) -> U8:
 def shown_factor(difference: F64) -> int:
     """Return the largest power of two, 1 to `LARGEST_FACTOR`, that scales nearly all of `difference` to at most 1.
 
-    `difference` (h,w): values in 0..1. If all are 0, return 1.
+    `difference` (h,w): values in 0..1. If nearly all values are 0, return 1. "Nearly all" is the share `ON_THE_BAR`.
     """
     most = float(np.quantile(difference, ON_THE_BAR))
     if most == 0.0:
@@ -322,16 +365,20 @@ def shown_factor(difference: F64) -> int:
 
 
 def coloured(values: F64) -> U8:
-    """Return the colours (..., 3) uint8 of `values` (...) in 0..1; larger values have the last colour."""
+    """Return the colours (..., 3) uint8 of `values` (...).
+
+    Values above 1 have the colour of 1, values below 0 that of 0.
+    """
     place = np.clip(values, 0, 1) * (len(COLOURS) - 1)
     channels = [np.interp(place, np.arange(len(COLOURS)), COLOURS[:, channel]) for channel in range(3)]
     return np.rint(np.stack(channels, axis=-1)).astype(np.uint8)
 
 
 def _draw_bar(sheet: Image.Image, draw: Any, place: tuple[int, int, int], most: float, font: Any) -> None:
-    """Draw the colour bar at `place` (left, top, height), with the values at its ends and its middle.
+    """Draw the colour bar on `sheet`, with the values at its two ends and its middle.
 
-    `most`: value at its upper end, in steps of 1/255.
+    `draw`: Pillow's drawing object of `sheet`. `place`: (left, top, height) of the bar, pixels. `most`: value at the
+    bar's upper end, in steps of 1/255. `font`: font of the values.
     """
     left, top, height = place
     bar = coloured(np.linspace(1, 0, height))[:, None].repeat(BAR_PX, axis=1)

@@ -30,7 +30,12 @@ LEAST_JOBS = 6
 
 @dataclass(frozen=True)
 class SizeRow:
-    """The results of one size on one runtime. `infer_ms`, `frame_ms`: times of each timed frame. `errors`: by frame."""
+    """The results of one tensor size on one runtime.
+
+    `size`: size as given by the user. `runtime`: name of the runtime. `pictures`: object that makes the frames.
+    `threads`: number of the runtime's threads. `infer_ms`: time of the infer stages for each timed frame. `frame_ms`:
+    time of all stages except present, for each timed frame. `errors`: errors of each frame's picture.
+    """
 
     size: str
     runtime: str
@@ -41,13 +46,13 @@ class SizeRow:
     errors: list[ErrorFigures] = field(default_factory=list)
 
     def time(self, number: int) -> None:
-        """Make frame `number`, and record its times."""
+        """Make frame `number`, and append its times to `infer_ms` and `frame_ms`."""
         _, times = self.pictures.frame(number)
         self.infer_ms.append(sum(ms for stage, ms in times.items() if stage.startswith("infer")))
         self.frame_ms.append(sum(times.values()))
 
     def as_json(self) -> dict[str, Any]:
-        """Return the results as a row of `measure`."""
+        """Return the results as one of the `rows` of `measure`."""
         low, high = median_interval(self.infer_ms) if len(self.infer_ms) >= LEAST_JOBS else (None, None)
         ssim = [error.ssim for error in self.errors if error.ssim is not None]
         return {
@@ -72,17 +77,20 @@ def measure(
     frames: int = 8,
     rounds: int = 3,
 ) -> dict[str, Any]:
-    """Image error and time of `frames` frames, evenly spread over the scene, by size of tensor and runtime.
+    """Return image error and time of `frames` frames, evenly spread over the scene, for each tensor size and runtime.
 
     Each frame is made once for its error, then `rounds` times to measure times.
 
-    Keys: `rows`: `size`, `runtime`, `threads`, `infer_ms` (median of timed jobs) with its 95 % interval `infer_low_ms`,
-    `infer_high_ms` (null for fewer than 6 jobs), `frame_ms` (median time of all stages except present). Errors cover
-    the part of the picture with avatars: means over the frames `psnr_db`, `mae` (steps of 1/255), `ssim`, `flip`; the
-    worst frame `worst_psnr_db`; the 1st percentile `p1_psnr_db`. Other keys: `against`: name of the reference;
-    `frames`; `empty_frames`: frames with nobody in view, which do not count; `sources`; `config`.
+    Keys of a row in `rows`: `size`, `runtime`, `threads`. `infer_ms`: median time of the infer stage, with its 95 %
+    interval `infer_low_ms`, `infer_high_ms` (null for fewer than 6 jobs). `frame_ms`: median time of all stages except
+    present. Errors cover the part of the picture with avatars. Means over the frames: `psnr_db`, `mae` (steps of
+    1/255), `ssim`, `flip`. `worst_psnr_db`: PSNR of the worst frame. `p1_psnr_db`: 1st percentile of the PSNR.
 
-    Raises BadInputError, MissingPartError.
+    Other keys: `against`: name of the reference. `frames`: numbers of the frames. `empty_frames`: frames with nobody in
+    view, which do not count. `sources`: source of the rows. `config`: scene, plan, filter of the texture, rounds.
+
+    Raises BadInputError for an option out of range, an unknown name, a value given twice, or nobody in view. Raises
+    MissingPartError if the libraries of the metrics, a runtime or OpenGL are missing.
     """
     require_metrics()
     refuse_twice("--size", size)
@@ -120,7 +128,10 @@ def measure(
 
 
 def refuse_twice(option: str, values: Sequence[str]) -> None:
-    """Raise BadInputError if there are no `values`, or if a value occurs twice."""
+    """Raise BadInputError if `values` is empty, or if a value occurs twice.
+
+    `option`: name of the option for the message.
+    """
     if not values or len(set(values)) < len(values):
         raise BadInputError(option, ", ".join(values) or "none", "one or more, each once")
 

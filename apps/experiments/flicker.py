@@ -1,8 +1,8 @@
 """Flicker: how much does the error change between successive frames?
 
-Rule: flicker of a pair of frames is the mean change of the error, |(P_t - G_t) - (P_t-1 - G_t-1)|, with P the picture
-and G its reference. Therefore neither the motion of the scene nor an error that stays in place is flicker. An error
-that moves with a surface counts, because surfaces are not followed.
+Rule: the flicker of a pair of frames is the mean change of the error, |(P_t - G_t) - (P_t-1 - G_t-1)|. P is the
+picture, and G is its reference. Therefore neither the motion of the scene nor an error that stays in place is flicker.
+An error that moves with a surface counts as flicker, because surfaces are not followed.
 """
 
 from __future__ import annotations
@@ -31,15 +31,19 @@ STEPS = 255
 
 
 def flicker(before: F64, now: F64) -> float:
-    """Return the mean change of the error of two successive frames, in steps of 1/255.
+    """Return the mean change of the error from one frame to the next, in steps of 1/255.
 
-    `before`, `now`: errors of the frames, picture minus its reference; equal shapes, pictures in 0..1.
+    `before`, `now`: errors (h,w,3) of two successive frames: picture minus reference, both in 0..1.
     """
     return float(np.abs(now - before).mean() * STEPS)
 
 
 class FlickerRow:
-    """The results of one variant. `pictures`: makes its pictures. `changes`: flicker of each pair of frames."""
+    """The results of one variant: a runtime, a calibration and a filter of the neural texture.
+
+    `pictures`: object that makes the variant's pictures. `changes`: flicker of each pair of successive frames, in
+    order.
+    """
 
     def __init__(self, runtime: str, calibration: str, texture_filter: str, pictures: ScenePictures) -> None:
         self.pictures = pictures
@@ -51,7 +55,8 @@ class FlickerRow:
     def add(self, error: F64, part: tuple[slice, slice]) -> None:
         """Count the next frame.
 
-        `error` (h,w,3): picture minus reference. `part`: rows and columns with the avatars of this and the last frame.
+        `error` (h,w,3): picture minus reference. `part`: rows and columns that hold the avatars of this and the last
+        frame.
         """
         if self._before is not None:
             self.changes.append(flicker(self._before[part], error[part]))
@@ -59,7 +64,7 @@ class FlickerRow:
         self._before = error
 
     def as_json(self) -> dict[str, Any]:
-        """Return the variant's row of `measure`."""
+        """Return the variant's results as one of the `rows` of `measure`. Call it after two or more frames."""
         return {
             **self._variant,
             "flicker": fmean(self.changes),
@@ -77,14 +82,20 @@ def measure(
     calibration: tuple[str, ...] = (AS_IT_IS,),
     texture_filter: tuple[str, ...] = ("linear",),
 ) -> dict[str, Any]:
-    """The flicker of the first `frames` frames of a scene, by runtime, calibration and filter of the neural texture.
+    """Return the flicker of the first `frames` frames of a scene, by runtime, calibration and texture filter.
 
-    Figures cover the part of the picture with avatars, in steps of 1/255. Keys: `rows`: `runtime`, `calibration`,
-    `texture_filter`, `flicker` (mean over the pairs of frames), `worst` (largest of a pair), `worst_frame` (the later
-    frame of that pair), `mae` (mean absolute error of the frames); `scene_change`: mean change of the reference between
-    frames; `against`: name of the reference; `frames`; `sources`; `config`.
+    Figures cover the part of the picture with avatars, in steps of 1/255.
 
-    Raises BadInputError, MissingPartError.
+    Keys of a row in `rows`: `runtime`, `calibration`, `texture_filter`. `flicker`: mean over the pairs of frames.
+    `worst`: largest flicker of a pair. `worst_frame`: later frame of that pair. `mae`: mean absolute error of the
+    frames.
+
+    Other keys: `scene_change`: mean change of the reference between successive frames. `against`: name of the
+    reference. `frames`: numbers of the frames. `sources`: source of the figures. `config`: scene, plan, size, frames a
+    second.
+
+    Raises BadInputError for an option out of range, an unknown name, a value given twice, or a frame with nobody in
+    view. Raises MissingPartError if a runtime or OpenGL is missing.
     """
     refuse_twice("--runtime", runtime)
     refuse_twice("--texture-filter", texture_filter)
@@ -131,7 +142,11 @@ def _filtered(checked: Checked, name: str) -> Checked:
 
 
 def _follow(cast: Cast, rows: Sequence[FlickerRow], wanted: Callable[[int, U8], U8], numbers: Iterable[int]) -> float:
-    """Count the frames `numbers` for each of `rows`, and return the mean change of the reference, in steps of 1/255."""
+    """Count the frames `numbers` for each of `rows`, and return the mean change of the reference, in steps of 1/255.
+
+    `cast`: avatars of the scene. `wanted`: function that makes the reference from a frame's number and background.
+    Raises BadInputError for a frame with nobody in view.
+    """
     last: F64 | None = None
     boxes_before, changes = cast.boxes(0), []
     for number in numbers:

@@ -1,10 +1,10 @@
 """Errors of integer networks against their float networks, for hard networks and inputs, on every runtime.
 
-Rule: a bound follows from network, input and quantisation steps, never from a runtime's picture. It is the smaller of
-two bounds: with the steps of the integer network (`noise_model`), and with the steps of an ideal quantiser
+Rule: a bound follows from network, input and quantisation steps, never from a runtime's picture. The bound is the
+smaller of two: one with the steps of the integer network (`noise_model`), one with the steps of an ideal quantiser
 (`ideal_noise_model`). Therefore coarse steps do not widen the bound on their own error. A row also fails if a wrong
-picture would stay within its bound. Networks are seeded, untrained, and made so that a wrong picture shows. No input is
-constant, because a constant picture could then be right.
+picture would stay within its bound. Networks have random weights of a fixed seed, chosen so that a wrong picture has a
+large error. No input is constant, because a constant picture could then be right.
 """
 
 from __future__ import annotations
@@ -69,7 +69,11 @@ INPUTS: dict[str, Callable[[np.random.Generator], F32]] = {
 
 @dataclass(frozen=True)
 class NetworkPair:
-    """A float network, its integer network, calibrated on usual frames, and the noise model of the integer network."""
+    """A float network, its integer network, and the noise model of the integer network.
+
+    `network`: float network. `quantised`: integer network, calibrated on usual frames. `noise`: model of the integer
+    network's rounding errors.
+    """
 
     network: onnx.ModelProto
     quantised: Quantised
@@ -78,11 +82,12 @@ class NetworkPair:
 
 @dataclass(frozen=True)
 class Case:
-    """A network with an input, the expected picture, and the bound on a picture's error.
+    """A pair of networks with an input, the expected picture, and the bound on a picture's error.
 
-    `tensor`: input bytes (1, H, W, C). `wanted`: the float network's picture (1, H, W, 4), in steps of 1/255.
-    `predicted`, `bound`: expected error and bound, by the model with the smaller bound, which `source` names.
-    `own_bound`: bound with the integer network's steps. `wrong`: least error of each kind of wrong picture.
+    `pair`: the networks. `tensor`: input (1,H,W,C) uint8. `wanted`: picture of the float network (1,H,W,4), in steps of
+    1/255. `predicted`, `bound`: expected error and bound by one of two noise models, the one with the smaller bound.
+    `source`: name of this noise model. `own_bound`: bound by the model with the integer network's steps.
+    `wrong`: result of `wrong_answers`. All errors and bounds are means, in steps of 1/255.
     """
 
     pair: NetworkPair
@@ -96,11 +101,17 @@ class Case:
 
     @property
     def tells(self) -> bool:
-        """Whether the error of every wrong picture is above the bound."""
+        """Whether the bound tells wrong pictures from right ones.
+
+        This holds if the error of every kind of wrong picture is above the bound.
+        """
         return self.bound < min(self.wrong.values())
 
     def verdict(self, error: float) -> str:
-        """Return the verdict on a picture's `error`. NaN counts as above the bound."""
+        """Return the verdict on a picture's `error`: HOLDS, EXCEEDED or UNTOLD. NaN counts as above the bound.
+
+        UNTOLD means that a wrong picture could also stay within the bound (`tells` is false).
+        """
         if not self.tells:
             return UNTOLD
         return HOLDS if error <= self.bound else EXCEEDED
@@ -114,7 +125,7 @@ def make_pair(name: str) -> NetworkPair:
 
 
 def make_case(pair: NetworkPair, case: str) -> Case:
-    """Return the case of the networks `pair` with the input `case` of `INPUTS`."""
+    """Return the case of the networks `pair` with the input named `case`, a key of `INPUTS`."""
     encoding = pair.quantised.network.input
     steps = np.round(case_input(case) / encoding.scale) + encoding.zero_point
     tensor = np.ascontiguousarray(np.clip(steps, 0, 255).astype(np.uint8)[None])
@@ -126,7 +137,10 @@ def make_case(pair: NetworkPair, case: str) -> Case:
 
 
 def error_of(case: Case, runtime: str) -> float:
-    """Return the mean error of `runtime`'s picture in steps of 1/255; NaN if the float network's picture has NaN."""
+    """Return the mean absolute error of `runtime`'s picture, in steps of 1/255.
+
+    The error is NaN if the float network's picture contains NaN.
+    """
     image = np.zeros(case.wanted.shape, np.uint8)
     session = load_runtime(runtime).load(case.pair.quantised.network, RuntimeOptions())
     session.bind([case.tensor], [image]).run()
@@ -134,11 +148,12 @@ def error_of(case: Case, runtime: str) -> float:
 
 
 def wrong_answers(wanted: F32) -> dict[str, float]:
-    """Return the least error of each kind of wrong picture against `wanted` (H, W, 4), all in steps of 1/255.
+    """Return the least error of each kind of wrong picture against `wanted` (H,W,4), all in steps of 1/255.
 
-    `constant_error`: the best picture of one colour, which is the median of each channel. `shifted_error`: `wanted`
-    moved by `SHIFT` pixels up, down, left or right, wrapped or with its edge repeated. `swapped_error`: `wanted` with
-    red and blue exchanged.
+    `constant_error`: error of the best picture of one colour, which is the median of each channel.
+    `shifted_error`: least error of `wanted` moved by `SHIFT` pixels up, down, left or right, wrapped or with its edge
+    repeated.
+    `swapped_error`: error of `wanted` with red and blue exchanged.
     """
     shifted = (
         np.abs(moved - wanted).mean() for axis in (0, 1) for by in (SHIFT, -SHIFT) for moved in _moved(wanted, by, axis)
@@ -158,10 +173,13 @@ def _moved(picture: F32, by: int, axis: int) -> Iterator[F32]:
 
 
 def hard_cases(runtimes: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yield rows of every network, input and runtime. Raises MissingPartError.
+    """Yield a row for each network of `NETWORKS`, input of `INPUTS` and runtime of `runtimes`.
 
-    Keys: `name`, `error`, `bound`, `unit`, `source` (of the bound), `predicted_error`, the keys of `wrong_answers`,
-    `verdict`, `passed`. An `error` that is not a finite number is None, and counts as above every bound.
+    Keys: `name`; `error`, `bound`: mean error and its bound; `unit`: unit of both; `source`: source of the bound;
+    `predicted_error`: expected error; the keys of `wrong_answers`; `verdict`: text; `passed`: whether the verdict is
+    HOLDS. An `error` that is not a finite number is None, and counts as above every bound.
+
+    Raises MissingPartError without PyTorch or a runtime.
     """
     for network in NETWORKS:
         pair = make_pair(network)
@@ -184,9 +202,9 @@ def hard_cases(runtimes: Sequence[str]) -> Iterator[dict[str, Any]]:
 
 
 def _smooth(rng: np.random.Generator) -> F32:
-    """Return a texture (SIDE, SIDE, CHANNELS) with normally distributed values at the corners of cells.
+    """Return a texture (SIDE,SIDE,CHANNELS) with random values at the corners of cells, and linear values between them.
 
-    It is linear between the corners.
+    The random values are normally distributed. `rng`: random numbers.
     """
     cells = SIDE // SMOOTH_CELL
     corners = rng.normal(size=(cells + 1, cells + 1, CHANNELS))
@@ -199,16 +217,20 @@ def _smooth(rng: np.random.Generator) -> F32:
 
 
 def _flat(rng: np.random.Generator) -> F32:
-    """Return a texture (SIDE, SIDE, CHANNELS) with one normally distributed value in each cell and channel."""
+    """Return a texture (SIDE,SIDE,CHANNELS) with one normally distributed value in each cell and channel.
+
+    `rng`: random numbers.
+    """
     cells = SIDE // FLAT_CELL
     values = rng.normal(size=(cells, cells, CHANNELS)).astype(np.float32)
     return values.repeat(FLAT_CELL, axis=0).repeat(FLAT_CELL, axis=1)
 
 
 def _in_figure(rng: np.random.Generator, texture: Callable[[np.random.Generator], F32], size: float = 1.0) -> F32:
-    """Return a frame (SIDE, SIDE, CHANNELS) with `texture` inside a randomly placed ellipse, 0 outside.
+    """Return a frame (SIDE,SIDE,CHANNELS) with a texture inside a randomly placed ellipse, and 0 outside the ellipse.
 
-    `size`: size of the ellipse, as a share of the usual size.
+    `rng`: random numbers. `texture`: function that draws the texture from `rng`. `size`: size of the ellipse, as a
+    share of the usual size.
     """
     row, column = np.mgrid[:SIDE, :SIDE] / SIDE - 0.5
     down, right = rng.uniform(-OFF_CENTRE, OFF_CENTRE, 2)
@@ -218,7 +240,7 @@ def _in_figure(rng: np.random.Generator, texture: Callable[[np.random.Generator]
 
 
 def case_input(case: str) -> F32:
-    """Return the input `case` of `INPUTS`, (SIDE, SIDE, CHANNELS). It is not among the calibration frames."""
+    """Return the input named `case`, a key of `INPUTS`, (SIDE,SIDE,CHANNELS). It is no calibration frame."""
     return INPUTS[case](np.random.default_rng(CASE_SEED))
 
 
@@ -232,7 +254,7 @@ def float_network(name: str) -> onnx.ModelProto:
     """Return the float network `name` of `NETWORKS`. Raises MissingPartError without PyTorch.
 
     As in trained networks, kernels are partly smooth, and each level weakens the features from deeper levels. Therefore
-    rounding errors do not drown the picture. The heads give every colour its own mean and contrast.
+    rounding errors do not hide the picture. The output layers give every colour its own mean and contrast.
     """
     try:
         import torch
@@ -258,9 +280,10 @@ def float_network(name: str) -> onnx.ModelProto:
 
 
 def _draw(module: Any, generator: Any) -> None:
-    """Draw random weights for a convolution, or biases for a norm.
+    """Draw random weights for `module` if it is a convolution, or random biases if it is a norm.
 
-    For each output channel, the weights sum to about 0 over the input channels.
+    For each output channel of a convolution, the weights sum to about 0 over the input channels. `generator`: PyTorch's
+    random numbers.
     """
     import torch
 
@@ -279,7 +302,11 @@ def _draw(module: Any, generator: Any) -> None:
 
 
 def _give_contrast(head: Any, features: Any) -> None:
-    """Scale the last layer of `head` so that its logits for `features` have deviation `CONTRAST` and means -1 to 1."""
+    """Scale the last layer of `head` so that its logits for `features` have a given spread and given means.
+
+    The standard deviation of each channel becomes `CONTRAST`, and the means of the channels run evenly from -1 to 1.
+    `head`: output layers for colour or mask. `features`: features (N,C,H,W) of the calibration frames.
+    """
     import torch
 
     logits = head(features)

@@ -1,13 +1,15 @@
-"""Numbers that are hard to compute, each with an error and a bound. Cases of rotations are in `hard_rotations.py`.
+"""Numbers that are hard to compute, each with an error and a bound. `hard_rotations.py` has the cases of rotations.
 
-Rule: the body is the default avatar's, so that the rows are the same everywhere. A reference sums in extended precision
-or float64. A bound counts the roundings of the computation, and never follows from a result.
+Rule: the body is the default avatar's, so the rows are the same everywhere. A reference sums in extended precision or
+float64. A bound counts the roundings of the computation, and never follows from a result.
 
 If a texture has constant channels, every covered pixel of a tensor is a known byte: q = clamp(round(x / scale) + zero
-point, 0, 255), rounded to even. Values are FP16 numbers. For halves the scale is a power of two, so x / scale is exact
-however a driver divides. All other x / scale are at least a tenth of a step from a half. The error of a driver's
-division is smaller (2.5 units in the last place, Vulkan 1.3 and OpenCL 3.0 for float32). A frame of a scene must be the
-same to the byte, whatever was drawn before; its reference comes from stages that draw nothing else.
+point, 0, 255), rounded to even. The values x are FP16 numbers. Some values are halves of a step. Their scale is a power
+of two, so every driver divides x / scale exactly. All other quotients are at least a tenth of a step from a half. This
+is more than the error of a driver's division (2.5 units in the last place, Vulkan 1.3 and OpenCL 3.0 for float32).
+
+A scene's frame must be the same to the byte, no matter which frames were drawn before. Its reference comes from stages
+that have drawn no other frame.
 """
 
 from __future__ import annotations
@@ -80,10 +82,11 @@ Shown = Callable[[float], F64]
 
 
 def hard_numbers() -> Iterator[dict[str, Any]]:
-    """Yield rows with `name`, `error`, `bound`, `unit`, `source` (of the bound), `verdict`, `passed`.
+    """Yield a row for each hard number.
 
-    An `error` that is not a finite number is None, and counts as above every bound.
-    Raises MissingPartError if no OpenGL context can be made.
+    Keys: `name`; `error`, `bound`: error and its bound; `unit`: unit of both; `source`: source of the bound; `verdict`:
+    text; `passed`: whether the bound holds. An `error` that is not a finite number is None, and counts as above every
+    bound. Raises MissingPartError if no OpenGL context can be made.
     """
     for case in _cases():
         error = case.error if math.isfinite(case.error) else None
@@ -91,7 +94,10 @@ def hard_numbers() -> Iterator[dict[str, Any]]:
 
 
 def kept_going(kind: str, cases: Iterable[HardNumber]) -> Iterator[HardNumber]:
-    """Yield `cases` of one kind. If tested code raises an error, a failed row that names the error ends them."""
+    """Yield `cases`. If the tested code raises an error, a failed row that names the error takes the place of the rest.
+
+    `kind`: name of the kind of cases.
+    """
     try:
         yield from cases
     except (BadInputError, ArithmeticError, ValueError) as error:
@@ -125,9 +131,10 @@ def _body_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
 
 
 def _shapes(body: Body) -> Iterator[HardNumber]:
-    """Yield rows about extreme shapes, with random shape directions.
+    """Yield rows about extreme shapes of `body`, with random shape directions.
 
-    A rest vertex is a sum in float64 of S + 1 numbers and an offset, S the number of directions, rounded to float32.
+    A rest vertex is a sum in float64, rounded to float32. The sum has S + 1 numbers and an offset, where S is the
+    number of directions.
     """
     rng = np.random.default_rng(9)
     drawn = rng.normal(0, DRAWN_M, (2, *body.v_template.shape, DRAWN_DIRECTIONS)).astype(np.float32)
@@ -160,12 +167,13 @@ def _skinning(shaped: ShapedBody) -> Iterator[HardNumber]:
 
 
 def _skinned(shaped: ShapedBody, matrices: F64, feature: F64) -> tuple[F64, F64]:
-    """Return the skinned vertices (V, 3) in float64, and the bound on the error of float32 (V, 3), metres.
+    """Return (vertices, bounds): skinned vertices (V,3) in float64, and bounds on the errors of float32 (V,3), metres.
 
-    `matrices` (55, 3, 4): skinning matrices. `feature` (486,): entries of R - I of the joints.
-    Let a vertex have n weights other than 0. The blended matrix M is off by gamma_(n+1) of sum w |matrix| in float32,
-    with one rounding for the float32 matrices. M [p, 1] is off by four roundings more. Pose blend shapes move p by a
-    sum of 486 products, which is off by gamma_488 of the sum of their absolute values.
+    `shaped`: body. `matrices` (55,3,4): skinning matrices. `feature` (486,): entries of R - I of joints 1 to 54.
+
+    Let a vertex have n weights other than 0. In float32, the blended matrix M is off by gamma_(n+1) of sum w |matrix|;
+    this includes one rounding for the float32 matrices. M [p, 1] is off by four roundings more. Pose blend shapes move
+    p by a sum of 486 products, which is off by gamma_488 of the sum of their absolute values.
     """
     body = shaped.body
     rest = shaped.vertices.astype(np.float64)
@@ -185,10 +193,11 @@ def _skinned(shaped: ShapedBody, matrices: F64, feature: F64) -> tuple[F64, F64]
 
 
 def _left_out(shaped: ShapedBody) -> Iterator[HardNumber]:
-    """Yield rows about skinning with only the largest weights: four of the body's, and each count of random weights.
+    """Yield rows about skinning with only the largest weights of each vertex.
 
-    The body's vertices have seven weights at most. With random weights the body is 200 m away, where an error would
-    show if the kept weights did not sum to 1.
+    One row keeps four weights of the body `shaped`, whose vertices have seven weights at most. In the other rows, each
+    vertex has random weights, and each count of `WEIGHT_COUNTS` is kept. There the body is 200 m away. At this
+    distance, an error would show if the kept weights did not sum to 1.
     """
     rng = np.random.default_rng(5)
     poses = [rng.normal(0, 1.0, (JOINTS, 3)) for _ in range(POSES)]
@@ -202,9 +211,12 @@ def _left_out(shaped: ShapedBody) -> Iterator[HardNumber]:
 
 
 def _fewer(shaped: ShapedBody, count: int, poses: Sequence[F64], metres: float, what: str) -> HardNumber:
-    """Return the row about skinning with the `count` largest weights. `metres`: distance of the body from the origin.
+    """Return the row about skinning with the `count` largest weights of each vertex.
 
-    The bound is the proof's, plus gamma_n times the reach of the body for the rounding of each of the weighted sums.
+    The bound is `weight_error_bound`, plus the rounding of the weighted sums: gamma_n times the reach of the body.
+
+    `shaped`: body. `poses`: axis-angle vectors (55,3) of each pose. `metres`: distance of the body from the origin.
+    `what`: description of the weights for the row's name.
     """
     skeleton = Skeleton(shaped.joints, shaped.body.parents)
     few, whole = CpuSkinner(shaped, count, pose_blend=False), CpuSkinner(shaped, pose_blend=False)
@@ -217,7 +229,10 @@ def _fewer(shaped: ShapedBody, count: int, poses: Sequence[F64], metres: float, 
 
 
 def _sums(shaped: ShapedBody) -> Iterator[HardNumber]:
-    """Yield rows about weights that do not sum to 1. At 200 m, a sum of 1 + d would move the body by 200 d metres."""
+    """Yield rows about weights of the body `shaped` that do not sum to 1.
+
+    The body is 200 m away. There a sum of 1 + d would move the body by 200 d metres.
+    """
     skeleton = Skeleton(shaped.joints, shaped.body.parents)
     posed = skeleton.pose(np.zeros((JOINTS, 3)), np.array([200.0, 0.0, 0.0]))
     wanted = CpuSkinner(shaped, pose_blend=False).vertices(posed)
@@ -238,9 +253,9 @@ def _sums(shaped: ShapedBody) -> Iterator[HardNumber]:
 
 
 def _camera_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
-    """Yield rows about rectangles, about crops, and about vertices on the screen.
+    """Yield rows about a body's rectangle on the screen, about crops, and about places of vertices on the screen.
 
-    The rectangle of a body is right if no vertex on the screen lies outside it.
+    The rectangle is right if no vertex on the screen lies outside it. `shaped`: body.
     """
     bounds, skinner = MeshBounds(shaped), CpuSkinner(shaped)
     skeleton = Skeleton(shaped.joints, shaped.body.parents)
@@ -256,7 +271,11 @@ def _camera_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
 
 
 def _drawn(skeleton: Skeleton, fov_deg: float, metres: float) -> Iterator[tuple[Posed, F64]]:
-    """Yield `DRAWN_POSES` random poses, each with projection @ view (4, 4) of a camera at `metres` from a joint."""
+    """Yield (pose, clip) for `DRAWN_POSES` random poses. `clip` is the projection @ view (4,4) of a camera.
+
+    `skeleton`: skeleton to pose. `fov_deg`: field of view of the camera, degrees. `metres`: distance of the camera from
+    one of the joints.
+    """
     rng = np.random.default_rng(round(1e3 * metres + fov_deg))
     for _ in range(DRAWN_POSES):
         posed = skeleton.pose(rng.normal(0, 0.6, (JOINTS, 3)))
@@ -267,9 +286,12 @@ def _drawn(skeleton: Skeleton, fov_deg: float, metres: float) -> Iterator[tuple[
 
 
 def _outside(bounds: MeshBounds, posed: Posed, vertices: F64, clip: F64) -> float:
-    """Return how far visible vertices lie outside the body's rectangle, NDC; inf if there is no rectangle.
+    """Return how far visible vertices lie outside the body's rectangle, in NDC; inf if `bounds` finds no rectangle.
 
-    A vertex is visible if it is on the screen and in front of the near plane.
+    A vertex is visible if it is on the screen and in front of the near plane. Without a visible vertex, return 0.
+
+    `bounds`: object that computes the rectangle. `posed`: posed skeleton. `vertices` (V,3): metres. `clip`: projection
+    @ view (4,4).
     """
     found = bounds.rect(posed, clip)
     x, y, z, w = clip @ np.concatenate([vertices, np.ones((len(vertices), 1))], axis=1).T
@@ -291,7 +313,7 @@ def _behind(bounds: MeshBounds, skeleton: Skeleton) -> Iterator[HardNumber]:
 
 
 def _crops() -> Iterator[HardNumber]:
-    """Yield rows about points in a crop: by the cropped projection, and by the whole projection in extended precision.
+    """Yield rows about points in a crop: the cropped projection in float64 against the whole one in extended precision.
 
     X' = (2 X - (x0 + x1) W) / (x1 - x0) and W are sums of at most 8 products in float64. The absolute values of the
     products sum to at most 2 (|X| + 2 |W|) / (x1 - x0).
@@ -314,8 +336,8 @@ def _on_screen(skinner: CpuSkinner, skeleton: Skeleton) -> Iterator[HardNumber]:
     """Yield rows about places of vertices on the screen: float32, with the shader's roundings, against float64.
 
     Let C = M [x, 1] be clip coordinates, with M and x in float32. Each coordinate is off by gamma_6 of |M| |x| in
-    float32: four products, two roundings of the inputs. If X is off by dX and W by dW, X / W is off by
-    (dX + |X / W| dW) / W and by a rounding of the quotient. X / W is multiplied by half a tensor's side to get pixels.
+    float32: four products, two roundings of the inputs. Let X be off by dX, and W by dW. The quotient X / W is off by
+    (dX + |X / W| dW) / W and by its own rounding. X / W is multiplied by half a tensor's side to get pixels.
     """
     posed = skeleton.pose(random_pose(JOINTS))
     vertices = skinner.vertices(posed)
@@ -338,12 +360,12 @@ def _on_screen(skinner: CpuSkinner, skeleton: Skeleton) -> Iterator[HardNumber]:
 
 
 def time_cases() -> Iterator[HardNumber]:
-    """Yield rows about the built-in walk and camera at each rate, after a day of media time.
+    """Yield rows about the built-in walk and camera at each rate of `RATES`, after 23 to 58 hours of media time.
 
     Frame 5,000,000 must show the same as the same moment in the first period of the motion. The reference reduces the
     frame's time by the period in fractions, which are exact. The tested time t = frame / fps is off by at most U t, and
-    its remainder is exact. A shown value is off by the error of the time, times the largest change of the value in a
-    second, and by a few roundings.
+    its remainder is exact. The error of a shown value has two parts: a few roundings, and the error of the time
+    multiplied by the value's largest change in a second.
     """
     motion, camera = walk_wave_turn(), load_builtin("orbit", CameraSpec())
     assert camera is not None
@@ -362,7 +384,7 @@ def time_cases() -> Iterator[HardNumber]:
 
 
 def _moment(fps: float, times_s: F64, wrap: Wrap) -> float:
-    """Return the time of frame `FRAME` at `fps`, reduced to the length of the motion, seconds.
+    """Return the time of frame `FRAME` at `fps` frames a second, reduced to the length of the motion, in seconds.
 
     `times_s`: times of the motion's samples. `wrap`: how the motion goes on after its end.
     """
@@ -372,7 +394,10 @@ def _moment(fps: float, times_s: F64, wrap: Wrap) -> float:
 
 
 def _fastest(at: Shown, times_s: F64) -> float:
-    """Return the largest change per second of any value of `at`, between neighbouring samples."""
+    """Return the largest change per second of any value of `at`, between neighbouring samples.
+
+    `at`: function of the time in seconds that returns an array. `times_s`: times of the samples.
+    """
     values = np.array([at(float(t)).ravel() for t in times_s])
     return float(np.abs(np.diff(values, axis=0) / np.diff(times_s)[:, None]).max())
 
@@ -408,7 +433,10 @@ RUNTIME = "ort"
 
 
 def tensor_cases(shaped: ShapedBody, ctx: Any) -> Iterator[HardNumber]:
-    """Yield rows about packing and texels, drawn in the OpenGL context `ctx`."""
+    """Yield rows about packing a tensor to bytes and about texels, drawn in the OpenGL context `ctx`.
+
+    `shaped`: body.
+    """
     mesh, view, placement = _scene(shaped, ctx)
     rows = {name: (s, z, [step * s for step in steps]) for name, (s, z, steps) in STEPS.items()} | NUMBERS
     for name, (scale, zero_point, numbers) in rows.items():
@@ -424,7 +452,10 @@ def tensor_cases(shaped: ShapedBody, ctx: Any) -> Iterator[HardNumber]:
 
 
 def _scene(shaped: ShapedBody, ctx: Any) -> tuple[SkinnedMesh, F64, Placement]:
-    """Return a mesh of the body at rest, the view matrix (4, 4) of a camera before it, and its place in the tensor."""
+    """Return (mesh, view, placement): the body's mesh at rest, a camera before it, and its place in the tensor.
+
+    `view` is the view matrix (4,4) of the camera. `shaped`: body. `ctx`: OpenGL context.
+    """
     body = shaped.body
     joint = np.zeros((len(shaped.vertices), 4), np.int64)
     weight = np.tile([1.0, 0.0, 0.0, 0.0], (len(joint), 1))
@@ -436,9 +467,12 @@ def _scene(shaped: ShapedBody, ctx: Any) -> tuple[SkinnedMesh, F64, Placement]:
 
 
 def _steps_off(pixels: U8, values: F64, scale: float, zero_point: int) -> float:
-    """Return the largest difference, in steps, of a covered pixel of `pixels` (N, C) from the formula of this module.
+    """Return the largest difference of a covered pixel's bytes from the formula of this module's docstring, in steps.
 
-    `values` (C,): values of the texture.
+    If every pixel equals the background, compare the middle pixel.
+
+    `pixels`: packed tensor (N,C), N = height x width of `SHAPE`. `values` (C,): values of the texture. `scale`,
+    `zero_point`: quantisation of the tensor.
     """
     wanted = np.clip(np.rint(values / np.float64(np.float32(scale))) + zero_point, 0, 255)
     middle = pixels.reshape(*SHAPE, -1)[SHAPE[0] // 2, SHAPE[1] // 2]
@@ -448,7 +482,10 @@ def _steps_off(pixels: U8, values: F64, scale: float, zero_point: int) -> float:
 
 
 def _texels(ctx: Any) -> Iterator[HardNumber]:
-    """Yield rows about a texture's values on the GPU, and about values that must be refused."""
+    """Yield rows about a texture's values on the GPU, and a row about values that must be refused.
+
+    `ctx`: OpenGL context.
+    """
     rng = np.random.default_rng(11)
     for name, exponents in {"usual numbers": (-6, 6), "subnormals": (-24, -14), "large numbers": (10, 15)}.items():
         sizes = 2.0 ** rng.uniform(*exponents, (8, 8, 4)) * rng.choice([-1.0, 1.0], (8, 8, 4))
@@ -469,7 +506,10 @@ def _is_taken(value: float) -> bool:
 
 
 def scene_cases() -> Iterator[HardNumber]:
-    """Yield a row for each scene of `JUMPS`: bytes of tensors that depend on the frames drawn before."""
+    """Yield a row for each scene of `JUMPS`.
+
+    The error of a row is the number of tensor bytes that depend on the frames drawn before.
+    """
     for scene, frames in JUMPS.items():
         checked = configure(RunOptions(scene=scene, runtime=RUNTIME), Path.cwd())
         last = checked.config.scene.frames - 1
@@ -479,7 +519,10 @@ def scene_cases() -> Iterator[HardNumber]:
 
 
 def _differing(checked: Checked, numbers: list[int]) -> int:
-    """Return how many bytes of the frames' tensors depend on the frames that the same stages drew before."""
+    """Return how many tensor bytes of the frames `numbers` depend on the frames that the same stages drew before.
+
+    `checked`: scene and its avatars.
+    """
     used, found = DrawnTensors(checked), 0
     for number in numbers:
         after, fresh = used.tensors(number), DrawnTensors(checked).tensors(number)
@@ -489,5 +532,5 @@ def _differing(checked: Checked, numbers: list[int]) -> int:
 
 
 def _different_bytes(one: U8, other: U8) -> int:
-    """Return how many bytes differ; for different shapes, the size of the larger tensor."""
+    """Return how many bytes of two tensors differ. If their shapes differ, return the size of the larger tensor."""
     return max(one.size, other.size) if one.shape != other.shape else int(np.count_nonzero(one != other))

@@ -1,4 +1,4 @@
-"""Hard cases: rotations at angles where formulas break, a million random rotations, and the longest chain of joints.
+"""Hard cases of rotations: angles at which formulas break, a million random rotations, and chains of joints.
 
 Rule: a bound follows from the tested formulas and the precision of the numbers, never from a result. An error that is
 not a number is above every bound. The references share no code with the tested body/joints.py.
@@ -62,7 +62,10 @@ CHAIN_SEED = 23
 
 
 class HardNumber(NamedTuple):
-    """One hard case. `error`, `bound`: both in `unit`. `source`: origin of the bound."""
+    """One hard case.
+
+    `name`: what is computed. `error`, `bound`: both in `unit`. `source`: source of the bound.
+    """
 
     name: str
     error: float
@@ -76,7 +79,7 @@ class HardNumber(NamedTuple):
 
 
 def gamma(n: float, unit: float = U) -> float:
-    """Return gamma_n = n u / (1 - n u) for numbers of unit roundoff u = `unit`.
+    """Return gamma_n = n u / (1 - n u), where u = `unit` is the unit roundoff of the numbers.
 
     A sum of n products is off by at most gamma_n times the sum of their absolute values: N. Higham, Accuracy and
     Stability of Numerical Algorithms, 2nd ed. 2002, sections 2.2 and 3.1.
@@ -85,9 +88,10 @@ def gamma(n: float, unit: float = U) -> float:
 
 
 def worst(errors: ArrayLike, bounds: ArrayLike) -> tuple[float, float]:
-    """Return the error with the largest ratio to its bound, and this bound.
+    """Return (error, bound): the error with the largest ratio to its bound, and this bound.
 
-    If an error is NaN, return NaN and its bound. If all errors are 0, return 0 and the largest bound.
+    If an error is NaN, return NaN and its bound. If all errors are 0, return 0 and the largest bound. `errors`,
+    `bounds`: arrays that can be broadcast to the same shape.
     """
     found: Any = np.broadcast_arrays(np.asarray(errors, np.float64), np.asarray(bounds, np.float64))
     error, bound = (each.ravel() for each in found)
@@ -100,7 +104,7 @@ def worst(errors: ArrayLike, bounds: ArrayLike) -> tuple[float, float]:
 
 
 def rotation_cases() -> Iterator[HardNumber]:
-    """Yield rows: rotations by each angle, random rotations, and vectors to a quaternion and back."""
+    """Yield rows about rotations by each angle of `ANGLES`, random rotations, and vectors to a quaternion and back."""
     axes = _axes()
     for name, angle in ANGLES.items():
         vectors = axes * angle
@@ -119,9 +123,10 @@ def rotation_cases() -> Iterator[HardNumber]:
 def turn_bound(angle: F64) -> F64:
     """Return the bound on the error of an entry of R - I (...), for rotations by `angle` (...), radians.
 
-    h = |v| / 2 is off by at most 2.5 U of itself: it is the root of a sum of three squares. Let s = min(1, h). The
-    first part of the quaternion is off by at most f = U (2.5 h + 2), each other part by at most e = U (2.5 h + 7.5 s).
-    An entry of R - I is a sum of at most two products of parts, doubled. Therefore it is off by at most
+    Let v be the axis-angle vector, and U the unit roundoff of float64. h = |v| / 2 is off by at most 2.5 U of itself,
+    because it is the root of a sum of three squares. Let s = min(1, h). The first part of the quaternion is off by at
+    most f = U (2.5 h + 2). Each other part is off by at most e = U (2.5 h + 7.5 s). An entry of R - I is a sum of at
+    most two products of parts, doubled. Therefore the entry is off by at most
 
         (4 s + 2) e + 2 s f + 6 s U
 
@@ -133,10 +138,11 @@ def turn_bound(angle: F64) -> F64:
 
 
 def return_bound(angle: F64) -> F64:
-    """Return the bound on the error of a part of a vector from a quaternion (...), radians.
+    """Return the bound on the error of an entry of the axis-angle vector from a quaternion (...), radians.
 
-    `angle` (...): angle of the rotation, up to pi. With e and f as in `turn_bound`, the angle 2 atan2(sine, w) is off
-    by 2 (f sine + sqrt(3) e) and four roundings. The axis is the quaternion's other parts divided by sine.
+    `angle` (...): angle of the rotation, up to pi. Let w be the quaternion's first part, and sine the length of its
+    other parts. With e and f as in `turn_bound`, the angle 2 atan2(sine, w) is off by 2 (f sine + sqrt(3) e) and four
+    roundings. The axis is the other parts divided by sine.
     """
     _, e, f = _parts(np.asarray(angle, np.float64))
     sine = np.sin(np.minimum(angle / 2, np.pi / 2))
@@ -145,7 +151,7 @@ def return_bound(angle: F64) -> F64:
 
 
 def _parts(angle: F64) -> tuple[F64, F64, F64]:
-    """Return s, e and f of `turn_bound`."""
+    """Return (s, e, f) of `turn_bound`, each of the shape of `angle`, radians."""
     h = angle / 2
     s = np.minimum(1.0, h)
     return s, U * (2.5 * h + 7.5 * s), U * (2.5 * h + 2)
@@ -161,9 +167,9 @@ def _axes() -> F64:
 def _random_cases() -> Iterator[HardNumber]:
     """Yield rows about R^T R = I and det R = 1 for random rotations by 0 to 2 pi.
 
-    Let each entry be off by at most b. An entry of R^T R is off by at most 2 sqrt(3) b, because columns have length 1,
-    and by four roundings. The determinant is off by b times the sum of all cofactors, at most 3 sqrt(3), and by ten
-    roundings.
+    Let each entry of R be off by at most b. An entry of R^T R is off by at most 2 sqrt(3) b, because columns have
+    length 1, and by four roundings. The determinant is off by b times the sum of all cofactors, at most 3 sqrt(3), and
+    by ten roundings.
     """
     rng = np.random.default_rng(SEED)
     square, volume = [], []
@@ -182,10 +188,10 @@ def _random_cases() -> Iterator[HardNumber]:
 
 
 def exact_turn(rotvec: Sequence[float]) -> list[list[Decimal]]:
-    """Return R - I (3, 3) of the axis-angle vector `rotvec` (3,), radians, with |rotvec| below 1e9, in `DIGITS` digits.
+    """Return R - I, a list of three rows, of the axis-angle vector `rotvec` (3,), radians, to `DIGITS` digits.
 
-    R - I = a [v]x + b [v]x^2, a = sin(t) / t, b = (1 - cos(t)) / t^2, t = |v|. Series compute sin and cos after t was
-    reduced by multiples of 2 pi.
+    Let v be this vector, and t = |v|, below 1e9. R - I = a [v]x + b [v]x^2, where a = sin(t) / t and b = (1 - cos(t)) /
+    t^2. First, t is reduced by multiples of 2 pi. After that, series compute sin and cos.
     """
     with localcontext() as context:
         context.prec = DIGITS
@@ -200,7 +206,10 @@ def exact_turn(rotvec: Sequence[float]) -> list[list[Decimal]]:
 
 
 def turn_error(found: F64, exact: Sequence[Sequence[Decimal]]) -> float:
-    """Return the largest difference of an entry of `found` (3, 3) from `exact`; NaN if an entry is not finite."""
+    """Return the largest difference between an entry of `found` and of `exact`, both R - I (3,3).
+
+    Return NaN if an entry of `found` is not finite.
+    """
     if not np.isfinite(found).all():
         return float("nan")
     with localcontext() as context:
@@ -210,7 +219,7 @@ def turn_error(found: F64, exact: Sequence[Sequence[Decimal]]) -> float:
 
 
 def _factors(squared: Decimal) -> tuple[Decimal, Decimal]:
-    """Return sin(t) / t and (1 - cos(t)) / t^2. `squared`: t^2."""
+    """Return (sin(t) / t, (1 - cos(t)) / t^2) for the angle t in radians. `squared`: t^2."""
     angle = squared.sqrt()
     if angle < TINY:
         return 1 - squared / 6, Decimal("0.5") - squared / 24
@@ -222,7 +231,7 @@ def _factors(squared: Decimal) -> tuple[Decimal, Decimal]:
 
 
 def _series(angle: Decimal) -> tuple[Decimal, Decimal]:
-    """Return sin and 1 - cos of an angle from -pi to pi, by Taylor's series."""
+    """Return (sin, 1 - cos) of an angle from -pi to pi, by Taylor's series."""
     term, sine, missing = angle, angle, Decimal(0)
     power = Decimal(1)
     for n in range(1, 60):
@@ -234,7 +243,10 @@ def _series(angle: Decimal) -> tuple[Decimal, Decimal]:
 
 
 def chain_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
-    """Yield rows about the joints of the whole body, and about the float32 skinning matrices for the GPU."""
+    """Yield rows about the joints of the whole body, and about the float32 skinning matrices for the GPU.
+
+    `shaped`: body.
+    """
     skeleton = Skeleton(shaped.joints, shaped.body.parents)
     axis = np.array([1.0, 2.0, 3.0]) / np.sqrt(14.0)
     poses = {name: np.tile(axis * angle, (len(shaped.joints), 1)) for name, angle in TURNS.items()}
@@ -257,10 +269,10 @@ def chain_cases(shaped: ShapedBody) -> Iterator[HardNumber]:
 
 
 def walked(shaped: ShapedBody, pose: F64, root: F64) -> Wide:
-    """Return the world transforms (55, 3, 4) of the joints in extended precision, joint by joint from the root.
+    """Return the world transforms (55,3,4) of the joints in extended precision, computed joint by joint from the root.
 
-    `root` (3,): translation of the root joint, metres. The tested body/joints.py goes along the chain in steps of
-    powers of two instead.
+    The tested body/joints.py goes along the chain in steps of powers of two instead. `shaped`: body. `pose` (55,3):
+    axis-angle vectors, radians. `root` (3,): translation of the root joint, metres.
     """
     wide = np.longdouble
     found: Wide = np.zeros((len(shaped.joints), 3, 4), wide)
@@ -279,14 +291,16 @@ def walked(shaped: ShapedBody, pose: F64, root: F64) -> Wide:
 
 
 def joint_bounds(shaped: ShapedBody, pose: F64, root_m: float) -> F64:
-    """Return the bounds on the errors of the joints' places (55,), metres. `root_m`: distance of the root, metres.
+    """Return the bounds on the errors of the joints' places (55,), metres.
 
-    A local rotation is off by at most 3 b in norm, with b the bound of `turn_bound` plus U for adding I. A product of a
-    row and a column rounds by gamma_4 of at most sqrt(3) * sqrt(3) for rotations, or sqrt(3) |place| + |place| for
-    places. Over d joints these errors add up. With L the length of the chain's bones, the place of the last joint is
-    off by at most
+    A local rotation is off by at most 3 b in norm. b is the bound of `turn_bound`, plus U for adding I. A product of a
+    row and a column rounds by gamma_4 of its size. The size is at most sqrt(3) * sqrt(3) for rotations, and sqrt(3)
+    |place| + |place| for places. Over d joints these errors add up. With L the length of the chain's bones, the place
+    of the last joint is off by at most
 
         L sum (3 b + 12 U) + d gamma_4 (sqrt(3) + 1) (|root| + L)
+
+    `shaped`: body. `pose` (55,3): axis-angle vectors, radians. `root_m`: distance of the root from the origin, metres.
     """
     parents, joints = shaped.body.parents, shaped.joints
     length, depth = np.zeros(len(joints)), np.zeros(len(joints))
@@ -301,7 +315,7 @@ def joint_bounds(shaped: ShapedBody, pose: F64, root_m: float) -> F64:
 
 
 def _rotation_bounds(shaped: ShapedBody, pose: F64) -> F64:
-    """Return the bounds on the errors of the joints' world rotations (55,), in norm."""
+    """Return the bounds on the errors of the joints' world rotations (55,), in norm. Parameters: see `joint_bounds`."""
     local = 3 * (turn_bound(np.linalg.norm(pose, axis=1)) + U) + 12 * U
     total = np.zeros(len(local))
     for joint, parent in enumerate(shaped.body.parents):
@@ -310,9 +324,9 @@ def _rotation_bounds(shaped: ShapedBody, pose: F64) -> F64:
 
 
 def _wide_rotation(v: Wide) -> Wide:
-    """Return the matrix (3, 3) of an axis-angle vector (3,), in the vector's precision.
+    """Return the rotation matrix (3,3) of an axis-angle vector `v` (3,), radians, in the precision of `v`.
 
-    It uses 1 - cos(t) = 2 sin^2(t / 2).
+    The formula uses 1 - cos(t) = 2 sin^2(t / 2), which keeps all digits for small t.
     """
     angle = np.sqrt(v @ v)
     if angle == 0:

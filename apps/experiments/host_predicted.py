@@ -1,7 +1,7 @@
 """Are the predictions of `trilane predict --profile host` right, for runs of an avatar and for single networks?
 
-Rule: each prediction is made before its measurement. A run is a whole `trilane run` in processes of its own; a network
-is called in a process that the prediction did not start. No measured time enters a prediction.
+Rule: each prediction is made before its measurement. A run is a whole `trilane run` in processes of its own. A network
+is called in a process of its own, which starts after the prediction. No time from the measurement enters a prediction.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MIN_FRAMES = 100  # frames of a run that is placed by its times
 
 
 class Predicted(NamedTuple):
-    """A predicted time in milliseconds, and the ends of its 80 % interval, None if nothing could be measured."""
+    """A predicted time in ms, and the ends of its 80 % interval; None: the interval is not known."""
 
     ms: float
     low_ms: float | None
@@ -44,18 +44,22 @@ class Predicted(NamedTuple):
 def measure(
     avatar: str = "default", width: tuple[int, ...] = (8, 24, 32, 40, 48), frames: int = 200, seconds: float = 3.0
 ) -> dict[str, Any]:
-    """Predicted and measured times: the avatar with its own network, then with an untrained network of each `width`.
+    """Return predicted and measured times of an avatar, with its own network and with an untrained one of each `width`.
 
-    Two rows for each network: `what` is `run` (mean frame time of a run of `frames` frames) or `network` (median time
-    of calls in `seconds` seconds). `predicted_ms`, with the 80 % interval `low_ms`, `high_ms`; `measured_ms`; `error`:
-    predicted / measured - 1; `inside`: whether the measured time is in the interval; `others`: share of the cores that
-    other programs had in the run. Above 0.1, the row says little.
+    Each network has two rows in `rows`. `name`: name of the avatar, or `width` with the number. `what`: `run` (mean
+    frame time of a run of `frames` frames) or `network` (median time of calls during `seconds` seconds).
+    `predicted_ms`, with the 80 % interval `low_ms`, `high_ms`. `measured_ms`. `error`: predicted / measured - 1.
+    `inside`: whether the measured time is in the interval. `others`: share of the cores that other programs had in the
+    run; null for calls of a network. If `others` is above 0.1, the row says little.
 
-    `run`, `network`: summary of the rows of that kind. `inside`: number of rows in their interval, out of `of` rows.
+    `run`, `network`: summaries of the rows of that kind. `inside`: number of rows in their interval, out of `of` rows.
     `median_error`: median of the absolute errors. `leave_one_out_error`: root mean square of log(predicted / measured).
     `inside_left_out`: number of rows in the 80 % interval that follows from the errors of all other rows.
 
-    Raises BadInputError, MissingPartError without PyTorch, TrilaneError when a run fails.
+    `config`: values of the options.
+
+    Raises BadInputError for fewer than 100 frames or an avatar that cannot be read, MissingPartError without PyTorch,
+    and TrilaneError if a run fails.
     """
     if frames < MIN_FRAMES:
         raise BadInputError("--frames", str(frames), f"at least {MIN_FRAMES}")
@@ -83,7 +87,10 @@ def _of_run(avatar: str) -> Predicted:
 
 
 def _run(avatar: str, frames: int, out: Path) -> tuple[float, float | None]:
-    """Do a run, and return its mean frame time in ms, and the share of the cores that other programs had."""
+    """Run the avatar, and return (mean frame time in ms, share of the cores that other programs had).
+
+    The share is None if it is not known. `avatar`: name or folder. `frames`: number of frames. `out`: run folder.
+    """
     options = RunOptions(avatar=avatar, frames=frames, baseline_frames=0, out=out)
     report = run_asked(options, quiet, ("trilane", "bench")).report
     return report.frame_time_ms.mean or 0.0, report.other_programs
@@ -117,7 +124,10 @@ def _row(name: str, what: str, predicted: Predicted, measured_ms: float, others:
 
 
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """Return the summary of rows of one kind (keys: see `measure`). `rows`: at least two."""
+    """Return the summary of the rows of one kind.
+
+    `rows`: two or more `rows` of `measure`, which also describes the keys.
+    """
     squares = [math.log1p(row["error"]) ** 2 for row in rows]
     left_out = [(sum(squares) - one) / (len(squares) - 1) for one in squares]
     return {
@@ -131,5 +141,5 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[Hooks]:
-    """Give hooks that print nothing."""
+    """Give a run's hooks that print nothing, as a context manager."""
     yield Hooks(lambda *_: None, lambda _: None)

@@ -1,10 +1,12 @@
-"""Error of a picture against a reference, and of a mask against a reference, by the usual measures.
+"""Errors of a picture against a reference picture, and of a mask against a reference mask, by the usual measures.
 
-Rule: pictures are (h,w,3) sRGB, bytes or real numbers in 0..1, masks (h,w) of bools. SSIM is as in the avatars'
-validations: windows of 7 x 7 pixels, mean over the colours. The weights of LPIPS come from a file that the user names;
-only tensors are read from the file. Sources: SSIM: Wang et al., "Image Quality Assessment", IEEE TIP 13
-(2004); MS-SSIM: Wang, Simoncelli and Bovik, "Multiscale structural similarity", Asilomar 2003; FLIP: Andersson et al.,
-HPG 2020, at 67 pixels a degree; LPIPS: Zhang et al., "Unreasonable Effectiveness", CVPR 2018, version 0.1.
+Rule: a picture is (h,w,3) sRGB, as bytes or as real numbers in 0..1. A mask is (h,w) bool. SSIM is as in the avatars'
+validations: windows of 7 x 7 pixels, mean over the colours. The weights of LPIPS come from a file that the user names.
+Only tensors are read from this file, and no code in it runs.
+
+Sources: SSIM: Wang et al., "Image Quality Assessment", IEEE TIP 13 (2004); MS-SSIM: Wang, Simoncelli and Bovik,
+"Multiscale structural similarity", Asilomar 2003; FLIP: Andersson et al., HPG 2020, at 67 pixels a degree; LPIPS: Zhang
+et al., "Unreasonable Effectiveness", CVPR 2018, version 0.1.
 """
 
 from __future__ import annotations
@@ -56,10 +58,11 @@ LEAST_LPIPS_PX = 64
 class ErrorFigures:
     """Errors of a picture against a reference.
 
-    `mae`: mean absolute difference, in steps of 1/255. `psnr_db`: PSNR, at most 100, which means no error. `ssim`,
-    `ms_ssim`: similarity, 1 without an error; None if the picture is too small. `flip`: mean FLIP, 0 without an error.
-    `dice`, `iou`: agreement of the masks, 1 if they are equal; None without masks. `lpips`: LPIPS, 0 without an error;
-    None without weights, or if the picture is too small.
+    `mae`: mean absolute difference, in steps of 1/255. `psnr_db`: PSNR, at most 100, which means no error.
+    `ssim`, `ms_ssim`: similarity, 1 without an error; None if the picture is too small.
+    `flip`: mean FLIP, 0 without an error.
+    `dice`, `iou`: agreement of the masks, 1 if they are equal; None without masks.
+    `lpips`: LPIPS, 0 without an error; None without weights, or if the picture is too small.
     """
 
     mae: float
@@ -85,8 +88,10 @@ def figures(
 ) -> ErrorFigures:
     """Return all errors of `picture` against `reference`.
 
-    `mask`, `reference_mask`: masks to compare, or None. `lpips`: computes LPIPS; None leaves it out.
-    Raises ValueError if the shapes differ or an argument is no picture, ImportError without the extra `metrics`.
+    `mask`, `reference_mask`: masks to compare; None for either leaves `dice` and `iou` out.
+    `lpips`: function that computes LPIPS; None leaves LPIPS out.
+    Raises ValueError if the pictures differ in shape or an argument is no picture, ImportError without the extra
+    `metrics`.
     """
     masks = None if mask is None or reference_mask is None else (mask, reference_mask)
     if np.array_equal(*_pair(picture, reference)):
@@ -104,7 +109,11 @@ def figures(
 
 
 def _no_error(side: int, masks: tuple[Mask, Mask] | None, lpips: Perceived | None) -> ErrorFigures:
-    """Return the figures of two equal pictures without computing errors. `side`: their shorter side, pixels."""
+    """Return the figures of two equal pictures without computing errors.
+
+    `side`: shorter side of the pictures, pixels. `masks`: (mask, reference mask); None without masks. `lpips`: None if
+    LPIPS is left out.
+    """
     return ErrorFigures(
         mae=0.0,
         psnr_db=arrays.psnr_db(0.0),
@@ -118,24 +127,27 @@ def _no_error(side: int, masks: tuple[Mask, Mask] | None, lpips: Perceived | Non
 
 
 def mae(picture: Floats, reference: Floats) -> float:
-    """Return the mean absolute difference of all values, in steps of 1/255."""
+    """Return the mean absolute difference of all values, in steps of 1/255. Raises ValueError as `figures` does."""
     shown, wanted = _pair(picture, reference)
     return float(np.abs(shown - wanted).mean() * 255)
 
 
 def mse(picture: Floats, reference: Floats) -> float:
-    """Return the mean square difference of all values, which are in 0..1."""
+    """Return the mean square difference of all values, as numbers in 0..1. Raises ValueError as `figures` does."""
     shown, wanted = _pair(picture, reference)
     return float(((shown - wanted) ** 2).mean())
 
 
 def psnr_db(picture: Floats, reference: Floats) -> float:
-    """Return the PSNR, -10 log10 of the mean square difference; at most 100 dB."""
+    """Return the PSNR in dB, -10 log10 of the mean square difference; at most 100.
+
+    Raises ValueError as `figures` does.
+    """
     return arrays.psnr_db(mse(picture, reference))
 
 
 def ssim(picture: Floats, reference: Floats) -> float | None:
-    """Return the mean SSIM; None if a side is shorter than `LEAST_SSIM_PX`."""
+    """Return the mean SSIM; None if a side is shorter than `LEAST_SSIM_PX`. Raises ValueError as `figures` does."""
     shown, wanted = _pair(picture, reference)
     return None if min(shown.shape[:2]) < LEAST_SSIM_PX else float(ssim_map(shown, wanted).mean())
 
@@ -143,7 +155,8 @@ def ssim(picture: Floats, reference: Floats) -> float | None:
 def ms_ssim(picture: Floats, reference: Floats) -> float | None:
     """Return MS-SSIM of five scales, mean over the colours; None if a side is shorter than `LEAST_MS_SSIM_PX`.
 
-    From scale to scale, squares of 2 x 2 pixels are averaged. A mean contrast-structure term below 0 counts as 0.
+    From each scale to the next, squares of 2 x 2 pixels are averaged. A mean contrast-structure term below 0 counts as
+    0. Raises ValueError as `figures` does.
     """
     shown, wanted = _pair(picture, reference)
     if min(shown.shape[:2]) < LEAST_MS_SSIM_PX:
@@ -157,7 +170,7 @@ def ms_ssim(picture: Floats, reference: Floats) -> float | None:
 
 
 def flip(picture: Floats, reference: Floats) -> float:
-    """Return the mean FLIP."""
+    """Return the mean of the FLIP map; 0 means no visible difference. Raises ValueError as `figures` does."""
     return float(flip_map(*_pair(picture, reference)).mean())
 
 
@@ -174,7 +187,7 @@ def iou(mask: Mask, reference: Mask) -> float:
 
 
 def _similarity(picture: F64, reference: F64) -> tuple[F64, F64]:
-    """Return, by colour, the mean SSIM (3,) and the mean contrast-structure term (3,), over windows in the picture."""
+    """Return (mean SSIM, mean contrast-structure term), each (3,) by colour, over all windows inside the picture."""
     from skimage.metrics import structural_similarity
 
     _, whole = structural_similarity(
@@ -195,7 +208,10 @@ def _similarity(picture: F64, reference: F64) -> tuple[F64, F64]:
 
 
 def _means(picture: F64) -> F64:
-    """Return the weighted mean of the window around each pixel (h,w,3), as `structural_similarity` computes it."""
+    """Return the weighted mean (h,w,3) of the window around each pixel.
+
+    The window and its weights are those of skimage's `structural_similarity`.
+    """
     from skimage.filters import gaussian
 
     reach = WINDOW_PX // 2 / DEVIATION_PX
@@ -216,7 +232,7 @@ def _pair(picture: Floats, reference: Floats) -> tuple[F64, F64]:
 
 
 def _real(picture: Floats) -> F64:
-    """Return `picture` as real numbers in 0..1. Raises ValueError if it is no picture."""
+    """Return `picture` as real numbers in 0..1, (h,w,3) float64. Raises ValueError if it is no picture."""
     if picture.ndim != 3 or picture.shape[2] != 3 or not picture.size:
         raise ValueError(f"a picture of shape {picture.shape}, expected (height, width, 3)")
     if picture.dtype == np.uint8:
@@ -228,14 +244,14 @@ def _real(picture: Floats) -> F64:
 
 
 class Lpips:
-    """LPIPS with AlexNet and the weights of a file.
+    """LPIPS with AlexNet and the weights in the file `weights`.
 
-    The file has the weights of `lpips.LPIPS(net="alex")` under the names of its authors' library, as
-    `torch.save(lpips.LPIPS().state_dict(), FILE)` writes them.
+    The file has the weights of `lpips.LPIPS(net="alex")` under the names in the `lpips` package.
+    `torch.save(lpips.LPIPS().state_dict(), FILE)` writes such a file.
     """
 
     def __init__(self, weights: Path) -> None:
-        """Raise BadInputError, MissingPartError without PyTorch."""
+        """Read the weights. Raises BadInputError for a file without them, MissingPartError without PyTorch."""
         try:
             import torch
         except ImportError as error:
@@ -262,7 +278,10 @@ class Lpips:
             )
 
     def _features(self, picture: F64) -> Iterator[Any]:
-        """Yield the features of each layer (1,C,h,w), scaled to length 1 along C."""
+        """Yield the features (1,C,h,w) of each layer for `picture` (h,w,3).
+
+        The vector of each pixel has length 1 along C.
+        """
         import torch
         from torch.nn import functional
 
@@ -276,7 +295,7 @@ class Lpips:
 
 
 def _shapes() -> Iterator[tuple[str, tuple[int, ...]]]:
-    """Yield the name and shape of each tensor that the file must have."""
+    """Yield (name, shape) of each tensor that the file of LPIPS weights must have."""
     for number, (name, outputs, inputs, side, *_) in enumerate(LPIPS_LAYERS):
         yield f"net.{name}.weight", (outputs, inputs, side, side)
         yield f"net.{name}.bias", (outputs,)

@@ -1,10 +1,11 @@
 """The reference path of a frame, with causes of error that can be switched on.
 
-Rule: without a cause, the path is the plan `full` (`bench/lib/full_picture.py`): float64 body with everything on,
-supersampled float64 raster, float texture, unrounded tensor of the network's own area, FP32 network, blend in linear
-light in float64, not rounded. Each cause replaces one of these by the run's way; with all causes, the picture is the
-run's. Motion, camera, background and contact shadows are always the run's. `NEEDS` names the causes that a cause needs:
-a runtime needs bytes, and stages that draw into the run's tensor or read it need that tensor.
+Rule: without a cause, the path is the plan `full` (`bench/lib/full_picture.py`). The body is in float64 with everything
+on. The raster is supersampled in float64, from a float texture, into an unrounded tensor of about the network's own
+area. The network is in FP32, and its picture is blended in linear light in float64 and not rounded. Each cause replaces
+one of these steps by the run's step. With all causes, the picture is the run's. Motion, camera, background and contact
+shadows are always the run's. `NEEDS` has the causes that a cause needs. For example, a runtime needs bytes, and stages
+that draw into the run's tensor or read it need this tensor.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ HALF = 0.5
 
 
 class Cause(StrEnum):
-    """The causes of the difference between a run's picture and the reference, in the order of switching them on."""
+    """The causes of the difference between a run's picture and the reference, in the order of switching on."""
 
     WEIGHTS = "skin weights"
     BLEND = "blend shapes"
@@ -91,18 +92,18 @@ WHAT: dict[Cause, str] = {
 
 
 def needs(cause: Cause) -> Causes:
-    """Return the causes that must be on for `cause`."""
+    """Return the causes that must be on for `cause`; an empty set for a cause that needs no other."""
     return NEEDS.get(cause, NOTHING)
 
 
 def up_to(cause: Cause) -> Causes:
-    """Return `cause` and all causes before it."""
+    """Return `cause` and all causes before it in the order of `Cause`."""
     order = list(Cause)
     return frozenset(order[: order.index(cause) + 1])
 
 
 def require_complete(causes: Iterable[Cause]) -> Causes:
-    """Return `causes` as a set. Raises ValueError if a cause is missing that another one needs."""
+    """Return `causes` as a set. Raises ValueError if one of them needs a cause that is missing."""
     found = frozenset(causes)
     for cause in found:
         if missing := needs(cause) - found:
@@ -111,10 +112,12 @@ def require_complete(causes: Iterable[Cause]) -> Causes:
 
 
 class RunBody:
-    """The body of one distinct avatar. `on_cpu`: whether the CPU unit skins it; otherwise the GPU unit does.
+    """The body of one distinct avatar, which computes its vertices with any causes.
 
     In float64, the vertices are computed joint by joint. In float32, Trilane's own skinning computes them. With all
     causes on, they equal the CPU unit's vertices to the bit.
+
+    `data`: avatar. `on_cpu`: whether the CPU unit skins the body; if not, the GPU unit skins it.
     """
 
     def __init__(self, data: AvatarData, *, on_cpu: bool) -> None:
@@ -124,10 +127,10 @@ class RunBody:
         self._skinners: dict[Detail, FrameSkinner] = {}
 
     def vertices(self, seen: CastView, level: int | None, causes: Causes) -> F64:
-        """Return the vertices (V,3), metres, in the world.
+        """Return the vertices (V,3) float64, metres, in the world.
 
         `seen`: the avatar in a frame. `level`: index into `DETAILS` by the run's plan; None if the run does not show
-        the avatar. `causes`: causes that are on; only causes of the body have an effect.
+        the avatar. `causes`: causes that are on; only the causes in `BODY` have an effect.
         """
         detail = self._detail(level, causes)
         if Cause.FLOAT32 not in causes:
@@ -136,7 +139,10 @@ class RunBody:
         return (self._by_cpu(detail, posed) if self._on_cpu else self._by_gpu(detail, posed)).astype(np.float64)
 
     def _detail(self, level: int | None, causes: Causes) -> Detail:
-        """Return the level of detail: the run's for causes that are on, otherwise everything."""
+        """Return the level of detail: the run's in the parts whose cause is on, and everything in the other parts.
+
+        The parts are skin weights with hands and face, and pose blend shapes. `level`, `causes`: as in `vertices`.
+        """
         run = EVERYTHING
         if self._on_cpu:
             run = EVERYTHING if level is None else DETAILS[level]
@@ -158,7 +164,10 @@ class RunBody:
         return self._full[detail]
 
     def _blend(self, detail: Detail) -> F32 | None:
-        """Return the pose blend shapes. If `detail` leaves them out, the CPU unit has none, the GPU unit float16."""
+        """Return the pose blend shapes for `detail`, in float32; None for no pose blend shapes.
+
+        If `detail` leaves them out, the CPU unit has none, and the GPU unit has them rounded to float16.
+        """
         if detail.pose_blend or self._body.posedirs is None:
             return self._body.posedirs
         return None if self._on_cpu else self._body.posedirs.astype(np.float16).astype(np.float32)
@@ -171,7 +180,10 @@ class RunBody:
         return vertices
 
     def _by_gpu(self, detail: Detail, posed: Posed) -> F32:
-        """Return the vertices (V,3) by the vertex shader's formula, rounded to float32 after each step."""
+        """Return the vertices (V,3) float32, metres, by the formula of the vertex shader.
+
+        The result of each step is rounded to float32.
+        """
         rest, blend = self._data.shaped.vertices.astype(np.float32), self._blend(detail)
         if blend is not None:
             rest = rest + (blend.reshape(-1, POSE_FEATURES) @ posed.feature).reshape(-1, 3)
@@ -181,10 +193,10 @@ class RunBody:
 
 @dataclass(frozen=True)
 class ReferenceFrame:
-    """Frame `number`, with or without causes.
+    """The frame `number`, drawn with or without causes.
 
-    `picture`: (h,w,3) sRGB in 0..1. `mask`: pixels (h,w) that avatars cover at least half. `boxes`: rectangles around
-    the avatars.
+    `picture`: (h,w,3) sRGB in 0..1. `mask` (h,w) bool: pixels of which avatars cover at least half. `boxes`: rectangles
+    around the visible avatars, pixels.
     """
 
     number: int
@@ -196,12 +208,16 @@ class ReferenceFrame:
 class ReferencePath:
     """The reference path of the scene in `checked`.
 
-    `networks`: names of the networks that paint the reference. `gl`: OpenGL context in use. `output`: (height, width)
-    of the picture. `avatars`: distinct avatars by folder.
+    `cast`: avatars and camera of the scene. `frames`: object that makes the run's own frames.
+    `networks`: names of the networks that paint the reference. `gl`: OpenGL context in use.
+    `output`: (height, width) of the picture. `avatars`: distinct avatars, by the folder of the bundle.
     """
 
     def __init__(self, checked: Checked) -> None:
-        """Raise BadInputError, MissingPartError."""
+        """Load the avatars.
+
+        Raises BadInputError for a broken avatar, MissingPartError without OpenGL or the run's runtime.
+        """
         config = checked.config
         self.cast, self.frames = Cast(checked), AvatarFrames(checked)
         self.output: Shape = (config.scene.output.height, config.scene.output.width)
@@ -222,7 +238,7 @@ class ReferencePath:
         return self._network_of(seen.index)
 
     def frame(self, number: int) -> ReferenceFrame:
-        """Return frame `number` without causes."""
+        """Return frame `number` without causes, which is the reference."""
         return self.moment(number).frame(NOTHING)
 
     def moment(self, number: int) -> ReferenceMoment:
@@ -231,9 +247,11 @@ class ReferencePath:
 
 
 class ReferenceMoment:
-    """One frame, to be drawn with any causes. Parts that several drawings share are made once.
+    """One frame, which can be drawn with any causes. Parts that several drawings share are made once.
 
-    `own`: the run's picture, (h,w,3) in 0..1. `seen`: visible avatars by number.
+    `path`: reference path of the scene. `number`: number of the frame.
+    `own`: the run's picture (h,w,3) in 0..1. `background`: the run's picture (h,w,3) uint8 without avatars.
+    `seen`: visible avatars, by number. `boxes`: rectangles around them, pixels.
     """
 
     def __init__(self, path: ReferencePath, number: int) -> None:
@@ -246,7 +264,7 @@ class ReferenceMoment:
         self._made: dict[Hashable, Any] = {}
 
     def frame(self, causes: Causes) -> ReferenceFrame:
-        """Return the frame with `causes` on. Raises ValueError if a cause is missing that another one needs."""
+        """Return the frame with `causes` on. Raises ValueError if one of them needs a cause that is missing."""
         made: ReferenceFrame = self._once(("frame", require_complete(causes)), lambda: self._frame(causes))
         return made
 
@@ -257,7 +275,7 @@ class ReferenceMoment:
         return ReferenceFrame(self.number, picture, cover >= HALF, self.boxes)
 
     def vertices(self, index: int, causes: Causes) -> F64:
-        """Return the vertices (V,3), metres in the world, of the visible avatar number `index`."""
+        """Return the vertices (V,3), metres in the world, of the visible avatar number `index`, with `causes` on."""
         seen = self.seen[index]
         body = self._path.avatars[seen.folder].body
         level = self._levels.get(index)
@@ -287,9 +305,9 @@ class ReferenceMoment:
         ]
 
     def _own_layer(self, seen: CastView, causes: Causes) -> RasterLayer:
-        """Return the layer of an avatar, painted from a tensor for this avatar alone, on the picture's grid.
+        """Return the layer of an avatar, painted from a tensor of its own on the picture's grid.
 
-        The plan `full` does the same.
+        The plan `full` makes its layers in the same way.
         """
         avatar = self._path.avatars[seen.folder]
         times = fineness(seen.box.shape, avatar.area)
@@ -302,14 +320,20 @@ class ReferenceMoment:
         return RasterLayer(box, seen.depth, enlarged(shrunk(painted, times.numerator), times.denominator))
 
     def _cells(self) -> list[tuple[CastView, Rect, Cell]]:
-        """Return the avatars in the run's tensors, each with its crop rectangle and its cell of the tensor."""
+        """Return (avatar, crop rectangle, cell) for each avatar in the run's tensors; empty if the run draws no tensor.
+
+        A cell is (top, left, height, width) in the tensor, pixels.
+        """
         if int(self._header["work"]) != FrameWork.FULL:
             return []
         visible = [row for row in self._header["avatars"] if row["visible"] and int(row["avatar"]) in self.seen]
         return [(self.seen[int(row["avatar"])], Rect(*map(float, row["rect"])), _cell(row)) for row in visible]
 
     def _painted(self, causes: Causes) -> dict[int, F32]:
-        """Return, by network number, the network's output (h,w,4) for the run's tensor, computed with `causes`."""
+        """Return the picture (h,w,4) that each network paints from the run's tensor, by network number.
+
+        `causes`: causes that are on.
+        """
         avatars = {self._path.network_of(seen): self._path.avatars[seen.folder] for seen, _, _ in self._cells()}
         return {
             network: self._paint(avatar, self._tensor(network, avatar, causes), causes)
@@ -317,9 +341,9 @@ class ReferenceMoment:
         }
 
     def _tensor(self, network: int, avatar: _Avatar, causes: Causes) -> F64:
-        """Return the tensor (h,w,C) of network number `network`, with the run's shape and crops, in real numbers.
+        """Return the tensor (h,w,C) of network number `network` in real numbers, with the run's shape and crops.
 
-        `avatar`: any avatar that this network paints.
+        `avatar`: any avatar that this network paints. `causes`: causes that are on.
         """
         if Cause.RASTER in causes:
             drawn = self._once(("drawn", network), lambda: self._path.frames.tensor_of(self.number, network))
@@ -335,7 +359,11 @@ class ReferenceMoment:
         return avatar.packed(tensor, causes)
 
     def _drawn(self, seen: CastView, clip: F64, shape: Shape, causes: Causes) -> F64:
-        """Return a tensor (h,w,C) with one avatar, drawn by the float64 rasteriser. `clip`: projection @ view (4,4)."""
+        """Return a tensor (h,w,C) float64 of one avatar, drawn by the float64 rasteriser.
+
+        `seen`: the avatar. `clip`: projection @ view (4,4). `shape`: (height, width) of the tensor. `causes`: causes
+        that are on.
+        """
         avatar = self._path.avatars[seen.folder]
         vertices, texture = self.vertices(seen.index, causes), avatar.texture
         if Cause.FLOAT16 in causes:
@@ -355,7 +383,10 @@ class ReferenceMoment:
         return painted
 
     def _composited(self, causes: Causes) -> F64:
-        """Return the frame (h,w,3) in 0..1 by the composite stage, from the networks' pictures in bytes."""
+        """Return the frame (h,w,3) in 0..1 as the composite stage makes it from the networks' pictures in bytes.
+
+        If the run draws no tensor, return the run's own picture.
+        """
         if not self._cells():
             return self.own
         painted = {one: np.asarray(np.rint(made * 255), np.uint8) for one, made in self._painted(causes).items()}
@@ -364,7 +395,10 @@ class ReferenceMoment:
         return composited
 
     def _once(self, key: Hashable, make: Callable[[], Any]) -> Any:
-        """Return the result of `make`, called once per `key`. Therefore a cause without effect costs nothing."""
+        """Return the result of `make`, which is called once for each `key`.
+
+        Therefore a cause without effect costs nothing.
+        """
         if key not in self._made:
             self._made[key] = make()
         return self._made[key]
@@ -374,9 +408,11 @@ class ReferenceMoment:
 class _Avatar:
     """One distinct avatar.
 
-    `encoding`: scale and zero point of the tensor's bytes. `area`: pixels of its network's own tensor. `paint`,
-    `as_written`, `by_runtime`: the network in FP32, in integers as its file says, and on the run's runtime; all take
-    tensors of real numbers. `network`: name of the network `paint`.
+    `body`: body that computes vertices. `mesh`: triangles and texture coordinates. `texture`: neural texture (H,W,C).
+    `encoding`: scale and zero point of the tensor's bytes. `area`: pixels of the tensor of its network's own size.
+    `paint`, `as_written`, `by_runtime`: functions from a tensor of real numbers to the network's picture. They compute
+    the network in FP32, in integers as its file says, and in integers on the run's runtime.
+    `network`: name of the network in `paint`.
     """
 
     body: RunBody
@@ -390,13 +426,16 @@ class _Avatar:
     by_runtime: Paint
 
     def packed(self, tensor: F64, causes: Causes) -> F64:
-        """Return `tensor`; if packing is on, rounded to values that bytes represent."""
+        """Return `tensor` (h,w,C).
+
+        If packing is on, its values are rounded and clamped to values that bytes represent.
+        """
         if Cause.PACKING not in causes:
             return tensor
         return self.real(quantise(tensor, self.encoding.scale, self.encoding.zero_point))
 
     def real(self, tensor: U8) -> F64:
-        """Return the real numbers that the bytes of a tensor represent."""
+        """Return the real numbers, float64, that the bytes of `tensor` represent."""
         return (tensor.astype(np.float64) - self.encoding.zero_point) * self.encoding.scale
 
 
@@ -418,7 +457,11 @@ def _avatar(data: AvatarData, runtime: str, on_cpu: bool) -> _Avatar:
 
 
 def _by_runtime(network: NetworkFile, name: str) -> Paint:
-    """Return `network` on the runtime `name`, as a function of a tensor of real numbers that bytes can represent."""
+    """Return a function that computes `network` on the runtime `name`.
+
+    The function takes a tensor (h,w,C) of real numbers that bytes can represent, and returns the picture (h,w,4) in
+    0..1.
+    """
     bound: dict[Shape, tuple[U8, U8, Binding]] = {}
 
     def paint(tensor: F64) -> F32:

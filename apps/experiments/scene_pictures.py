@@ -1,7 +1,8 @@
 """The frames of a scene, made in this process: pictures, times, references, and differences between runtimes.
 
-Rule: the run's own stages draw tensors and make pictures, one after the other. The reference is the ground truth (the
-clothed body) if the scene has one, otherwise the plan `full`. A result names its reference.
+Rule: the run's own stages draw tensors and make pictures, one after the other. If the scene has a ground truth (the
+clothed bodies), it is the reference. If the scene has none, the plan `full` is the reference. A result names its
+reference.
 """
 
 from __future__ import annotations
@@ -45,13 +46,17 @@ Wanted = Callable[[int, U8], U8]
 
 
 class ScenePictures:
-    """Makes the frames of the scene in `checked`. `gpu`: GPU unit with the OpenGL context to use; None for a new one.
+    """Makes the frames of the scene in `checked`.
 
-    `output`: (height, width) of the picture.
+    `gpu`: GPU unit with the OpenGL context to use; None for a new unit. `output`: (height, width) of the picture.
     """
 
     def __init__(self, checked: Checked, gpu: UnitContext | None = None) -> None:
-        """Raise BadInputError, MissingPartError."""
+        """Build the stages.
+
+        Raises BadInputError for a stage that cannot be built, MissingPartError if a library that a stage needs is
+        missing.
+        """
         pipeline, output = avatar_pipeline(checked.config, checked.assets), checked.config.scene.output
         units = units_of(pipeline, checked.assets)
         self.gpu = units["gpu"] if gpu is None else replace(gpu, assets=checked.assets)
@@ -65,9 +70,10 @@ class ScenePictures:
         return self.gpu.shared(CONTEXT, open_context)
 
     def frame(self, number: int) -> tuple[U8, Mapping[str, float]]:
-        """Return frame `number`, (h,w,3) uint8 sRGB, and the time of each stage, ms. A skipped stage takes no time.
+        """Return (picture, times) of frame `number`: (h,w,3) uint8 sRGB, and the time in ms by stage.
 
-        Time in which a ready thread had no core does not count.
+        The stage present does not run. A skipped stage takes almost no time. Time in which a ready thread had no core
+        does not count.
         """
         cores, times = len(machine.here.cores()), {}
         with closing(CoreMeter()) as meter:
@@ -81,7 +87,7 @@ class ScenePictures:
         return self._picture(packet), times
 
     def background(self, number: int) -> U8:
-        """Return frame `number` without its avatars, but with their shadows, (h,w,3) uint8."""
+        """Return frame `number` without its avatars, but with their shadows, (h,w,3) uint8 sRGB."""
         self._chain.run(number, len(self._names) - 2).payload[:] = 0
         return self._picture(self._chain.go_on(number))
 
@@ -92,7 +98,7 @@ class ScenePictures:
 
 
 def wanted_pictures(cast: Cast, ctx: Any) -> tuple[Wanted, str]:
-    """Return the function that makes reference pictures of `cast`, and the name of the reference.
+    """Return (function that makes reference pictures of `cast`, name of the reference).
 
     `ctx`: OpenGL context in use.
     """
@@ -103,7 +109,10 @@ def wanted_pictures(cast: Cast, ctx: Any) -> tuple[Wanted, str]:
 
 
 def spread(total: int, frames: int) -> list[int]:
-    """Return the numbers of at most `frames` of `total` frames, evenly spread. Raises BadInputError."""
+    """Return the numbers of at most `frames` of `total` frames, evenly spread, from 0 on.
+
+    Raises BadInputError if `frames` is not 1 to `MAX_FRAMES`.
+    """
     if not 1 <= frames <= MAX_FRAMES:
         raise BadInputError("--frames", str(frames), f"1 to {MAX_FRAMES}")
     count = min(frames, total)
@@ -111,15 +120,16 @@ def spread(total: int, frames: int) -> list[int]:
 
 
 def around(boxes: Sequence[Box], output: Shape) -> tuple[slice, slice]:
-    """Return `region` as slices of rows and columns. `boxes`: at least one."""
+    """Return the result of `region` as (rows, columns), two slices. Parameters: see `region`."""
     box = region(boxes, output)
     return slice(box.top, box.bottom), slice(box.left, box.right)
 
 
 def region(boxes: Sequence[Box], output: Shape) -> Box:
-    """Return the rectangle of a picture that holds all `boxes`, enlarged for MS-SSIM if the picture has the room.
+    """Return the rectangle of a picture that holds all `boxes`, in pixels.
 
-    `output`: (height, width) of the picture.
+    If the picture has room, each side of the rectangle is at least as long as MS-SSIM needs. `boxes`: at least one box
+    in the picture. `output`: (height, width) of the picture.
     """
     top, left = min(box.top for box in boxes), min(box.left for box in boxes)
     bottom, right = max(box.bottom for box in boxes), max(box.right for box in boxes)
@@ -142,9 +152,14 @@ def runtime_differences(checked: Checked, runtimes: Sequence[str], frames: int) 
 
     `checked`: the scene and its avatars. `runtimes`: names of two or more runtimes. `frames`: number of frames, evenly
     spread over the scene.
-    Keys: `rows`, one per pair: `first`, `second`, `mean`, `largest` (in steps of 1/255, over all channels and frames),
-    `worst_frame`; `sources`; `bounds`; `frames` (numbers of the frames that show an avatar); `runtimes` (name ->
-    version). Raises BadInputError and MissingPartError.
+
+    Keys: `rows`: a row for each pair of runtimes, with `first`, `second`: names; `mean`, `largest`: differences in
+    steps of 1/255, over all channels and frames; `worst_frame`: number of the frame with the largest mean. `sources`:
+    source of the rows. `bounds`: bounds on `mean` and `largest`. `frames`: numbers of the frames that show an avatar.
+    `runtimes`: version of each runtime, by name.
+
+    Raises BadInputError for a number of frames out of range, fewer than two runtimes, a runtime given twice, or nobody
+    in view. Raises MissingPartError for a runtime that is not installed, or without OpenGL.
     """
     wanted = spread(checked.config.scene.frames, frames)
     if len(set(runtimes)) < 2 or len(set(runtimes)) < len(runtimes):
@@ -172,7 +187,11 @@ def runtime_differences(checked: Checked, runtimes: Sequence[str], frames: int) 
 
 
 def _row(pair: tuple[str, str], steps: list[tuple[float, int, int]]) -> dict[str, Any]:
-    """Return the row of a pair. `steps`: (mean difference, largest difference, number of the frame) of each frame."""
+    """Return the row of `runtime_differences` for a pair of runtimes.
+
+    `pair`: names of the two runtimes. `steps`: for each tensor, (mean difference, largest difference, number of the
+    frame).
+    """
     return {
         "first": pair[0],
         "second": pair[1],
@@ -183,7 +202,7 @@ def _row(pair: tuple[str, str], steps: list[tuple[float, int, int]]) -> dict[str
 
 
 class _Sessions:
-    """Runs a network on several runtimes. Sessions are kept by runtime and tensor shape."""
+    """Runs `network` on several runtimes. A session is kept for each runtime and tensor shape."""
 
     def __init__(self, network: NetworkFile, runtimes: Sequence[str]) -> None:
         self._network = network
@@ -191,7 +210,7 @@ class _Sessions:
         self._bound: dict[tuple[str, Shape], tuple[U8, U8, Binding]] = {}
 
     def picture(self, runtime: str, tensor: U8) -> U8:
-        """Return the picture (h,w,4) uint8 by `runtime` from `tensor` (h,w,C) uint8."""
+        """Return the picture (h,w,4) uint8 that the network paints on `runtime` from `tensor` (h,w,C) uint8."""
         shape = (int(tensor.shape[0]), int(tensor.shape[1]))
         if (runtime, shape) not in self._bound:
             slots = np.empty((1, *tensor.shape), np.uint8), np.empty((1, *shape, 4), np.uint8)
@@ -205,9 +224,9 @@ class _Sessions:
 
 
 def _tensors(checked: Checked, frames: Sequence[int]) -> Iterator[tuple[int, int, U8]]:
-    """Yield (frame, network, tensor) for each network that paints an avatar in one of `frames`.
+    """Yield (frame number, network number, tensor) for each network that paints an avatar in one of `frames`.
 
-    The frame and the network are numbers; a tensor is (h,w,C) uint8.
+    A tensor is (h,w,C) uint8, and valid until a tensor of the next frame is yielded.
     """
     painter = DrawnTensors(checked)
     for frame in frames:
@@ -232,9 +251,9 @@ class DrawnTensors:
         self._config = config
 
     def tensors(self, frame: int) -> dict[int, U8]:
-        """Return the tensors (h, w, C) uint8 of a frame, by the number of the network, valid until the next call.
+        """Return the tensors (h,w,C) uint8 of frame number `frame`, by the number of the network.
 
-        A network that paints nobody in the frame has no tensor.
+        A network that paints nobody in the frame has no tensor. The tensors are valid until the next call.
         """
         self._pose.run(frame, None, 0)
         self._raster.run(frame, 0, 0)

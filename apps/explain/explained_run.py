@@ -1,8 +1,8 @@
 """Where the time of a run went, as a document and as a table of its jobs.
 
-Rule: the figures come from one pass over the journal of a live or finished run, in bounded memory. The report of a
-finished run says how it ended. The table is written during a second pass, because the first pass finds the metrics of
-the stages, which are the last columns.
+Rule: one pass over the journal of a live or finished run gives the figures, in bounded memory. The report of a finished
+run says how the run ended. The table is written in a second pass. Its last columns are the metrics of the stages, which
+are known only after the first pass.
 """
 
 from __future__ import annotations
@@ -58,16 +58,19 @@ ENDINGS = (".csv", ".parquet")
 
 
 def _explained_jobs(begun: Begun, records: Iterable[Record]) -> Iterator[ExplainedJob]:
-    """Yield every job of a journal with the causes of its wait. `records`: the records that follow `begun`."""
+    """Yield every job of a journal with the causes of its wait, in the order of the jobs' ends.
+
+    `begun`: first record of the journal. `records`: records after the first.
+    """
     timeline = Timeline(begun.graph, begun.settings, waits=True)
     for record in records:
         yield from (fact for fact in timeline.add(record) if isinstance(fact, ExplainedJob))
 
 
 def open_journal(folder: Path) -> tuple[Begun, Iterator[Record]]:
-    """Return the first record of the journal in a run folder, and an iterator over the records that follow.
+    """Return (first record, iterator over the other records) of the journal in the run folder `folder`.
 
-    Raises BadInputError for a folder without a journal and, also from the iterator, for a broken journal.
+    Raises BadInputError for a folder without a journal, and for a broken journal. The iterator may also raise it.
     """
     path = journal_in(folder)
     if path is None:
@@ -81,10 +84,10 @@ def open_journal(folder: Path) -> tuple[Begun, Iterator[Record]]:
 
 
 class RunExplanation:
-    """Explains a run. `add` takes the records of its journal after the first; `document` returns the explanation.
+    """Explains where the time of a run went.
 
-    `begun`: first record of the journal. `report`: report of the run, None while it goes on. `slowest`: number of
-    frames to name. `name`: the run's folder.
+    `begun`: first record of the run's journal. `report`: report of the run; None while the run goes on.
+    `slowest`: number of slowest frames to describe. `name`: folder of the run, for the verdict.
     """
 
     def __init__(self, begun: Begun, report: Report | None, slowest: int, name: str = "") -> None:
@@ -100,7 +103,7 @@ class RunExplanation:
         self._said: deque[str] = deque(maxlen=MOST_MESSAGES)
 
     def add(self, record: Record) -> None:
-        """Take the next record of the journal."""
+        """Take the next record of the journal; the first call takes the record after `begun`."""
         if isinstance(record, Said):
             self._said.append(record.text)
         for fact in self._timeline.add(record):
@@ -123,7 +126,12 @@ class RunExplanation:
             self._first_ns, self._last_ns = self._first_ns or job.end_ns, job.end_ns
 
     def document(self) -> dict[str, Any]:
-        """Return the document of `trilane explain RUN --json`. Call it after the last record."""
+        """Return the document of `trilane explain RUN --json` without `run` and `remark`.
+
+        Call it once, after the last record.
+
+        docs/explain.md describes the keys.
+        """
         budget, taken, figures = self._reckoning.close()
         slowest, usual = self._slow.close()
         unit_of = {stage.name: stage.unit for stage in self._begun.graph.stages}
@@ -168,7 +176,11 @@ class RunExplanation:
         }
 
     def _of_run(self) -> dict[str, Any]:
-        """Return the facts of the run that are known before its first frame, and how it ended."""
+        """Return the part of the document that describes the run itself and how it ended.
+
+        The run's facts are `scene`, `policy`, `edges` and `accuracy`. Its end is described by `interrupted` and
+        `failure`, both None while the run goes on, and by `messages`.
+        """
         facts, report = self._begun.facts, self._report
         return {
             "scene": config_of(self._begun).get("scene", {}).get("name"),
@@ -196,11 +208,13 @@ class RunExplanation:
         }
 
     def _of_cores(self, frame_ms: float | None, efficiency: float | None) -> dict[str, Any] | None:
-        """Return figures of the run's cores: `numbers` of the cores, and two times of a mean frame, ms.
+        """Return figures of the run's cores; None if the mean frame time, the efficiency or a unit's cores are unknown.
 
-        `had_ms`: frame time multiplied by the number of cores. `cpu_ms`: CPU time of all jobs.
-        `frame_ms`: mean frame time. `efficiency`: machine efficiency. If `frame_ms`, `efficiency` or the cores of a
-        unit are unknown, return None.
+        Keys: `numbers`: numbers of the cores.
+        `had_ms`: mean frame time multiplied by the number of cores.
+        `cpu_ms`: CPU time of all jobs of a mean frame.
+
+        `frame_ms`: mean frame time. `efficiency`: machine efficiency.
         """
         cores = sorted({core for place in self._places.values() for core in place.cores})
         if frame_ms is None or efficiency is None or not cores or len(self._places) < len(self._begun.graph.units):
@@ -209,13 +223,18 @@ class RunExplanation:
         return {"numbers": cores, "cpu_ms": efficiency * had_ms, "had_ms": had_ms}
 
     def _spare_cores(self, unit_of: Mapping[str, str]) -> int:
-        """Return the number of cores that the run had beyond one for each unit; negative if units must share cores."""
+        """Return how many more cores than units the run had. A negative number means that units had to share cores.
+
+        `unit_of`: unit of each stage.
+        """
         cpu = self._begun.facts.get("machine", {}).get("cpu", {})
         return len(cpu.get("cores_allowed", ())) - len(set(unit_of.values()))
 
 
 def explain_run(folder: Path, slowest: int = 10) -> dict[str, Any]:
-    """Return where the time of the run in `folder` went, as plain data. `slowest`: number of frames to name.
+    """Return the document of `trilane explain RUN --json` for the run in `folder`: where its time went.
+
+    `slowest`: number of slowest frames to describe.
 
     Raises BadInputError if `folder` is no run folder, or if its journal or report cannot be read.
     """
@@ -231,12 +250,16 @@ def explain_run(folder: Path, slowest: int = 10) -> dict[str, Any]:
 
 
 def explain_frame(folder: Path, number: int) -> dict[str, Any]:
-    """Return what became of frame `number` of the run in `folder`, with a row for each of its jobs, as plain data.
+    """Return what became of frame `number` of the run in `folder`, as plain data.
 
-    `outcome` is `presented`, `dropped`, `lost` or `under way`; `cause` is the key of the report that counts a dropped
-    or lost frame. `after_ms`: time from the frame's release until it was presented, dropped or lost; None while it is
-    under way. The jobs' `begin_ms` count from the release too. Raises BadInputError as `explain_run` does, and for a
-    frame that is not in the journal.
+    Keys: `schema`, `run`: folder, `frame`: number.
+    `outcome`: `presented`, `dropped`, `lost` or `under way`.
+    `cause`: key of the report that counts the dropped or lost frame; None for any other frame.
+    `after_ms`: time from the frame's release until it was presented, dropped or lost; None for a frame under way.
+    `latency_ms`: latency; None if not known.
+    `jobs`: a row for each job of the frame. Its `begin_ms` counts from the frame's release.
+
+    Raises BadInputError as `explain_run` does, and for a frame that is not in the journal.
     """
     begun, records = open_journal(folder)
     timeline = Timeline(begun.graph, begun.settings, waits=True)
@@ -327,15 +350,20 @@ def _slow_row(shown: ShownFrame, usual: Usual) -> dict[str, Any]:
 
 
 def figure_names(folder: Path) -> list[str]:
-    """Return the names of the metrics that the stages of a run report, sorted. Raises BadInputError."""
+    """Return the names of the metrics that the stages of a run report, sorted. `folder`: run folder.
+
+    Raises BadInputError as `open_journal` does.
+    """
     _, records = open_journal(folder)
     return sorted({name for record in records if isinstance(record, Worked) for name in record.figures})
 
 
 def job_rows(folder: Path, figures: Sequence[str]) -> Iterator[tuple[Any, ...]]:
-    """Yield a row for each job, in the order of their ends: COLUMNS, then `figures`; None if a job has no such figure.
+    """Yield a row for each job of the run in `folder`, in the order of the jobs' ends.
 
-    `figures`: names of metrics of the stages.
+    A row has the values of COLUMNS, then those of `figures`. The value of a metric that the job's stage lacks is None.
+
+    `figures`: names of metrics of the stages. Raises BadInputError as `open_journal` does.
     """
     values = [value for _, value in COLUMNS.values()]
     for one in _explained_jobs(*open_journal(folder)):
@@ -349,10 +377,10 @@ def check_ending(target: Path) -> None:
 
 
 def write_jobs(folder: Path, target: Path) -> int:
-    """Write every job of the run in `folder` to `target`, a .csv or .parquet file, and return their number.
+    """Write every job of the run in `folder` to `target`, a .csv or .parquet file, and return the number of jobs.
 
-    Raises BadInputError for another ending, for a folder that is no run folder, and for a place that cannot be written.
-    Raises MissingPartError if .parquet lacks its library.
+    Raises BadInputError for another ending, a folder that is no run folder, and a file that cannot be written. Raises
+    MissingPartError for .parquet if PyArrow is not installed.
     """
     check_ending(target)
     figures = figure_names(folder)
@@ -397,7 +425,8 @@ MOST_ENDS: Final = 1024  # frames whose ends are kept for each stage; far more t
 class Joins:
     """For stages with several inputs: which input of a frame came last, and how long after the input before it.
 
-    An input comes when the job that writes it ends. Inputs with `sync = "latest"` do not count: no job waits for them.
+    An input comes when the job that writes it ends. Inputs with `sync = "latest"` do not count, because no job waits
+    for them. `graph`: graph of the run.
     """
 
     def __init__(self, graph: Graph) -> None:
@@ -422,7 +451,12 @@ class Joins:
                 del kept[next(iter(kept))]
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return, by stage and input: in how many jobs this input came last, and its mean delay after the others."""
+        """Return a row for each stage with several inputs.
+
+        Keys: `stage`: name of the stage. `inputs`: two figures of each input, by the name of the stage that writes it.
+        `last`: number of jobs in which this input came last. `after_ms`: in these jobs, the mean time by which it came
+        after the input before it.
+        """
         return [
             {
                 "stage": stage,
@@ -436,7 +470,7 @@ class Joins:
 
 
 def join_text(row: dict[str, Any]) -> str:
-    """Return a sentence about a row of `Joins.rows`. The input that came last most often is named first."""
+    """Return a sentence about `row`, one of `Joins.rows`. The input that came last in most jobs is named first."""
     inputs = sorted(row["inputs"].items(), key=lambda each: -each[1]["last"])
     jobs = sum(each["last"] for _, each in inputs)
     found = [

@@ -1,8 +1,8 @@
 """Why a run takes its time, in words: its slowest frames with their reasons, what bounded it, and what to try.
 
-Rule: each cause names its evidence. A frame's time is the critical path between the presentation of the frame before
-and its own presentation. The usual length of a part of the path is its median over the run's frames. Parts that took
-longer than usual made the frame slow.
+Rule: each cause names its evidence. A frame's time is the critical path from the presentation of the frame before to
+the frame's own presentation. The usual length of a part of the path is the median over the run's frames. Parts that
+took longer than usual made the frame slow.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ T = TypeVar("T")
 
 
 class ShownFrame(NamedTuple):
-    """A presented frame and the one that was presented before it.
+    """A presented frame, and the frame that was presented before it.
 
-    `frame_ns`: time between the two presentations. `parts_ns`: parts of that time. `longest`: for each part, the job
-    with its largest piece.
+    `now`, `before`: these two frames. `frame_ns`: time between their presentations. `parts_ns`: parts of this time.
+    `longest`: for each part, the job that has the longest piece of it.
     """
 
     now: Presented
@@ -59,7 +59,11 @@ class ShownFrame(NamedTuple):
 
 
 class Usual(NamedTuple):
-    """Medians over a run: frame time, its parts, and service time by stage. `unit_of`: unit of each stage."""
+    """Medians over a run.
+
+    `frame_ns`: frame time. `parts_ns`: time of each part of the path. `service_ns`: service time by stage. `unit_of`:
+    unit of each stage.
+    """
 
     frame_ns: float
     parts_ns: Mapping[Part, float]
@@ -68,9 +72,9 @@ class Usual(NamedTuple):
 
 
 class Reason(NamedTuple):
-    """Why a frame was slow: the part (`cause`, `stage`) of its path took `longer_ms` more than usual.
+    """A reason why a frame was slow: a part of its path took longer than usual.
 
-    `text`: the reason in words.
+    `cause`, `stage`: kind and stage of the part. `longer_ms`: time beyond the usual. `text`: the reason in words.
     """
 
     cause: str
@@ -80,7 +84,10 @@ class Reason(NamedTuple):
 
 
 class EvenSample(Generic[T]):
-    """At most MOST_SAMPLES of the added values, evenly spaced; all values if they are not more."""
+    """At most MOST_SAMPLES of the added values, evenly spaced; all of them if no more than MOST_SAMPLES were added.
+
+    `values`: kept values, in the order of adding.
+    """
 
     def __init__(self) -> None:
         self.values: list[T] = []
@@ -100,7 +107,8 @@ class EvenSample(Generic[T]):
 class SlowFrames:
     """Finds the slowest frames of a run.
 
-    `paths`, `sharing`: the caller adds each job to these two first. `most`: number of slowest frames to keep.
+    `graph`: graph of the run. `paths`, `sharing`: paths and core sharing of the jobs; the caller adds each job to these
+    two before `add`. `most`: number of slowest frames to keep.
     """
 
     def __init__(self, graph: Graph, paths: Paths, sharing: Sharing, most: int) -> None:
@@ -113,7 +121,7 @@ class SlowFrames:
         self._services: dict[str, EvenSample[int]] = {stage.name: EvenSample() for stage in graph.stages}
 
     def add(self, explained: ExplainedJob) -> None:
-        """Count a job; jobs come in the order of their ends."""
+        """Count a job. Jobs must come in the order of their ends."""
         job = explained.job
         self._services[job.stage].add(job.end_ns - job.begin_ns)
         if explained.presented is not None:
@@ -122,7 +130,7 @@ class SlowFrames:
             self._look(self._waiting.popleft())
 
     def close(self) -> tuple[list[ShownFrame], Usual]:
-        """Return the slowest frames, the slowest first, and the usual lengths of parts. Call it after the last job."""
+        """Return (slowest frames, medians over the run). The slowest frame comes first. Call it after the last job."""
         while self._waiting:
             self._look(self._waiting.popleft())
         slowest = [shown for _, _, shown in sorted(self._slowest, reverse=True)]
@@ -171,7 +179,10 @@ def _median(values: Sequence[int]) -> float:
 
 
 def reasons(shown: ShownFrame, usual: Usual) -> list[Reason]:
-    """Return why a frame took longer than the median, the most important reason first; empty if it hardly did."""
+    """Return why a frame took longer than the median, the most important reason first.
+
+    If the frame took hardly longer, return no reason. `shown`: the frame. `usual`: medians over the run.
+    """
     longer_ns = shown.frame_ns - usual.frame_ns
     found = [
         (ns - usual.parts_ns.get(part, 0.0), part)
@@ -187,7 +198,10 @@ def reasons(shown: ShownFrame, usual: Usual) -> list[Reason]:
 
 
 def notes(shown: ShownFrame) -> list[str]:
-    """Return, in words, what else differs from the frame before: frames missing between the two, rung and bypass."""
+    """Return, in words, the differences from the frame before: frames missing between the two, rung and bypass.
+
+    `shown`: both frames.
+    """
     said = []
     now, before = shown.now, shown.before
     missing = now.frame - before.frame - 1
@@ -226,9 +240,11 @@ def _text(shown: ShownFrame, usual: Usual, part: Part, longer_ns: float) -> str:
 
 
 def _work(shown: ShownFrame, usual: Usual, job: JobRecord, longer_ns: float) -> str:
-    """Return, in words, why a stage's work took a larger part of the path.
+    """Return, in words, why the work of a job's stage took a larger part of the path.
 
-    Either its job took longer, or less of the job overlapped with the frame before.
+    Either the job took longer than usual, or less of it overlapped with the frame before.
+
+    `shown`, `usual`: as in `reasons`. `job`: the job. `longer_ns`: time of the part beyond the usual.
     """
     service_ns, usual_ns = job.end_ns - job.begin_ns, usual.service_ns.get(job.stage, 0.0)
     times = f"{service_ns / NS_PER_MS:.1f} ms, median {usual_ns / NS_PER_MS:.1f}"
@@ -241,9 +257,9 @@ def _work(shown: ShownFrame, usual: Usual, job: JobRecord, longer_ns: float) -> 
 
 
 def bound_text(bound: Mapping[str, Any]) -> str:
-    """Return a report's `bound` in words: the unit and the stage, what slowing them costs and their shares of the path.
+    """Return a report's `bound` in words: what slowing the unit and the stage costs, and their shares of the path.
 
-    If another unit or stage has most of the path, it is named last.
+    If another unit or stage has most of the path, the text ends with it.
     """
     named = ", and of stages most ".join(part_text(part) for part in (bound["unit"], bound["stage"]) if part)
     path = bound.get("path") or {}
@@ -252,7 +268,10 @@ def bound_text(bound: Mapping[str, Any]) -> str:
 
 
 def part_text(part: Mapping[str, Any]) -> str:
-    """Return an entry of a report's `bound`, a unit or a stage, in words, with its interval and its rivals."""
+    """Return a part of a report's `bound` in words: what slowing it costs, its share of the path, and its rivals.
+
+    `part`: value of `unit` or `stage` in the `bound`, or in the `path` of the `bound`, which has no cost.
+    """
     cost = part.get("cost")
     key, value = ("share", part["share"]) if cost is None else ("cost", cost)
     low, high = part[f"{key}_low"], part[f"{key}_high"]
@@ -291,11 +310,13 @@ OF_CAUSES = {
 def advice(
     budget: Sequence[Mapping[str, Any]], policy: str, spare_cores: int, *, is_of_file: bool = False
 ) -> list[str]:
-    """Return what a person could try, as sentences that name their reason.
+    """Return sentences about what a user could try, each with its reason.
 
-    The policy comes first, then time taken by other programs, then the largest rows. `budget`: rows of the document's
-    `budget`, the largest first. `policy`: policy of the run. `spare_cores`: cores of the machine beyond one for each
-    unit. `is_of_file`: whether a pipeline file was run. Otherwise the stages are the avatar's.
+    The policy comes first, then time that other programs took, then the largest rows.
+
+    `budget`: rows of the document's `budget`, the largest first. `policy`: policy of the run.
+    `spare_cores`: number of cores beyond one for each unit; negative if units share cores.
+    `is_of_file`: whether a pipeline file was run. If not, the stages are the avatar's.
     """
     found = []
     works = [row for row in budget if row["what"] == WORK]

@@ -1,10 +1,12 @@
 """The plan that a run makes for each frame of a scene: in words and figures, with costs and savings, and as a drawing.
 
 Rule: the run's own pose stage decides. `ScenePlan` measures how far a level of detail moves vertices on the picture,
-against the whole body in float64. Costs are computed, never measured, by the same model as `trilane predict`; joints
-count for each avatar in view, and vertices for the level of its mesh. Every figure says whether it is a bound, measured
-or computed. The drawing shows the plan for a frame of each phase, not the painted frame: the bodies' vertices, the
-bodies' rectangles and the tensor's crop rectangles.
+against the whole body in float64. Costs are computed, never measured, by the same model as `trilane predict`. In this
+model, joints count for each avatar in view, and vertices for the level of its mesh. Every figure says whether it is a
+bound, measured or computed.
+
+The drawing shows the plan for a frame of each phase, not the painted frame. Its parts are the vertices of the bodies,
+the bodies' rectangles and the tensor's crop rectangles.
 """
 
 from __future__ import annotations
@@ -54,7 +56,8 @@ GROUND, BODY, MESH, TENSOR, TEXT = (24, 26, 30), (150, 156, 166), (92, 176, 255)
 class PlannedFrame:
     """A planned frame.
 
-    `plan`: decision of the pose stage. `crops`: by avatar, the rectangle of the screen that the tensor shows.
+    `frame`: number of the frame. `plan`: decisions of the pose stage. `crops`: for each visible avatar, by its number,
+    the crop rectangle in NDC.
     """
 
     frame: int
@@ -63,7 +66,10 @@ class PlannedFrame:
 
 
 class ScenePlan:
-    """Plans the frames of a checked configuration, one after the other. `output`: (height, width) of the picture."""
+    """Plans the frames of a checked configuration, one after the other.
+
+    `config`: checked configuration. `assets`: arrays of the run. `output`: (height, width) of the picture.
+    """
 
     def __init__(self, config: RunConfig, assets: Assets) -> None:
         self.config, self._assets = config, assets
@@ -80,20 +86,27 @@ class ScenePlan:
         self._staged = staged_of(assets)
 
     def decide(self, frame: int) -> PlannedFrame:
-        """Return the plan of `frame`, as a run decides. Call it in order: the shape depends on the frame before."""
+        """Return the plan of frame number `frame`, as a run decides.
+
+        Call it for the frames in order, because the tensor's shape depends on the frame before.
+        """
         self._stage.run(frame, None, 0)
         plan = self._stage.plan
         crops = {number: Rect(*self._packet.header["avatars"][number]["rect"].tolist()) for number in plan.seen}
         return PlannedFrame(frame, plan, crops)
 
     def places(self, frame: int, avatar: int) -> F64:
-        """Return where the vertices of the whole body lie in the picture (V,2): x, y in pixels; NaN outside of it."""
+        """Return the places (V,2) of the vertices of the whole body in the picture: x, y in pixels from the top left.
+
+        Vertices outside of the picture have NaN. `frame`, `avatar`: numbers.
+        """
         return self._places(self._exact(frame, avatar), frame)
 
     def measured_px(self, frame: int, avatar: int) -> float:
-        """Return the largest distance by which the plan of `frame` moves a vertex of `avatar` in the picture, pixels.
+        """Return the largest distance by which the plan moves a vertex of an avatar in the picture, in pixels.
 
-        Call it after `decide(frame)`. Vertices that the level of the mesh leaves out do not count.
+        Call it after `decide(frame)`. Vertices that the level of the mesh leaves out do not count. If the GPU unit
+        skins, or if all vertices are outside of the picture, return 0. `frame`, `avatar`: numbers.
         """
         if not self._drawn:
             return 0.0
@@ -121,9 +134,9 @@ class ScenePlan:
 
 
 def _kept(assets: Assets, number: int) -> list[I64 | slice]:
-    """Return the vertices that each level of an avatar's mesh keeps, as indices; level 0 is the whole mesh.
+    """Return, for each level of an avatar's mesh, the vertices that the level keeps, as indices. Level 0 keeps all.
 
-    `number`: number of the avatar among the distinct ones.
+    `assets`: arrays of the run. `number`: number of the avatar among the distinct avatars.
     """
     return [slice(None), *(np.unique(level.faces).astype(np.int64) for level in mesh_levels_of(assets, number))]
 
@@ -134,7 +147,10 @@ def _packet(config: RunConfig) -> Packet:
 
 
 def phases(frames: Sequence[PlannedFrame]) -> list[list[PlannedFrame]]:
-    """Return groups of successive frames with the same work, tensor shape, visible avatars and levels."""
+    """Return the phases: groups of successive frames with the same work, tensor shape and visible avatars.
+
+    The visible avatars must also have the same levels of detail and mesh.
+    """
     groups: list[list[PlannedFrame]] = []
     for planned in frames:
         if groups and _kind(groups[-1][-1]) == _kind(planned):
@@ -150,7 +166,10 @@ def _kind(planned: PlannedFrame) -> tuple[object, ...]:
 
 
 def draw_plan(plan: ScenePlan, frames: Sequence[PlannedFrame], file: Path) -> None:
-    """Draw at most `MOST_FRAMES` of `frames`, evenly spread, into one picture, and write it as a PNG file."""
+    """Draw at most `MOST_FRAMES` of `frames`, evenly spread, into one picture, and write it as the PNG `file`.
+
+    `plan`: plan that decided `frames`. Raises BadInputError if `file` cannot be written.
+    """
     step = max(1, math.ceil(len(frames) / MOST_FRAMES))
     tiles = [_tile(plan, planned) for planned in frames[::step]]
     columns = math.ceil(math.sqrt(len(tiles)))
@@ -214,8 +233,8 @@ ALWAYS = ("pose", "composite", "present")
 class PlanExplanation:
     """An explained plan.
 
-    `document`: document of `trilane plan --json`. `plan`: the plan, and `first_frames`: the first frame of each phase,
-    both for the drawing.
+    `document`: document of `trilane plan --json`. `plan`, `first_frames`: the plan and the first frame of each phase,
+    for `draw_plan`.
     """
 
     document: dict[str, Any]
@@ -224,10 +243,12 @@ class PlanExplanation:
 
 
 def explain(checked: Checked, profile: str, performance_profile: str) -> PlanExplanation:
-    """Return the explained plan of a checked scene.
+    """Return the explained plan of the scene in `checked`.
 
-    `profile`, `performance_profile`: hardware profile and performance profile that the costs are computed with.
-    Raises BadInputError for an unknown profile.
+    `profile`: hardware profile for which the costs are computed. `performance_profile`: performance profile of its
+    units.
+
+    Raises BadInputError for an unknown profile, and for cores that were chosen for another chip than this machine.
     """
     scene, plan = checked.config.scene, ScenePlan(checked.config, checked.assets)
     networks, painters = networks_of(checked.assets), checked.config.networks_of
@@ -276,7 +297,10 @@ def explain(checked: Checked, profile: str, performance_profile: str) -> PlanExp
 
 
 class _Bodies:
-    """The bodies of the avatars, and the parts that each level of detail leaves out."""
+    """The bodies of the avatars, and the parts that each level of detail leaves out.
+
+    `left_out`: cached function from (number of the avatar, level of detail) to the names of the parts left out.
+    """
 
     def __init__(self, checked: Checked) -> None:
         folders = distinct(checked.config)
@@ -285,7 +309,7 @@ class _Bodies:
         self.left_out = cache(self._left_out)
 
     def triangles(self, avatar: int) -> int:
-        """Return the number of triangles of the avatar's whole mesh."""
+        """Return the number of triangles of the whole mesh of avatar number `avatar`."""
         return len(self._bodies[avatar].faces)
 
     def _left_out(self, avatar: int, level: int) -> list[str]:
@@ -293,7 +317,11 @@ class _Bodies:
 
 
 def _image(checked: Checked) -> dict[str, Any]:
-    """Return the size of a planned tensor, as a share of its network's own pixels, and the PSNR that this costs."""
+    """Return the part of the document about the size of planned tensors.
+
+    Keys: `work`: pixels of a tensor, as a share of its network's own pixels. `psnr_loss_db`: PSNR that this size costs;
+    None if not known. `source`: source of both. If the scene fixes the size, both are None.
+    """
     if not checked.config.scene.plans_tensor:
         return {"work": None, "psnr_loss_db": None, "source": "the scene fixes the tensor's size"}
     work = checked.config.works[0]
@@ -364,7 +392,7 @@ def _most(group: Sequence[PlannedFrame]) -> float:
 def _why(group: Sequence[PlannedFrame], is_measured: bool) -> str:
     """Return, in words, why the tensor of a phase has its size.
 
-    `is_measured`: whether the size follows the table in each avatar's manifest.
+    `group`: frames of the phase. `is_measured`: whether the size follows the table in each avatar's manifest.
     """
     first = group[0].plan
     if first.work in WHY:
@@ -387,9 +415,9 @@ def _saved(cost: FrameCost, fixed: FrameCost) -> dict[str, float]:
 
 
 def _usual(frames: Sequence[PlannedFrame], costs: CostModel) -> tuple[Shape | None, int, Networks]:
-    """Return the most frequent kind of a frame with all work: tensor shape, number of avatars in view, their networks.
+    """Return (tensor shape, number of avatars in view, numbers of their networks) that most frames with all work have.
 
-    Without such a frame, return None, 0 and the first network.
+    If no frame has all work, return (None, 0, FIRST).
     """
     full = [one.plan for one in frames if one.plan.work is FrameWork.FULL]
     kinds = Counter((plan.shape, *costs.in_view(plan)) for plan in full)
@@ -397,7 +425,11 @@ def _usual(frames: Sequence[PlannedFrame], costs: CostModel) -> tuple[Shape | No
 
 
 def _totals(frames: Sequence[PlannedFrame], costs: CostModel) -> dict[str, Any]:
-    """Add up the costs of all frames: as planned, and with a tensor of shape `FIXED` for the same avatars."""
+    """Return the sums of the costs of all frames, and the mean frame times.
+
+    Keys with the prefix `fixed_` are for tensors of the shape `FIXED` with the same avatars, other keys for the plan.
+    The keys have the meaning of the fields of `FrameCost`; `frame_ms` is a mean.
+    """
     planned = [_cost(one.plan, costs) for one in frames]
     fixed = [costs.of(FIXED, *costs.in_view(one.plan)) for one in frames]
     return {
@@ -416,8 +448,8 @@ def _totals(frames: Sequence[PlannedFrame], costs: CostModel) -> dict[str, Any]:
 class FrameCost:
     """The cost of one frame.
 
-    `pixels`: pixels of its tensors. `gmac`: multiply-accumulates of its networks, in 1e9. `work_ms`: time of all
-    stages, one after the other. `frame_ms`: frame time if all frames are like this one and pipelined.
+    `pixels`: pixels of its tensors. `gmac`: multiply-accumulates of its networks, in 1e9.
+    `work_ms`: sum of the times of all stages. `frame_ms`: frame time if all frames are like this frame and pipelined.
     """
 
     pixels: int
@@ -430,9 +462,10 @@ class FrameCost:
 
 
 def least_frame_ms(chip: Profile, times: Mapping[tuple[str, UnitName], float]) -> float:
-    """Return the least frame time of pipelined frames: the time of the busiest core, or the display's if longer.
+    """Return the least frame time of pipelined frames in ms: the time of the busiest core, or of the display if longer.
 
-    `times`: time of each stage's job, ms, by stage and unit. A unit without a core counts as a core of its own.
+    A unit without a core counts as a core of its own. `chip`: hardware profile. `times`: time of each stage's job in
+    ms, by (stage, unit).
     """
     worker = workers_of(chip)
     busy = (sum(ms for (_, unit), ms in times.items() if worker[unit] == one) for one in set(worker.values()))
@@ -440,7 +473,11 @@ def least_frame_ms(chip: Profile, times: Mapping[tuple[str, UnitName], float]) -
 
 
 class CostModel:
-    """The costs of frames on the chip `profile`. Raises BadInputError for an unknown profile."""
+    """The costs of frames on a chip, by the model of `trilane predict`.
+
+    `networks`: networks of the scene. `profile`: name of the chip's hardware profile. `performance_profile`:
+    performance profile of its units. `of`: the function `_of`, which returns the cost of a frame, with a cache.
+    """
 
     def __init__(
         self,
@@ -449,23 +486,32 @@ class CostModel:
         performance_profile: str,
         painters: Callable[[Iterable[int]], Networks] = lambda _avatars: FIRST,
     ) -> None:
-        """`painters`: function from the numbers of avatars to the numbers of the networks that paint them."""
+        """Load the hardware profile. Raises BadInputError for an unknown profile, or for one without a chip.
+
+        `painters`: function from the numbers of avatars to the numbers of the networks that paint them. Other
+        parameters: see `CostModel`.
+        """
         self._networks, self._chip, self._painters = networks, load_runnable(profile), painters
         self._corners = corners_of(self._chip, performance_profile)
         self.of = cache(self._of)
 
     def in_view(self, plan: FramePlan) -> tuple[int, Networks]:
-        """Return the number of avatars that a frame shows, and the numbers of the networks that paint them."""
+        """Return (number of avatars that a frame shows, numbers of the networks that paint them).
+
+        With nobody in view, the networks are FIRST. `plan`: plan of the frame.
+        """
         return len(plan.seen), self._painters(plan.seen) or FIRST
 
     def _of(
         self, shape: Shape | None, avatars: int = 1, networks: Networks = FIRST, meshes: float | None = None
     ) -> FrameCost:
-        """Return the cost of a frame with `avatars` avatars in view. `shape`: shape of its tensors; None for no tensor.
+        """Return the cost of a frame with `avatars` avatars in view.
 
-        `networks`: numbers of the networks that paint the avatars, each on a tensor of its own. `meshes`: number of
-        their vertices over that of a whole mesh; None for whole meshes. With nobody in view, the pose of one avatar
-        still counts, because the pose stage looks for somebody.
+        With nobody in view, the pose of one avatar still counts, because the pose stage looks for somebody.
+
+        `shape`: shape of the frame's tensors; None for no tensor.
+        `networks`: numbers of the networks that paint the avatars, each from a tensor of its own.
+        `meshes`: number of drawn vertices, counted in whole meshes; None for a whole mesh of each avatar.
         """
         plan = replace(self._plan(shape, avatars, networks), meshes=meshes)
         times = stage_times_ms(self._chip, plan, self._corners)
@@ -482,10 +528,15 @@ class CostModel:
         networks: Networks = FIRST,
         asked: Mapping[str, tuple[int, ...]] | None = None,
     ) -> dict[str, Any]:
-        """Return the best placement of the units for frames of `shape` that show `avatars` avatars, and why.
+        """Return the best placement of the units for a typical frame, and why, by the model of `trilane predict`.
 
-        The model of `trilane predict` decides. `networks`: as in `of`. `asked`: cores that the user chose for units of
-        this machine. Raises BadInputError if cores are chosen for another chip.
+        Keys: `units`: cores and threads of each unit. `predicted_ms`: predicted frame time. `why`: the reason in words.
+        On another chip than this machine, the first two are None.
+
+        `shape`, `avatars`, `networks`: as in `_of`. `asked`: cores that the user chose, by unit of this machine; None
+        for none.
+
+        Raises BadInputError if cores are chosen for another chip than this machine.
         """
         asked = asked or {}
         if self._chip.name != HOST:

@@ -1,9 +1,9 @@
-"""The trace of a run from the records of its journal: tracks of units, stages and frames, on either clock.
+"""The trace of a run from the records of its journal: tracks of units, stages and frames, on the host or virtual clock.
 
 Rule: memory is bounded by what the run has in flight. A slice is a recorded job, or the time between two jobs with its
-cause; only measured times are drawn. The slices of a unit do not overlap, so they sum to its accounts. A frame is late
-as in the report: past its deadline or, without a deadline, after a longer frame time than the scene's rate allows. A
-file is complete or absent.
+cause; only recorded times are drawn. The slices of a unit do not overlap, so they sum to the unit's accounts. A frame
+is late as in the report: it was presented past its deadline. Without a deadline, it is late if its frame time is longer
+than the scene's rate allows. A trace file is complete or absent.
 """
 
 from __future__ import annotations
@@ -53,7 +53,11 @@ Item = TypeVar("Item")
 
 
 class RunTracks:
-    """One run as a group of tracks of `sink`. `name`: name of the group. `number`: number of the run in the trace."""
+    """One run as a group of tracks of `sink`.
+
+    `begun`: first record of the run's journal. `name`: name of the group. `number`: number of the run in the trace,
+    from 0.
+    """
 
     def __init__(self, sink: Sink, begun: Begun, name: str = "trilane", number: int = 0) -> None:
         self._sink, self._begun = sink, begun
@@ -69,7 +73,7 @@ class RunTracks:
         self._end_ns = 0
 
     def add(self, record: Record) -> None:
-        """Take the next record of the journal."""
+        """Take the next record of the journal; the first call takes the record after `begun`."""
         if isinstance(record, Stepped):
             self._end_step(record.now_ns)
         had_started = self._timeline.start_ns is not None
@@ -92,7 +96,10 @@ class RunTracks:
                 self._end_ns = record.now_ns
 
     def close(self) -> None:
-        """Write the last idle slices, the slices that still wait, and the last counters; end the run's slice."""
+        """Write the last idle slices, the slices that still wait, and the last counters.
+
+        End the slice of the whole run.
+        """
         for piece in self._timeline.end():
             self._units.idle(piece)
         self._units.close()
@@ -101,7 +108,10 @@ class RunTracks:
             self._sink.end(self._run, max(self._now_ns, self._end_ns))
 
     def _end_step(self, now_ns: int) -> None:
-        """Write the counters of the step before the one at `now_ns`; at the first step, begin the run's slice."""
+        """Write the counters of the step before the step at `now_ns`.
+
+        At the first step, begin the slice of the whole run.
+        """
         if self._now_ns is None:
             self._sink.begin(self._run, now_ns, "run", _facts_of(self._begun))
         self._count()
@@ -125,14 +135,17 @@ class RunTracks:
 
 
 class TraceWriter:
-    """The trace of a run as Perfetto's packets. `file`: opened for bytes; its opener closes it after `close`."""
+    """Writes the trace of a run as Perfetto's packets.
+
+    `file`: file for bytes; the caller closes it after `close`. `begun`: first record of the run's journal.
+    """
 
     def __init__(self, file: IO[bytes], begun: Begun) -> None:
         self._sink = PacketSink(file)
         self._tracks = RunTracks(self._sink, begun)
 
     def add(self, record: Record) -> None:
-        """Take the next record of the journal."""
+        """Take the next record of the journal; the first call takes the record after `begun`."""
         self._tracks.add(record)
 
     def close(self) -> None:
@@ -142,14 +155,14 @@ class TraceWriter:
 
 
 def write_trace(records: Iterable[Record], file: IO[bytes]) -> None:
-    """Write the trace of a journal's `records` to `file` as Perfetto's packets."""
+    """Write the trace of a run to `file` as Perfetto's packets. `records`: all records of the run's journal."""
     write_tracks(PacketSink(file), {"trilane": records})
 
 
 def write_tracks(sink: Sink, runs: Mapping[str, Iterable[Record]]) -> None:
     """Write several runs to one trace, one after the other, and close `sink`.
 
-    `runs`: name of a group of tracks -> records of the run's journal.
+    `runs`: name of a group of tracks -> all records of the run's journal.
     """
     for number, (name, records) in enumerate(runs.items()):
         tracks: RunTracks | None = None
@@ -164,7 +177,7 @@ def write_tracks(sink: Sink, runs: Mapping[str, Iterable[Record]]) -> None:
 
 
 def _facts_of(begun: Begun) -> dict[str, Any]:
-    """Return the facts of a run that are known before its first frame, and the clock of its times."""
+    """Return the notes of the whole run's slice: facts known before its first frame, and the clock of its times."""
     clocks = {"host": "CLOCK_MONOTONIC", "virtual": "simulated time from 0 on"}
     times = f"ns of {clocks.get(str(begun.facts.get('clock')), 'an unknown clock')}"
     settings = {key: value for key, value in asdict(begun.settings).items() if not isinstance(value, Sequence) or value}
@@ -172,7 +185,11 @@ def _facts_of(begun: Begun) -> dict[str, Any]:
 
 
 def write_run(records: Iterable[Record], target: Path, *, chrome: bool = False) -> None:
-    """Write the trace of a run's journal to `target`. `chrome`: whether as Chrome's JSON. Raises BadInputError."""
+    """Write the trace of a run to the file `target`. Raises BadInputError if the file cannot be written.
+
+    `records`: all records of the run's journal. `chrome`: whether to write Chrome's JSON in place of Perfetto's
+    packets.
+    """
     with write_atomically(target) as draft:
         if chrome:
             with draft.open("w", encoding="utf-8") as text:
@@ -183,9 +200,11 @@ def write_run(records: Iterable[Record], target: Path, *, chrome: bool = False) 
 
 
 def write_predicted(runs: Mapping[str, Simulation], facts: Mapping[str, Any], target: Path) -> None:
-    """Write the trace of recorded runs in virtual time to `target`. Raises BadInputError.
+    """Write the trace of recorded runs in virtual time to the file `target`, as Perfetto's packets.
 
-    `runs`: name of a group of tracks -> run. `facts`: facts that all runs have, as in `Begun`.
+    `runs`: name of a group of tracks -> run, with its recording. `facts`: facts that all runs have, as in `Begun`.
+
+    Raises BadInputError if the file cannot be written.
     """
     records: dict[str, Iterable[Record]] = {}
     begun = {"clock": "virtual", "target_period_ns": 0, **facts}
@@ -199,7 +218,7 @@ def write_predicted(runs: Mapping[str, Simulation], facts: Mapping[str, Any], ta
 class _FrameTracks:
     """Tracks of a run's frames, below the track `parent`: expected, presented, and lost or dropped frames.
 
-    `rank`: place of the first track among the tracks below `parent`.
+    `begun`: first record of the run's journal. `rank`: place of the first of these tracks among those below `parent`.
     """
 
     def __init__(self, sink: Sink, begun: Begun, parent: int, rank: int) -> None:
@@ -228,15 +247,17 @@ class _FrameTracks:
         self._before_ns = frame.end_ns
 
     def count(self, at_ns: int, in_flight: int) -> None:
-        """Write how many frames are in flight, if that has changed."""
+        """Write that `in_flight` frames are in flight at `at_ns`. If the number has not changed, write nothing."""
         if in_flight != self._flying:
             self._flying = in_flight
             self._sink.count(self._in_flight, at_ns, self._flying)
 
     def _expect(self, frame: int, release_ns: int, before_ns: int | None) -> int:
-        """Write the slice of time in which a frame is expected, and return its end, when the frame is due.
+        """Write the slice of time in which a frame is expected, and return its end in ns, when the frame is due.
 
-        If nothing says when it is due, write nothing and return NEVER. `before_ns`: as for `due_ns`.
+        If nothing says when the frame is due, write nothing and return NEVER.
+
+        `frame`: number of the frame. `release_ns`: time of its release. `before_ns`: as for `due_ns`.
         """
         until_ns = due_ns(self._settings.due_from_ns(release_ns), before_ns, self._target_ns)
         if until_ns != NEVER:
@@ -255,8 +276,9 @@ class _UnitTracks:
     """Tracks of a run's units, below the track `parent`: jobs, idle time by cause, and the unit's stages.
 
     A job that was dispatched ahead is shown from its begin on.
-    `rank`: place of the first track among the tracks below `parent`.
-    `flows_from`: number of the arrow that connects the jobs of frame 0; frame n has arrow `flows_from` + n.
+
+    `graph`: graph of the run. `rank`: place of the first of these tracks among those below `parent`.
+    `flows_from`: number of the arrow that connects the jobs of frame 0. Frame n has the arrow `flows_from` + n.
     """
 
     def __init__(self, sink: Sink, graph: Graph, parent: int, rank: int, flows_from: int = 1) -> None:
@@ -276,7 +298,7 @@ class _UnitTracks:
         self._figures: dict[tuple[str, str], float] = {}
 
     def start(self, at_ns: int) -> None:
-        """Begin the time that the ledger accounts for."""
+        """Begin the units' tracks at `at_ns`, where the time that the ledger accounts for begins."""
         for tiles in self._tiles.values():
             tiles.start(at_ns)
 
@@ -294,7 +316,10 @@ class _UnitTracks:
         self._write(piece.unit)
 
     def count(self, at_ns: int, waiting: Mapping[str, int]) -> None:
-        """Write how many frames wait before each stage, if their number has changed."""
+        """Write how many frames wait before each stage at `at_ns`. A stage whose number has not changed is left out.
+
+        `waiting`: number of waiting frames by stage.
+        """
         for stage, frames in waiting.items():
             counter, depth = self._depths.get(stage, (0, 0))
             if frames == depth:
@@ -320,7 +345,10 @@ class _UnitTracks:
                 self._sink.slice(track, begin_ns, end_ns, piece.stage, _notes_of(piece), flow)
 
     def _count_figures(self, job: JobRecord, figures: Mapping[str, float]) -> None:
-        """Write, at the job's begin, each counter of the stage that has changed. A counter starts with the value 0."""
+        """Write, at the begin of `job`, each counter of its stage that has changed. A counter starts with the value 0.
+
+        `figures`: metrics of the job, by name.
+        """
         for rank, (name, (title, unit)) in enumerate(FIGURE_COUNTERS.items(), start=1):
             key, value = (job.stage, name), figures.get(name)
             if value is None or self._figures.get(key, 0) == value:
@@ -337,14 +365,14 @@ def _notes_of(job: JobRecord) -> dict[str, int | str]:
 
 
 def _if_any(**notes: int | str) -> dict[str, int | str]:
-    """Return the notes that are neither 0 nor empty."""
+    """Return those of `notes` that are neither 0 nor empty."""
     return {name: value for name, value in notes.items() if value}
 
 
 class Tiles(Generic[Item]):
     """Puts the slices of one track in order, without overlap.
 
-    A unit always has a job or is idle, so a slice can be written as soon as earlier slices fill the time up to its
+    A unit always has a job or is idle. Therefore a slice can be written when earlier slices fill the time up to its
     begin. If a slice begins within the written time, its begin is cut.
     """
 
@@ -354,7 +382,7 @@ class Tiles(Generic[Item]):
         self._count = 0
 
     def add(self, begin_ns: int, end_ns: int, item: Item) -> None:
-        """Add a slice of the track."""
+        """Add a slice of the track, from `begin_ns` to `end_ns`. `item`: content of the slice, which `take` yields."""
         self._count += 1
         heappush(self._waiting, (begin_ns, end_ns, self._count, item))
 
@@ -363,7 +391,10 @@ class Tiles(Generic[Item]):
         self._until_ns = at_ns
 
     def take(self, *, rest: bool = False) -> Iterator[tuple[int, int, Item]]:
-        """Yield (begin, end, item) of each slice that can be written now; with `rest`, of every slice that is left."""
+        """Yield (begin, end, item) of each slice that can be written now, times in ns, in order.
+
+        `rest`: whether to yield every slice that is left.
+        """
         waiting = self._waiting
         while waiting and (rest or len(waiting) > MOST_WAITING or self._reaches(waiting[0][0])):
             begin_ns, end_ns, _, item = heappop(waiting)
@@ -377,9 +408,9 @@ class Tiles(Generic[Item]):
 
 
 class Lanes:
-    """Distributes overlapping slices over lanes, numbered from 0, so that no slices in a lane overlap.
+    """Distributes overlapping slices over lanes, numbered from 0, so that the slices of a lane do not overlap.
 
-    `most`: largest number of lanes. If more slices overlap, the begin of the last one is cut.
+    `most`: largest number of lanes. If more slices than lanes overlap, the begin of the last slice is cut.
     """
 
     def __init__(self, most: int) -> None:
@@ -387,7 +418,7 @@ class Lanes:
         self._until_ns: list[int] = []
 
     def place(self, begin_ns: int, end_ns: int) -> tuple[int, int]:
-        """Return the lane of a slice, and where the slice begins in it."""
+        """Return (number of the lane of a slice, time in ns at which the slice begins in this lane)."""
         for lane, until_ns in enumerate(self._until_ns):
             if until_ns <= begin_ns:
                 self._until_ns[lane] = end_ns

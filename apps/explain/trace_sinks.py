@@ -1,8 +1,8 @@
 """The formats of a trace: Perfetto's packets (ui.perfetto.dev) or Chrome's JSON (chrome://tracing).
 
-Rule: both have tracks, slices, instants, counters and flows. Times are ns of the run's clock. The caller writes the
-slices of a track in the order of their begins, without overlap. Memory is bounded: packets are written in blocks, JSON
-event by event. A file that ends early is readable up to its last block.
+Rule: both formats have tracks, slices, instants, counters and flow arrows. Times are ns of the run's clock. The caller
+writes the slices of a track in the order of their begins, without overlap. Memory is bounded: packets are written in
+blocks, JSON event by event. An incomplete file is readable up to its last block or event.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ CATEGORY: Final = "frame"
 
 
 class FlowArrow(NamedTuple):
-    """The arrow that goes through a slice: it connects the jobs of a frame.
+    """The arrow that connects the jobs of a frame, as it goes through one slice.
 
     `number`: number of the arrow, above 0. `begins`, `ends`: whether the arrow begins or ends at the slice.
     """
@@ -40,42 +40,53 @@ class FlowArrow(NamedTuple):
 
 
 class Sink(Protocol):
-    """A writer of a trace file. Tracks have numbers, which its methods return and take."""
+    """A writer of a trace file. Tracks have numbers, which its methods return and take.
+
+    `notes` of a slice or event are shown with it, by name.
+    """
 
     def recurring(self, names: Iterable[str]) -> None:
         """Announce names of slices and instants that will occur often."""
 
     def process(self, name: str) -> int:
-        """Begin a group of tracks; return the number of its top track."""
+        """Begin a group of tracks named `name`, and return the number of its top track."""
 
     def track(self, name: str, parent: int, rank: int = 0) -> int:
-        """Begin a track below the track `parent`; return its number. Tracks of equal name may be shown as one.
+        """Begin a track named `name` below the track `parent`, and return its number.
+
+        A viewer may show tracks of equal name as one track.
 
         `rank`: place among the tracks below `parent`, the smallest on top.
         """
 
     def counter_track(self, name: str, parent: int, rank: int = 0, unit: str = "") -> int:
-        """Begin a track of a counter; return the track's number. `unit`: unit of the values, such as "B"."""
+        """Begin a track of a counter `name` below the track `parent`, and return its number.
+
+        `rank`: as in `track`. `unit`: unit of the values, such as "B"; "" for none.
+        """
 
     def slice(
         self, track: int, begin_ns: int, end_ns: int, name: str, notes: Notes = NO_NOTES, flow: FlowArrow | None = None
     ) -> None:
-        """Write a slice of a track. `flow`: arrow that goes through it."""
+        """Write the slice `name` of the track number `track`, from `begin_ns` to `end_ns`.
+
+        `notes`: notes of the slice. `flow`: arrow that goes through the slice; None for no arrow.
+        """
 
     def begin(self, track: int, at_ns: int, name: str, notes: Notes = NO_NOTES) -> None:
-        """Begin a slice; `end` ends it."""
+        """Begin a slice of the track at `at_ns`; a call of `end` ends the slice."""
 
     def end(self, track: int, at_ns: int) -> None:
         """End the slice of the track that `begin` began."""
 
     def instant(self, track: int, at_ns: int, name: str, notes: Notes = NO_NOTES) -> None:
-        """Write an event without duration."""
+        """Write an event without duration on the track."""
 
     def count(self, track: int, at_ns: int, value: float) -> None:
-        """Give the counter `track` this value from `at_ns` on."""
+        """Give the counter `track` the value `value` from `at_ns` on."""
 
     def close(self) -> None:
-        """Write the rest to the file, which stays open."""
+        """Write the rest of the trace to the file. The file stays open."""
 
 
 class PacketSink:
@@ -83,8 +94,9 @@ class PacketSink:
 
     The first `plain_bytes` bytes are plain packets, so any protobuf reader can read a trace of some minutes. Later
     packets are compressed in blocks (`TracePacket.compressed_packets`, zlib), as Perfetto's own recorder does.
-    Recurring names are interned: the first packet that uses a name defines its number. `file`: opened for writing
-    bytes; its opener closes it after `close`.
+    Recurring names are interned: the first packet that uses a name defines the name's number.
+
+    `file`: file for bytes; the caller closes it after `close`.
     """
 
     def __init__(self, file: IO[bytes], plain_bytes: int = PLAIN_BYTES) -> None:
@@ -158,7 +170,12 @@ class PacketSink:
         return self._tracks
 
     def _named(self, track: int, at_ns: int, kind: int, name: str, notes: Notes) -> Any:
-        """Return a packet with a named event. Recurring names and the names of notes are interned."""
+        """Return a packet with the event `name` on the track number `track`.
+
+        Recurring names and names of notes are interned.
+
+        `kind`: as in `_packet`.
+        """
         packet = _packet(track, at_ns, kind)
         event = packet.track_event
         if name in self._recurring:
@@ -189,7 +206,10 @@ class PacketSink:
 
 @lru_cache(maxsize=1024)
 def _varint(number: int) -> bytes:
-    """Return `number` as a protobuf varint: seven bits a byte, lowest first; the top bit is set except in the last."""
+    """Return `number` as a protobuf varint: seven bits a byte, the lowest first.
+
+    All bytes but the last have the top bit set.
+    """
     groups = bytearray()
     while number > 0x7F:
         groups.append(number & 0x7F | 0x80)
@@ -198,7 +218,10 @@ def _varint(number: int) -> bytes:
 
 
 def _packet(track: int, at_ns: int, kind: int) -> Any:
-    """Return a packet with an event of a track. `kind`: a type of `TrackEvent`, such as TYPE_INSTANT."""
+    """Return a packet with an event at `at_ns` on the track number `track`.
+
+    `kind`: type of the event in `TrackEvent`, such as TYPE_INSTANT.
+    """
     packet = TracePacket(timestamp=at_ns, trusted_packet_sequence_id=SEQUENCE)
     event = packet.track_event
     event.type, event.track_uuid = kind, track
@@ -208,7 +231,7 @@ def _packet(track: int, at_ns: int, kind: int) -> Any:
 def _intern(numbers: dict[str, int], name: str, packet: Any, table: str) -> int:
     """Give `name` the next number, define it in `packet`, and return the number.
 
-    `table`: field of the packet's interned data that defines such names.
+    `numbers`: numbers by name so far. `table`: field of the packet's interned data that defines such names.
     """
     numbers[name] = number = len(numbers) + 1
     getattr(packet.interned_data, table).add(iid=number, name=name)
@@ -216,7 +239,7 @@ def _intern(numbers: dict[str, int], name: str, packet: Any, table: str) -> int:
 
 
 def _fill(note: Any, value: Any) -> None:
-    """Set the debug annotation `note` to `value`, which may be nested."""
+    """Set the debug annotation `note` to `value`, a number, a text or None, also nested in mappings and sequences."""
     if isinstance(value, bool):
         note.bool_value = value
     elif isinstance(value, int) and -LONGEST_INT <= value < LONGEST_INT:
@@ -239,8 +262,9 @@ class ChromeSink:
     """A `Sink` that writes Chrome's JSON, event by event.
 
     The format is the Trace Event Format, docs.google.com/document/d/1CvAClvFfyA5R-PhYUmn5OOQtYMH4h6I0nSsKchNAySU. In
-    the file, a group of tracks is a process, and a track is a thread; times are in us. `file`: opened for writing text;
-    its opener closes it after `close`.
+    the file, a group of tracks is a process, and a track is a thread. Times in the file are in us.
+
+    `file`: file for text; the caller closes it after `close`.
     """
 
     def __init__(self, file: IO[str]) -> None:
@@ -303,7 +327,7 @@ class ChromeSink:
     def _child(self, name: str, parent: int) -> int:
         """Begin a track below `parent`, and return its number.
 
-        The name of a parent track is put in front of the name, because Chrome's threads have no hierarchy.
+        If `parent` is no group, its name is put in front of `name`, because Chrome's threads have no hierarchy.
         """
         pid = self._process_of[parent]
         number = self._new(name if parent == pid else f"{self._names[parent]}: {name}")

@@ -1,6 +1,6 @@
 """Predictions for a pipeline file on a chip: for the file as it is, and for a variant with each `--set`.
 
-Rule: nothing is printed here and no Python of the file is imported. `trilane.hw_profiles` computes the answers.
+Rule: this module prints nothing and imports no Python of the file. `trilane.hw_profiles` computes the answers.
 """
 
 from __future__ import annotations
@@ -38,9 +38,11 @@ APART: Final = "networks are priced alone: units that work at once share memory 
 
 
 def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str], None]) -> dict[str, Any]:
-    """Return the document of `trilane predict FILE.toml --json`: predictions for `path` and its variants.
+    """Return the document of `trilane predict FILE.toml --json`, which predicts the file `path` and its variants.
 
-    `say`: function that gets a message before an action that takes seconds. Raises BadInputError.
+    `options`: options of the prediction. `say`: function that gets a message before an action that takes seconds.
+
+    Raises BadInputError for an unknown chip, a file or change that cannot be used, or a stage without a time.
     """
     chips = _Chips(options, say)
     measured, of_run = MeasuredStages({}, "", chips.name), None
@@ -75,7 +77,7 @@ def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str],
 
 
 def _clock(measured: MeasuredStages) -> list[str]:
-    """Return a list with a note on the part of a job that counts as its time; empty if no times are measured."""
+    """Return a list with a note that says which part of a job counts as its time; empty if no times were measured."""
     return [FROM_HAND_OVER if measured.chip == HOST else WITH_A_CORE] if measured.times else []
 
 
@@ -84,9 +86,9 @@ def _without_share(file: PipelineFile) -> list[str]:
 
 
 def _without_base(lacking: Sequence[str]) -> list[str]:
-    """Return a list with a note that only variants are predicted; empty if the file as it is has all times.
+    """Return a list with a note that only variants are predicted; empty if no stage lacks a time.
 
-    `lacking`: stages without a time in the file.
+    `lacking`: names of the stages without a time in the file.
     """
     return [NO_BASE.format(", ".join(lacking))] if lacking else []
 
@@ -94,9 +96,16 @@ def _without_base(lacking: Sequence[str]) -> list[str]:
 class _Chips:
     """The chip of a prediction, with its units in the precision that each network needs.
 
-    `name`: name of the requested chip. Without a request, it is HOST if a run was measured, else the default chip.
-    `used`: profile of the chip; None until it is loaded, which happens if it is requested or a network needs it.
-    `assumed`: stage and assumed precision of each network whose file states no precision, as texts in order.
+    `options`, `say`: as in `predict_asked_file`.
+
+    `name`: name of the requested chip. If no chip is requested, the name is HOST if the options name a measured run,
+    and the default chip if they name no run.
+
+    `used`: profile of the chip; None until the profile is loaded. It is loaded if it is requested, or when a network
+    needs it.
+
+    `assumed`: texts "STAGE PRECISION" as keys, in order, for networks whose file states no precision; the values are
+    None.
     """
 
     def __init__(self, options: PredictOptions, say: Callable[[str], None]) -> None:
@@ -108,9 +117,10 @@ class _Chips:
         self.name = self.used.name if self.used else HOST if options.measured else options.profile
 
     def chip_for(self, name: str, stage: OnnxStage, graph: GraphFile, unit: UnitName) -> Profile:
-        """Return the chip whose `unit` has the precision and runtime of the network `graph` of `stage`.
+        """Return the chip whose unit `unit` has the precision and runtime of the network `graph` of `stage`.
 
-        `name`: name of the stage. If the chip is this machine, calls of the network are measured first.
+        If the chip is this machine, `unit` is its unit for networks, and no precision is requested, calls of the
+        network are measured first. `name`: name of the stage.
         """
         options, asked = self._options, stage.precision or self._options.numbers
         key = graph.path, tuple(sorted(stage.shapes.items())), unit, asked, stage.runtime
@@ -128,12 +138,16 @@ class _Chips:
 
 
 def _measured(folder: Path, chip: str) -> MeasuredStages:
-    """Return the times of a run's jobs by stage, to predict a run on `chip`. `folder`: run folder. `chip`: its name.
+    """Return the times of a run's jobs by stage, to predict a run on a chip.
 
-    On this machine, a job's time counts from the moment when the unit gets the job. A unit whose core is busy with
-    other work begins later, and this delay counts too. Other programs of this machine take no core of a chip.
-    Therefore, for a chip, the time in which the unit had no core is left out. This time is exact for a unit with one
+    On this machine, a job's time counts from the moment when the unit gets the job. If the core is busy with other
+    work, the unit begins later, and this delay counts too. On a chip, other programs of this machine take no core.
+    Therefore the time in which the unit had no core is left out for a chip. This time is exact for a unit with one
     thread (docs/decisions/preempted-time.md).
+
+    `folder`: run folder. `chip`: name of the chip; HOST for this machine.
+
+    Raises BadInputError for a folder without a journal, or a broken journal.
     """
     samples: dict[str, list[float]] = {}
     free_ns: dict[str, int] = {}
@@ -149,15 +163,18 @@ def _measured(folder: Path, chip: str) -> MeasuredStages:
 
 
 def _trust_in(folder: Path) -> Trust:
-    """Return whether the run in `folder` can be trusted, with reasons. A run without a report is not trusted."""
+    """Return whether the run in `folder` can be trusted, with reasons. A run without a report is not trusted.
+
+    Raises BadInputError if the report cannot be read.
+    """
     return trust_of(read_report(folder).as_json() if (folder / "report.json").exists() else {})
 
 
 def _with_share(file: PipelineFile, measured: MeasuredStages) -> PipelineFile:
     """Return `file` with the measured share of frames that took the bypass.
 
-    A file without a bypass, or with a share or pattern of its own, is returned unchanged. This also holds if the stage
-    before the bypass has no measured jobs.
+    A file without a bypass, or with a share or pattern of its own, is returned unchanged. If the stage where the bypass
+    begins has no measured jobs, the file is also returned unchanged.
     """
     if file.bypass is None or file.bypass[1].taken is not None:
         return file

@@ -1,7 +1,7 @@
 """The pipelines that share a chip in `trilane predict --beside`: scenes, networks and pipeline files.
 
-Rule: each frame of a scene is planned by the code of a run's pose stage, as in `trilane plan`. A pipeline file is read
-as for `trilane predict FILE.toml`, and no Python of it is imported.
+Rule: the code of a run's pose stage plans each frame of a scene, as in `trilane plan`. A pipeline file is read as in
+`trilane predict FILE.toml`, and no Python of the file is imported.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ FORM = "SCENE, SCENE@RATE or NETWORK.onnx@RATE, with :gpu or :dsp behind the rat
 class AskedPipeline(NamedTuple):
     """A pipeline as typed on the command line.
 
-    `text`: the text as typed, such as `face.onnx@30:gpu`. `what`: part before the @: a scene, network or pipeline file.
+    `text`: the whole text, such as `face.onnx@30:gpu`. `what`: part before the @, a scene, network or pipeline file.
     `fps`: frames a second; None for the pipeline's own rate. `unit`: unit of the network; None if not given.
     """
 
@@ -59,7 +59,7 @@ class AskedPipeline(NamedTuple):
 def asked(text: str) -> AskedPipeline:
     """Return the pipeline that `text` describes: SCENE, SCENE@RATE, or another of the forms in FORM.
 
-    An @ in the name of a file is allowed. Raises BadInputError.
+    An @ in the name of a file is allowed. Raises BadInputError for a text of another form.
     """
     what, at, rate = text.rpartition("@")
     if not at or text.endswith((ENDING, NETWORK_ENDING)):
@@ -99,10 +99,12 @@ def _unit(text: str, asked_for: str) -> UnitName:
 
 
 def tenants(texts: Sequence[str], variant: Variant = NEWEST, precision: str | None = None) -> list[SharingPipeline]:
-    """Return a pipeline for each of `texts`, in order. Raises BadInputError.
+    """Return the pipeline that each of `texts` describes, in order.
 
-    `variant`: policy and edge of scenes. `precision`: int8, fp16 or fp32 for all networks, except stages of a pipeline
-    file that have their own `precision`. None means the precision in each network's file.
+    `variant`: policy and edge of scenes. `precision`: int8, fp16 or fp32 for all networks; None for the precision in
+    each network's file. Stages of a pipeline file with a `precision` keep it.
+
+    Raises BadInputError for too many pipelines, and for a scene, network or file that cannot be used.
     """
     if len(texts) > MOST_TENANTS:
         raise BadInputError("--beside", f"{len(texts)} pipelines", f"at most {MOST_TENANTS} with the first one")
@@ -112,7 +114,10 @@ def tenants(texts: Sequence[str], variant: Variant = NEWEST, precision: str | No
 
 
 def answer_of(chip: Profile, pipelines: Sequence[SharingPipeline], options: PredictOptions) -> dict[str, Any]:
-    """Return the document of a prediction for `pipelines` on one chip, with a verdict on each. Raises BadInputError."""
+    """Return the document of a prediction for `pipelines` that share `chip`, with a verdict on each pipeline.
+
+    `options`: options of the prediction. Raises BadInputError if the prediction cannot be made.
+    """
     answer = predict_beside(chip, pipelines, options.cap, options.minutes, options.governor, options.turns)
     rows = [row | {"verdict": predicted_verdict(answer | row).shown()} for row in answer["pipelines"]]
     return answer | {"pipelines": rows}
@@ -125,7 +130,10 @@ def _tenant(each: AskedPipeline, name: str, variant: Variant, precision: str | N
 
 
 def _names(stems: Sequence[str]) -> list[str]:
-    """Return a unique name for each pipeline. `stems`: file names without suffix; equal stems get numbers."""
+    """Return a unique name for each pipeline, in order. Equal stems get numbers.
+
+    `stems`: file names of the pipelines without the suffix.
+    """
     return [
         stem if stems.count(stem) == 1 else f"{stem} ({stems[: place + 1].count(stem)})"
         for place, stem in enumerate(stems)
@@ -152,9 +160,11 @@ def _of_file(each: AskedPipeline, name: str, precision: str | None) -> FileTenan
 
 
 def avatar(each: AskedPipeline, name: str, variant: Variant = NEWEST, precision: str | None = None) -> Tenant:
-    """Return the pipeline of the scene `each`, after planning its frames. Raises BadInputError.
+    """Return the pipeline of the scene that `each` describes, after planning its frames.
 
     `name`: unique name of the pipeline. `variant`, `precision`: as in `tenants`.
+
+    Raises BadInputError if the scene cannot be read or run.
     """
     checked = configure(RunOptions(scene=each.what, skinning="gpu"), Path.cwd())
     scene, files = checked.config.scene, networks_of(checked.assets)

@@ -1,7 +1,8 @@
 """Predictions from options to an answer, for the command line and for programs alike.
 
-Rule: this module neither prints nor computes. `trilane.hw_profiles` computes the answers; for this machine it uses the
-measurements of `this_machine.py`. In all functions, `say` gets a message before an action that takes seconds.
+Rule: this module neither prints nor computes. `trilane.hw_profiles` computes the answers, for this machine from the
+measurements of `this_machine.py`. In all functions, `chip` is the hardware profile of the chip, and `options` are the
+options of the prediction. `say` is a function that gets a message before an action that takes seconds.
 """
 
 from __future__ import annotations
@@ -26,9 +27,12 @@ AS_RUN: Final = "the avatar, policy and edge are those of `trilane run` without 
 def predict_networks(
     chip: Profile, options: PredictOptions, say: Callable[[str], None] = lambda _: None
 ) -> list[dict[str, Any]]:
-    """Return a prediction for each network of `options` by itself, on each unit of `options`. Raises BadInputError.
+    """Return a prediction for each network of `options` by itself, on each unit of `options`.
 
-    With the profile `host`, calls of each network on this machine's unit for networks are measured first.
+    With the profile `host` and no requested precision, calls of each network on this machine's unit for networks are
+    measured first.
+
+    Raises BadInputError for a network that cannot be read, and for an unknown unit or input.
     """
     from trilane.hw_profiles.graph_file import read_graph
     from trilane.hw_profiles.network_time import Computes, predict_network
@@ -56,9 +60,12 @@ def predict_networks(
 def application_of(
     chip: Profile, options: PredictOptions, say: Callable[[str], None] = lambda _: None
 ) -> tuple[Profile, Plan]:
-    """Return the chip in the network's precision, and the avatar application with the network that `options` select.
+    """Return (chip in the network's precision, avatar application with the network that `options` select).
 
-    With the profile `host`, this machine is measured with this network. Raises BadInputError.
+    With the profile `host`, this machine is measured with this network, except for a published network, a requested
+    precision or another unit than the one for networks.
+
+    Raises BadInputError for a network or avatar that cannot be read, and for options that no application has.
     """
     from trilane.hw_profiles.application import Plan
 
@@ -97,12 +104,19 @@ def _network_of(chip: Profile, options: PredictOptions, say: Callable[[str], Non
 
 
 def _is_measured(chip: Profile, options: PredictOptions, unit: UnitName) -> bool:
-    """Return whether the network is to be measured: the chip is this machine, and a run would use it the same way."""
+    """Return whether the network is to be measured on this machine.
+
+    It is measured if the chip is this machine, `unit` is the unit for networks, and `options` request no precision. A
+    run then uses the network in the same way.
+    """
     return chip.name == HOST and unit == INFER[1] and options.precision is None
 
 
 def answer_of(chip: Profile, plan: Plan, options: PredictOptions) -> dict[str, Any]:
-    """Return the prediction of the application `plan` on `chip`; with `what_if` in `options`, also its alternatives."""
+    """Return the prediction of the application `plan` on `chip`.
+
+    With `what_if` in `options`, the key `alternatives` has predictions with other policies and edges.
+    """
     from trilane.hw_profiles import predict as predictions
 
     cap, wanted = options.cap, options.wanted

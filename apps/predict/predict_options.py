@@ -1,7 +1,7 @@
 """The options of a prediction, each as one field, for `trilane predict` and `trilane.predict`.
 
-Rule: a field checks its own value, and `check_together` checks combinations. Modules of the chip's model, which define
-the valid words, are imported only when a word is checked, because their import takes long.
+Rule: a field checks its own value, and `check_together` checks combinations. The modules of the chip's model define the
+valid words. They are imported only when a word is checked, because their import takes long.
 """
 
 from __future__ import annotations
@@ -64,9 +64,10 @@ OF_A_PIPELINE: Final = OF_A_PIPELINE_ALONE | {"scene", "profile", "performance_p
 
 
 def _either(read_words: Callable[[], tuple[str, ...]], expected: str = "") -> AfterValidator:
-    """Return a validator that accepts the words of `read_words`, which is called only when a value is checked.
+    """Return a validator that accepts None and the words that `read_words` returns.
 
-    `expected`: description of the valid words for error messages; the words themselves if empty.
+    `read_words` is called only when a value is checked. `expected`: description of the valid words for error messages;
+    "" for the words themselves.
     """
 
     def known(text: str | None) -> str | None:
@@ -233,10 +234,10 @@ class PredictOptions(Options):
 
     @property
     def cap(self) -> str:
-        """Return the given performance profile, or else the usual one.
+        """Return the performance profile that the user gave; without one, return the usual performance profile.
 
-        The usual profile is `burst` for a network by itself, because published latencies are measured with it. It is
-        also `burst` for a pipeline file, and on this machine, where a run has no cap. Otherwise it is
+        The usual one is `burst` for a network by itself, because published latencies are measured with it. It is also
+        `burst` for a pipeline file, and on this machine, where a run has no cap. For any other prediction, it is
         `sustained_high_performance`.
         """
         if "performance_profile" in self.model_fields_set:
@@ -245,7 +246,10 @@ class PredictOptions(Options):
 
     @property
     def pipeline(self) -> Path | None:
-        """Return the pipeline file to predict by itself; None if there is none, or if `beside` has other pipelines."""
+        """Return the pipeline file to predict by itself.
+
+        Return None if `scene` is no pipeline file, or if other pipelines share the chip (`beside`).
+        """
         from trilane.pipeline.pipeline_file import is_pipeline_file
 
         path = None if self.scene is None or self.beside else Path(self.scene)
@@ -253,7 +257,7 @@ class PredictOptions(Options):
 
     @property
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Return the shapes that `input_shape` gives, by the input's name."""
+        """Return the shapes in `input_shape`, by the input's name."""
         return dict(map(shape_of, self.input_shape))
 
     @property
@@ -263,7 +267,7 @@ class PredictOptions(Options):
 
     @property
     def engine(self) -> EngineRuntime | None:
-        """Return `runtime` if it is the runtime of a tensor engine, otherwise None."""
+        """Return `runtime`, the runtime of a tensor engine; None if the user gave none."""
         from trilane.hw_profiles.schema import ENGINE_RUNTIMES
 
         return next((runtime for runtime in ENGINE_RUNTIMES if runtime == self.runtime), None)
@@ -285,27 +289,32 @@ class PredictOptions(Options):
 
     @property
     def wanted(self) -> Wanted:
-        """Return the frame rate and the power limit that the prediction judges."""
+        """Return the frame rate and the power limit that the prediction judges. Each is None if the user gave none."""
         from trilane.hw_profiles.rates import Wanted
 
         return Wanted(self.fps, self.power_limit_w)
 
     @property
     def is_published(self) -> bool:
-        """Return whether the application runs a published network, not the network of an avatar or a file."""
+        """Return whether the application runs a published network, not the network of an avatar or a file.
+
+        A table counts as a published network.
+        """
         return bool(self.model_fields_set & (OF_A_FILE | {"table"}))
 
     @property
     def is_as_run(self) -> bool:
-        """Return whether network, policy and edge are those of `trilane run` without options."""
+        """Return whether network, policy, edge and batch are those of `trilane run` without options."""
         return not (self.is_published or self.model_fields_set & {"avatar", "network", "policy", "edge", "batch"})
 
     @property
     def variant(self) -> Variant:
         """Return policy, edge and batch of the application.
 
-        If no policy is given, it is `pipelined`, as in a run. For a published network on a chip, it is `reference`.
-        Raises BadInputError for an edge that the published application does not have.
+        If no policy is given, the policy is `pipelined`, as in a run. For a published network on another chip than this
+        machine, the default policy is `reference`.
+
+        Raises BadInputError for the policy `reference` with an edge that the published application does not have.
         """
         from trilane.hw_profiles.application import REFERENCE, Variant
 
@@ -320,7 +329,7 @@ class PredictOptions(Options):
         return REFERENCE._replace(batch=self.batch)
 
     def check_together(self) -> None:
-        """Raise BadInputError if an option makes another one useless, or needs another one that is not given."""
+        """Raise BadInputError if an option has no effect beside another, or needs another that is not given."""
         self._check_pipeline_file()
         if self.pipeline is None:
             self._check_others()

@@ -1,7 +1,8 @@
 """Adds measurements of this machine to the profile `host`: calls of a network, and stages of an avatar's run.
 
-Rule: a measurement is announced and takes at most half a minute. It is cached under the machine's facts, so it happens
-once. If a measurement fails, a message says so. The profile then stays as it is, and its predictions have no interval.
+Rule: a measurement is announced and takes at most half a minute. Its result is kept for this machine and these
+packages, so the measurement happens once. If a measurement fails, a message says why. The profile then stays as it is,
+and its predictions have no interval.
 """
 
 from __future__ import annotations
@@ -37,10 +38,11 @@ Say = Callable[[str], None]
 
 
 def with_avatar(chip: Profile, avatar: str, say: Say) -> tuple[Profile, Network]:
-    """Return `chip` with measured times of a run of `avatar`, and the avatar's network at the run's usual tensor shape.
+    """Return (`chip` with measured times of a run of `avatar`, the avatar's network at the run's usual tensor shape).
 
     `chip`: profile `host`. `avatar`: name or folder.
-    `say`: function that gets a message before a measurement, and after one that failed.
+    `say`: function that gets a message before a measurement, and after a measurement that failed.
+
     Raises BadInputError if `avatar` is no avatar.
     """
     measured, network = _with_run(chip, RunOptions(avatar=avatar), say)
@@ -48,10 +50,11 @@ def with_avatar(chip: Profile, avatar: str, say: Say) -> tuple[Profile, Network]
 
 
 def _with_run(chip: Profile, request: RunOptions, say: Say) -> tuple[Profile, Network]:
-    """Return `chip` with measured times of the run that `request` describes, and its network at the usual tensor shape.
+    """Return (`chip` with measured times of the run that `request` describes, its network at the usual tensor shape).
 
     The times come from the rehearsal that also chooses the run's placement. The avatars of the run share one tensor,
-    and each gets an equal share of the time for poses. `chip`, `say`: as in `with_avatar`.
+    and each avatar gets an equal share of the time for poses. `chip`, `say`: as in `with_avatar`.
+
     Raises BadInputError for options that no run can have.
     """
     checked = configure(request, Path.cwd())
@@ -69,9 +72,12 @@ def _with_run(chip: Profile, request: RunOptions, say: Say) -> tuple[Profile, Ne
 
 
 def with_first(chip: Profile, text: str, say: Say) -> Profile:
-    """Return `chip` with measurements of the pipeline `text`, as typed: a scene, a network file or a pipeline file.
+    """Return `chip` with measurements of the first pipeline that shares it: a scene, a network or a pipeline file.
 
-    A pipeline file is not measured here. `chip`, `say`: as in `with_avatar`. Raises BadInputError.
+    A pipeline file is not measured here. `text`: pipeline as typed on the command line. `chip`, `say`: as in
+    `with_avatar`.
+
+    Raises BadInputError for a text that describes no pipeline, and a scene or network that cannot be used.
     """
     first = asked(text)
     if first.what.endswith(NETWORK_ENDING):
@@ -82,10 +88,10 @@ def with_first(chip: Profile, text: str, say: Say) -> Profile:
 
 
 def with_file_in_application(chip: Profile, graph: GraphFile, shapes: Mapping[str, Sequence[int]], say: Say) -> Profile:
-    """Return `chip` with measured times of the default avatar's stages, and of the network in `graph` as its network.
+    """Return `chip` with the measured times of an application: the default avatar's stages with the network in `graph`.
 
-    A run of the default avatar and calls of the network are measured apart. If one fails, `chip` is returned unchanged.
-    `chip`, `graph`, `shapes`, `say`: as in `with_file`.
+    A run of the default avatar and calls of the network are measured apart. If one of the two measurements fails,
+    `chip` is returned unchanged. `chip`, `graph`, `shapes`, `say`: as in `with_file`.
     """
     usual, _ = with_avatar(chip, DEFAULT, say)
     placed = usual.units[NETWORK].measured
@@ -105,12 +111,12 @@ def with_file(
     counts: Sequence[int] = (),
     runtime: str = "",
 ) -> Profile:
-    """Return `chip` with the measured time of the network in `graph`.
+    """Return `chip` with the measured time of the network in `graph`; unchanged if the network cannot be measured.
 
-    `shapes`: shapes of inputs by name, in place of the file's own. `chip`, `say`: as in `with_avatar`.
-    `counts`: numbers of threads to measure with; if empty, the number of the unit for networks.
-    `runtime`: runtime of the pipeline stage that has this network. If empty, the network is not a stage, and the
-    fastest installed runtime that fits it is used.
+    `chip`, `say`: as in `with_avatar`. `shapes`: shapes of inputs by name, in place of the file's own.
+    `counts`: numbers of threads to measure with; if empty, the number of threads of the unit for networks.
+    `runtime`: runtime of the pipeline stage that has this network; "" if the network is no stage. In this case, an
+    avatar's integer network uses the fastest installed runtime, and any other network uses ONNX Runtime.
     """
     why = _why_not(chip, graph)
     if why:
@@ -129,7 +135,7 @@ def with_file(
 
 
 def _why_not(chip: Profile, graph: GraphFile) -> str:
-    """Return the reason for which a network is not measured; "" if it is measured."""
+    """Return the reason why the network in `graph` is not measured; "" if it can be measured."""
     if graph.numbers == "not said":
         return "the file has no weights"
     ms = price(chip, graph.work, NETWORK, corners_of(chip, BURST)).total_ms

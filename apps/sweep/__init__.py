@@ -1,3 +1,3 @@
-"""Sweeps: many configurations of one command, tried one by one, on one machine or many."""
+"""Sweeps: many configurations of one command, tried on one machine or many."""
 
 from __future__ import annotations

@@ -1,6 +1,7 @@
-"""The process of a trial: `python -m trilane.apps.sweep.child PARENT MODULE WORD...`, started by Trilane alone.
+"""The process of a trial: `python -m trilane.apps.sweep.child PARENT MODULE WORD...`, which only Trilane starts.
 
-Rule: this process runs MODULE with WORDs. It ends, by a signal of the kernel, if its parent, the process PARENT, ends.
+Rule: this process runs MODULE with the WORDs as its command line. PARENT is the id of its parent process. When the
+parent ends, the kernel ends this process with SIGTERM.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Defines a sweep: a command with fixed options and axes, its named trials, and its TOML file.
 
 Rule: the same definition gives the same trials in the same order on every machine. A trial's name is a hash of its
-options alone, not of machine, folder or time. An error names the first defect of a file with its key. This module does
-not know the options of any command.
+command, options and repeat alone, not of machine, folder or time. An error names the first defect of a file with its
+key. This module does not know the options of any command.
 """
 
 from __future__ import annotations
@@ -42,7 +42,10 @@ KEYS: dict[str, tuple[type, str]] = {
 
 
 class SweepKind(StrEnum):
-    """How axes are combined. GRID: every combination; LIST: the n-th values of all axes; RANDOM: a sample of GRID."""
+    """How the values of the axes are combined.
+
+    GRID: every combination. LIST: the n-th values of all axes, for each n. RANDOM: a sample of GRID.
+    """
 
     GRID = "grid"
     LIST = "list"
@@ -53,9 +56,10 @@ class SweepKind(StrEnum):
 class Definition:
     """A sweep to be done.
 
-    `command`: words of the command. `options`: fixed options. `axes`: option -> values to try, at least one. `kind`:
-    how axes are combined. `count`: number of configurations that RANDOM draws. `seed`: seed of RANDOM. `repeats`:
-    number of trials of each configuration.
+    `command`: words of the command. `options`: fixed options and their values.
+    `axes`: option -> values to try, at least one. `kind`: how the values of the axes are combined.
+    `count`: number of configurations that RANDOM draws; None for GRID and LIST. `seed`: seed of RANDOM.
+    `repeats`: number of trials of each configuration.
     """
 
     command: tuple[str, ...]
@@ -68,7 +72,10 @@ class Definition:
 
 
 def _kind_named(where: str, word: str) -> SweepKind:
-    """Return the kind that `word` names. Raises BadInputError, which names `where`, for any other word."""
+    """Return the kind that `word` names. Raises BadInputError for any other word.
+
+    `where`: file and key for the message of the error.
+    """
     if word not in [*SweepKind]:
         raise BadInputError(where, repr(word), f"one of {', '.join(SweepKind)}", did_you_mean(word, SweepKind))
     return SweepKind(word)
@@ -77,9 +84,12 @@ def _kind_named(where: str, word: str) -> SweepKind:
 def trials_of(definition: Definition, words: Callable[[Options], Sequence[str]]) -> list[Trial]:
     """Return the trials of a sweep in their order. The last axis changes fastest.
 
-    All configurations run once before any is repeated: if the machine slows down, all of them slow down.
-    `words`: function that returns options as the words of a command line.
-    Raises BadInputError for axes that do not fit each other, for more than `MOST_TRIALS`, and for a trial given twice.
+    All configurations run once before any is repeated: if the machine slows down, all configurations slow down.
+
+    `definition`: the sweep. `words`: function that returns options as the words of a command line.
+
+    Raises BadInputError for axes that do not fit each other, a `count` out of range, more than `MOST_TRIALS` trials,
+    and a trial given twice.
     """
     configurations = [*_configurations(definition)]
     made = [
@@ -122,7 +132,7 @@ def _check(definition: Definition) -> None:
 
 
 def _count(definition: Definition) -> int:
-    """Return the number of configurations. Raises BadInputError if RANDOM draws more than the axes have."""
+    """Return the number of configurations. Raises BadInputError if the `count` of RANDOM is missing or out of range."""
     if definition.kind is SweepKind.LIST:
         return max((len(values) for values in definition.axes.values()), default=1)
     whole = math.prod(len(values) for values in definition.axes.values())
@@ -135,7 +145,7 @@ def _count(definition: Definition) -> int:
 
 
 def _numbers(definition: Definition) -> Sequence[int]:
-    """Return the numbers of the combinations to try, ascending: all of the grid's or, for RANDOM, a sample of them."""
+    """Return the numbers of the combinations to try, ascending: the whole grid or, for RANDOM, a sample of the grid."""
     whole = math.prod(len(values) for values in definition.axes.values())
     if definition.kind is SweepKind.RANDOM:
         return sorted(random.Random(definition.seed).sample(range(whole), _count(definition)))
@@ -152,7 +162,10 @@ def _combination(definition: Definition, number: int) -> list[Value]:
 
 
 class TrialClock(StrEnum):
-    """The clock of a trial. HOST: the trial measures and needs its machine for itself. VIRTUAL: it computes times."""
+    """The clock of a trial.
+
+    HOST: the trial measures, and needs its machine for itself. VIRTUAL: the trial computes times.
+    """
 
     HOST = "host"
     VIRTUAL = "virtual"
@@ -160,7 +173,10 @@ class TrialClock(StrEnum):
 
 @dataclass(frozen=True)
 class TriedCommand:
-    """A command that a sweep can try. `clock`: clock of its result. `has_folder`: whether it writes a run folder."""
+    """A command that a sweep can try.
+
+    `clock`: clock of the command's trials. `has_folder`: whether the command writes a run folder.
+    """
 
     clock: TrialClock
     has_folder: bool = False
@@ -179,8 +195,8 @@ COMMANDS = {
 class Trial:
     """One configuration of a command, to be run once.
 
-    `command`: words of the command, such as `bench raster`. `options`: values by name, without dashes. `words`: options
-    and values as words of a command line. `repeat`: number of the repeat, from 1.
+    `command`: words of the command, such as `bench raster`. `options`: values by the option's name, without dashes.
+    `words`: options and values as words of a command line. `repeat`: number of the repeat, from 1 on.
     """
 
     command: tuple[str, ...]
@@ -209,10 +225,10 @@ class Trial:
 
 
 def canonical(command: tuple[str, ...], options: Options, repeat: int = 1) -> str:
-    """Return a configuration as JSON without spaces, keys sorted.
+    """Return a configuration as JSON with the keys `command`, `options` and `repeat`, without spaces, keys sorted.
 
-    The first repeat has no key `repeat`, so a sweep that gets more repeats keeps the names of its trials. Raises
-    ValueError for NaN and infinities.
+    The first repeat has no key `repeat`. Therefore the trials of a sweep keep their names if the sweep gets more
+    repeats. Parameters: see `Trial`. Raises ValueError for NaN and infinities.
     """
     named: dict[str, Any] = {"command": list(command), "options": dict(options)}
     if repeat > 1:
@@ -222,7 +238,10 @@ def canonical(command: tuple[str, ...], options: Options, repeat: int = 1) -> st
 
 @dataclass(frozen=True)
 class SweepFile:
-    """The content of a sweep file (docs/sweeps.md). The values of options are not checked."""
+    """The content of a sweep file (docs/sweeps.md). The values of options are not checked.
+
+    The fields have the same meaning as those of `Definition`.
+    """
 
     command: tuple[str, ...]
     kind: SweepKind = SweepKind.GRID
@@ -234,7 +253,10 @@ class SweepFile:
 
 
 def read_sweep(path: Path) -> SweepFile:
-    """Read a sweep file. Raises BadInputError if `path` cannot be read or is no sweep."""
+    """Read the sweep file `path`, and return its content.
+
+    Raises BadInputError if it cannot be read or is no sweep file.
+    """
     try:
         data = tomllib.loads(read_text(path, EXPECTED))
     except (ValueError, RecursionError) as error:  # numbers and nested lists may be too long for the reader

@@ -1,9 +1,11 @@
-"""Engines of a sweep: they do one trial in a process, and many on this machine or on the machines of a Ray cluster.
+"""Engines of a sweep, which do one trial in a process, and many on this machine or on the machines of a Ray cluster.
 
-Rule: a trial whose process was ended from outside is lost and may be tried again; a trial that ended by itself is
-final. Trials of the host clock run one at a time on a machine, virtual ones on all its cores. No process is left
-behind. On Ray, a task does one trial as this machine would, and only the driver writes the sweep's folder. Ray itself
-retries nothing. When the driver ends, its workers end, and so do their trials.
+Rule: a trial whose process was ended from outside is lost and may be tried again. A trial that ended by itself is
+final. A machine does one trial of the host clock at a time, and trials of the virtual clock on all its cores. No
+process is left behind.
+
+On Ray, a task does one trial as this machine would, and only the driver writes `trials.jsonl`. Ray itself repeats no
+task. When the driver ends, its workers and their trials end too.
 """
 
 from __future__ import annotations
@@ -58,10 +60,12 @@ SET_BY_RAY = ("OMP_NUM_THREADS", "CUDA_VISIBLE_DEVICES", "PYTHONBREAKPOINT")
 
 @dataclass(frozen=True)
 class TrialPlace:
-    """Where trials are done.
+    """Where and with which program trials are done.
 
-    `folder`: folder of the sweep, for the run folders; None to keep none. `working_folder`, `environment`: working
-    folder and environment of the trials' processes; None for those of this process. `program`: module that trials run.
+    `folder`: folder of the sweep, for the run folders; None to keep no run folders.
+    `working_folder`: working folder of the trials' processes; None for that of this process.
+    `environment`: environment of the trials' processes; None for that of this process.
+    `program`: module that the trials run.
     """
 
     folder: Path | None
@@ -71,19 +75,24 @@ class TrialPlace:
 
 
 class Children:
-    """The running processes of trials. Several threads start processes, and any thread may end all of them."""
+    """The running processes of trials. Several threads start processes, and any thread may end all of them.
+
+    `inherited`: file descriptors that every process inherits.
+    """
 
     def __init__(self, inherited: tuple[int, ...] = ()) -> None:
-        """`inherited`: file descriptors that every process gets."""
+        """Keep the parameter; no process runs yet."""
         self._inherited = inherited
         self._lock = threading.Lock()
         self._going: set[subprocess.Popen[bytes]] = set()
         self._over = False
 
     def run(self, command: list[str], stdout: Any, stderr: Any, place: TrialPlace) -> int:
-        """Run `command` and return its exit code, negative for a signal. After `end`, only return -SIGTERM.
+        """Run `command`, and return its exit code; a negative code is the number of a signal.
 
-        `stdout`, `stderr`: files for the output, as for `subprocess.Popen`.
+        After a call of `end`, start nothing and return -SIGTERM.
+
+        `stdout`, `stderr`: files for the output, as for `subprocess.Popen`. `place`: working folder and environment.
         """
         with self._lock:
             if self._over:
@@ -127,10 +136,10 @@ def _end(processes: list[subprocess.Popen[bytes]]) -> None:
 
 
 def perform(trial: Trial, place: TrialPlace, children: Children) -> Record:
-    """Do `trial` and return its line of `trials.jsonl` (docs/sweeps.md has the keys).
+    """Do `trial`, and return its line of `trials.jsonl` (docs/sweeps.md has the keys).
 
     A run that the machine disturbed is repeated up to `REPEATS` times, and the least disturbed run is kept. Files of a
-    lost trial are removed. `children`: starts the trial's process.
+    lost trial are removed. `place`: folders of the trial. `children`: object that starts the trial's process.
     """
     began_at, start = machine.here.now().isoformat(timespec="milliseconds"), time.monotonic()
     with tempfile.TemporaryDirectory(prefix="trilane-trial-") as scratch:
@@ -164,7 +173,10 @@ def perform(trial: Trial, place: TrialPlace, children: Children) -> Record:
 
 
 def _once(trial: Trial, own: Path, place: TrialPlace, children: Children) -> Record:
-    """Do `trial` once, with the run folder `own`, and return how it ended (`ended_as`)."""
+    """Do `trial` once, and return the result of `ended_as`. Remove its run folder before, and after a lost trial.
+
+    `own`: run folder of the trial. `place`, `children`: as in `perform`.
+    """
     _remove(own)
     with tempfile.TemporaryFile() as stdout, tempfile.TemporaryFile() as stderr:
         code = children.run(_command(trial, own, place.program), stdout, stderr, place)
@@ -176,9 +188,9 @@ def _once(trial: Trial, own: Path, place: TrialPlace, children: Children) -> Rec
 
 
 def trust_in(ended: Record) -> Trust:
-    """Return whether the times of a trial can be trusted. `ended`: how it ended (`ended_as`).
+    """Return whether the times of a trial can be trusted, with reasons. `ended`: result of `ended_as`.
 
-    A trial that is not done counts as trusted, and so does one whose result lacks the share of other programs.
+    A trial counts as trusted if it is not done, or if its result lacks the share of other programs.
     """
     result = ended["result"] or {}
     is_judged = ended["status"] == "done" and "other_programs" in result
@@ -186,7 +198,10 @@ def trust_in(ended: Record) -> Trust:
 
 
 def disturbance(ended: Record) -> tuple[bool, float]:
-    """Return a sort key by which less disturbed trials come first: (not trusted, share of other programs)."""
+    """Return (not trusted, share of other programs), a sort key that puts less disturbed trials first.
+
+    If the share is not known, it counts as 1. `ended`: result of `ended_as`.
+    """
     others = (ended["result"] or {}).get("other_programs")
     return not trust_in(ended).trusted, 1.0 if others is None else others
 
@@ -204,9 +219,12 @@ def about(trial: Trial) -> Record:
 
 
 def ended_as(code: int, out: str, messages: str) -> Record:
-    """Return how a trial's process ended: status, exit code, its JSON document, and the error of a trial not done.
+    """Return how a trial's process ended.
 
-    `code`: exit code, negative for a signal, as `subprocess` has it. `out`, `messages`: text of its stdout and stderr.
+    Keys: `status`: `done`, `failed` or `lost`. `exit_code`: exit code. `error`: message of a trial that is not done;
+    None for a done trial. `result`: JSON document of the trial; None for a lost trial or without a document.
+
+    `code`: exit code; a negative code is the number of a signal. `out`, `messages`: text of its stdout and stderr.
     """
     result = _document(out)
     lines = [line for line in messages.splitlines() if line.strip()]
@@ -225,7 +243,7 @@ def ended_as(code: int, out: str, messages: str) -> Record:
 
 
 def lost(trial: Trial, why: str) -> Record:
-    """Return the record of a trial whose Ray worker ended without a record. `why`: error."""
+    """Return the record of `trial`, whose Ray worker ended without a record. `why`: message of the error."""
     return {
         **about(trial),
         **{"status": "lost", "exit_code": None, "error": why, "result": None, "repeated": 0, "unsure": []},
@@ -252,21 +270,23 @@ def _text(file: Any) -> str:
 
 
 def _remove(own: Path) -> None:
-    """Remove the run folder `own` of a trial, complete or partial."""
+    """Remove the run folder `own` of a trial, and drafts of it that were not completed."""
     shutil.rmtree(own, ignore_errors=True)
     for draft in own.parent.glob(f"{own.name}.*.partial"):
         shutil.rmtree(draft, ignore_errors=True)
 
 
 def at_once(clock: TrialClock) -> int:
-    """Return how many trials run at once on this machine: 1 if they measure, otherwise 1 on each core."""
+    """Return how many trials run at once on this machine: 1 for the host clock, 1 on each core for the virtual one."""
     return 1 if clock is TrialClock.HOST else len(machine.here.cores())
 
 
 def run_here(trials: Sequence[Trial], place: TrialPlace, inherited: tuple[int, ...] = ()) -> Generator[Record]:
-    """Do `trials`, all of one command, on this machine and yield their records as they end.
+    """Do `trials`, all with the same command, on this machine, and yield their records as they end.
 
-    Closing the generator ends the trials that still run. `inherited`: file descriptors that every trial gets.
+    Closing the generator ends the trials that still run.
+
+    `place`: folders of the trials. `inherited`: file descriptors that every trial inherits.
     """
     children = Children(inherited)
     with ThreadPoolExecutor(at_once(trials[0].kind.clock)) as pool:
@@ -282,7 +302,7 @@ def run_here(trials: Sequence[Trial], place: TrialPlace, inherited: tuple[int, .
 def run_inside(trials: Sequence[Trial], call: Callable[[list[str]], tuple[int, str, str]]) -> Generator[Record]:
     """Do `trials` of the virtual clock in this process, one after the other, and yield their records as they end.
 
-    `call`: function that takes the words of a command line after `trilane` and returns exit code, stdout and stderr.
+    `call`: function from the words of a command line after `trilane` to (exit code, text of stdout, text of stderr).
     """
     for trial in trials:
         began_at, start = machine.here.now().isoformat(timespec="milliseconds"), time.monotonic()
@@ -297,17 +317,23 @@ def run_inside(trials: Sequence[Trial], call: Callable[[list[str]], tuple[int, s
 
 
 def at_once_on_ray(clock: TrialClock) -> int:
-    """Return how many trials the connected cluster does at once, at least 1."""
+    """Return how many trials with `clock` the connected Ray cluster does at once, at least 1.
+
+    Raises MissingPartError without Ray.
+    """
     name = RESOURCE if clock is TrialClock.HOST else "CPU"
     return max(1, int(required_ray().cluster_resources().get(name, 1)))
 
 
 @contextmanager
 def cluster(folder: Path) -> Iterator[Engine]:
-    """Give the engine of the Ray cluster at RAY_ADDRESS or, without it, on this machine. Disconnect afterwards.
+    """Connect to a Ray cluster, give its engine, and disconnect afterwards.
 
-    `folder`: folder of the sweep; machines of the cluster that see it keep their run folders there.
-    Raises MissingPartError without Ray, BadInputError without a cluster.
+    The cluster is the one at the address in RAY_ADDRESS. If this variable is not set, it is the one on this machine.
+
+    `folder`: folder of the sweep. Machines of the cluster that can read it keep their run folders there.
+
+    Raises MissingPartError without Ray, BadInputError without a running cluster.
     """
     ray = required_ray()
     try:
@@ -322,7 +348,10 @@ def cluster(folder: Path) -> Iterator[Engine]:
 
 
 def _try_address(address: str) -> None:
-    """Raise OSError if `address` is HOST:PORT and nothing listens there. Ray itself would try for many minutes."""
+    """Raise OSError if `address` is HOST:PORT and nothing listens there.
+
+    Without this check, Ray would try for many minutes.
+    """
     host, _, port = address.rpartition(":")
     if host and port.isdecimal() and "/" not in host:
         socket.create_connection((host, int(port)), ANSWER_S).close()
@@ -347,7 +376,10 @@ def _run_on(ray: Any, place: TrialPlace, trials: Sequence[Trial]) -> Generator[R
 
 
 def _resources(ray: Any, clock: TrialClock) -> dict[str, int]:
-    """Return the resources that a trial takes besides a core. Raises BadInputError if no machine has them."""
+    """Return the Ray resources that a trial takes besides a core.
+
+    Raises BadInputError if no machine has these resources.
+    """
     if clock is TrialClock.VIRTUAL:
         return {}
     if RESOURCE not in ray.cluster_resources():
@@ -369,9 +401,11 @@ def _record(ray: Any, reference: Any, trial: Trial) -> Record:
 def perform_there(trial: Trial, folder: str, working_folder: str, program: str) -> Record:
     """Do `trial` in a Ray worker, on the machine that Ray chose, and return its record.
 
-    `folder`: folder of the sweep on the driver's machine, used if this machine sees it. `working_folder`: the driver's
-    working folder, used if this machine has it. `program`: the module that the trial runs.
-    Raises BadInputError if the trial measures but has a lower priority than other programs.
+    `folder`: folder of the sweep on the driver's machine. If this machine cannot read it, run folders are not kept.
+    `working_folder`: working folder of the driver. If this machine has no such folder, the worker's own is used.
+    `program`: module that the trial runs.
+
+    Raises BadInputError if the trial has the host clock and the worker has a lower priority than its parent process.
     """
     worker = psutil.Process()
     parent = worker.parent() or worker
@@ -385,9 +419,9 @@ def perform_there(trial: Trial, folder: str, working_folder: str, program: str) 
 
 
 def restored(worker: Mapping[str, str], parent: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment `worker` of a Ray worker, with the variables `SET_BY_RAY` as in `parent`.
+    """Return the environment `worker` of a Ray worker, with the variables in `SET_BY_RAY` as they are in `parent`.
 
-    `parent`: environment of the worker's parent process, which has the machine's own values.
+    `parent`: environment of the worker's parent process, in which Ray has not set these variables.
     """
     kept = {name: value for name, value in worker.items() if name not in SET_BY_RAY}
     return kept | {name: parent[name] for name in SET_BY_RAY if name in parent}

@@ -1,7 +1,7 @@
-"""The folder of a sweep, and the loop that does the trials it lacks: `sweep.json`, `trials.jsonl`, run folders.
+"""The folder of a sweep, and the loop that does its missing trials: `sweep.json`, `trials.jsonl`, run folders.
 
-Rule: one process at a time adds whole lines, one for every trial that ended. A torn last line is cut off, and its trial
-is done again. A lost trial is tried up to `TRIES` times, any other trial once.
+Rule: one process at a time adds whole lines to `trials.jsonl`, one line for every trial that ended. An incomplete last
+line is cut off, and its trial is done again. A lost trial is tried up to `TRIES` times, any other trial once.
 """
 
 from __future__ import annotations
@@ -32,10 +32,13 @@ Engine = Callable[[Sequence[Trial]], Generator[Record]]
 
 
 def whole_lines(text: bytes, where: str | Path) -> tuple[list[Record], int]:
-    """Return the records of a `trials.jsonl` with the content `text`, and the length of `text` up to the last record.
+    """Return (records, size) of a `trials.jsonl`: its records, and the number of bytes up to the last record.
 
-    Text after the last line feed is left out, and so is a last line that is no record.
-    Raises BadInputError, which names the line, for an earlier line that is no record. `where`: place for its message.
+    Text after the last line feed is left out. The last line is also left out if it is no record.
+
+    `text`: content of the file. `where`: name of the file for the message of the error.
+
+    Raises BadInputError, which names the line, for an earlier line that is no record.
     """
     records: list[Record] = []
     size, lines = 0, text.split(b"\n")[:-1]
@@ -61,12 +64,15 @@ def _record(line: bytes) -> Record | None:
 
 
 def latest(records: Sequence[Record]) -> dict[str, Record]:
-    """Return the last record of each trial by its name, in the order in which the trials first ended."""
+    """Return the last record of each trial, by the trial's name, in the order in which the trials first ended."""
     return {str(record["id"]): record for record in records}
 
 
 def read_trials(folder: Path) -> dict[str, Record]:
-    """Return the `latest` records of the sweep in `folder`. Raises BadInputError if it has no or broken trials."""
+    """Return the `latest` records of the sweep in `folder`.
+
+    Raises BadInputError if the folder has no `trials.jsonl`, or if a line of this file is broken.
+    """
     path = folder / TRIALS
     try:
         return latest(whole_lines(path.read_bytes(), path)[0])
@@ -75,15 +81,23 @@ def read_trials(folder: Path) -> dict[str, Record]:
 
 
 class Store:
-    """The folder of a sweep, open for the one process that runs it; a context manager.
+    """The folder of a sweep, open for the one process that runs the sweep; a context manager.
 
-    `done`: records by name of the trial, from the folder and from `add`. Entering makes the folder, or opens one with
-    the same trials. Entering raises BadInputError if the folder has other trials, if another process works in it, or
-    if trials are left and `resume` is false.
+    `folder`: absolute path of the folder. `done`: last records by the trial's name, from the folder and from `add`.
+
+    Entering makes the folder, or opens a folder with the same trials. Entering raises BadInputError if:
+    - the folder cannot be written, its files are broken, or another process works in it;
+    - the folder has other trials, or a file that the trials name has changed;
+    - the folder has records, but not all trials have ended, and `resume` is false;
+    - the folder has no sweep and `resume` is true.
     """
 
     def __init__(self, folder: Path, trials: Sequence[Trial], about: Mapping[str, Any], *, resume: bool) -> None:
-        """`about`: content of `sweep.json` besides the trials. `resume`: whether to go on with trials that are left."""
+        """Keep the parameters; entering opens the folder.
+
+        `folder`: folder of the sweep. `trials`: all its trials. `about`: content of `sweep.json` besides the trials.
+        `resume`: whether to go on with a sweep that has begun.
+        """
         self.folder = folder.absolute()
         self.done: dict[str, Record] = {}
         self._trials, self._about, self._resume = trials, about, resume
@@ -117,7 +131,10 @@ class Store:
         return self._lock
 
     def add(self, record: Mapping[str, Any]) -> None:
-        """Write a trial's record, and wait until it is on the disk."""
+        """Write a trial's record, and wait until the record is on the disk.
+
+        Raises BadInputError if it cannot be written.
+        """
         line = json.dumps(record, separators=(",", ":"), allow_nan=False).encode() + b"\n"
         try:
             while line:
@@ -182,7 +199,7 @@ class Store:
 
 
 def input_digests(trials: Sequence[Trial]) -> dict[str, str]:
-    """Return the SHA-256 of each file that an option of a trial names, by the name in the option."""
+    """Return the SHA-256 of each file that an option of a trial names, in hexadecimal, by the path in the option."""
     values = (each for trial in trials for value in trial.options.values() for each in _flat(value))
     files = sorted({each for each in values if isinstance(each, str) and Path(each).is_file()})
     return {name: hashlib.sha256(Path(name).read_bytes()).hexdigest() for name in files}
@@ -193,14 +210,19 @@ def _flat(value: Any) -> Iterable[Any]:
 
 
 def is_ended(record: Mapping[str, Any] | None) -> bool:
-    """Return whether a trial is final: done, or failed by itself. A lost trial is not: it may be tried again."""
+    """Return whether a trial is final: done, or failed by itself.
+
+    A lost trial is not final, because it may be tried again.
+
+    `record`: record of the trial; None for a trial that was not tried.
+    """
     return record is not None and record["status"] in ("done", "failed")
 
 
 def run_sweep(trials: Sequence[Trial], store: Store, engine: Engine, told: Callable[[Record], None]) -> None:
     """Do all `trials` that have not ended in `store`, the open folder of the sweep.
 
-    `told`: called with the record of each trial that is not tried again.
+    `engine`: function that does trials. `told`: function that gets the record of each trial that is not tried again.
     """
     left = [trial for trial in trials if not is_ended(store.done.get(trial.id))]
     for attempt in range(1, TRIES + 1):
@@ -221,9 +243,13 @@ def _records(engine: Engine, trials: list[Trial]) -> Iterator[Record]:
 
 
 def summary(trials: Sequence[Trial], store: Store, before: set[str]) -> dict[str, Any]:
-    """Return how the trials of a sweep ended: counts, and a row for each trial.
+    """Return how the trials of a sweep ended.
 
-    `before`: names of the trials that were done before the sweep began; they count as `skipped`.
+    Keys: `folder`: folder of the sweep. `counts`: numbers of trials, in all and by status. `trials`: results of
+    `row_of`.
+
+    `store`: open folder of the sweep. `before`: names of the trials that ended before this call of the sweep; they
+    count as `skipped` too.
     """
     rows = [row_of(trial, store.done.get(trial.id)) for trial in trials]
     counts = Counter(row["status"] for row in rows)
@@ -239,7 +265,10 @@ def summary(trials: Sequence[Trial], store: Store, before: set[str]) -> dict[str
 
 
 def row_of(trial: Trial, record: Record | None) -> dict[str, Any]:
-    """Return a trial as a row of a summary: its options and how it ended. `record`: None for a planned trial."""
+    """Return `trial` as a row of a summary: its options, and how it ended.
+
+    `record`: record of the trial; None for a trial that was not tried, whose status is `planned`.
+    """
     ended = record or {"status": "planned", "exit_code": None, "error": None, "seconds": None}
     return {
         "id": trial.id,

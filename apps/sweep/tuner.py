@@ -1,8 +1,8 @@
-"""Tuning: a search that does few trials of a sweep's grid to find the best configuration within given limits.
+"""Tuning: a search that finds the best configuration within given limits, with few trials of a sweep's grid.
 
-Rule: Optuna proposes and this module judges. Trials have the names, engines and records of a sweep. The same seed, goal
-and results give the same proposals. A killed search is therefore done again from its start, and the trials that ended
-cost nothing. Nothing here starts a process or writes a file.
+Rule: Optuna proposes configurations, and this module judges their results. Trials have the names, engines and records
+of a sweep. The same seed, goal and results give the same proposals. Therefore a killed search is done again from its
+start, and the trials that have ended are not run again. This module starts no process and writes no file.
 """
 
 from __future__ import annotations
@@ -38,7 +38,11 @@ Do = Callable[[Sequence[Trial]], Mapping[str, Record]]
 
 
 class GoalMetric(NamedTuple):
-    """A figure of a result. `path`: keys that lead to it in the `--json` document; empty for the PSNR (`entry_of`)."""
+    """A figure of a result that can be a goal or have a limit.
+
+    `unit`: unit of the figure. `more_is_better`: whether larger values are better. `path`: keys that lead to the figure
+    in the `--json` document; empty for the PSNR, which `entry_of` finds.
+    """
 
     unit: str
     more_is_better: bool
@@ -61,7 +65,11 @@ WEIGHED = ("psnr", "power")
 
 
 class Keep(NamedTuple):
-    """A limit that the answer keeps. `name`: a key of `METRICS`, or the dotted key of a number in the result."""
+    """A limit that the answer keeps, such as `psnr>=33`.
+
+    `name`: a key of `METRICS`, or the dotted key of a number in the result. `sign`: `<`, `<=`, `>` or `>=`. `limit`:
+    number of the limit, in the unit of the figure.
+    """
 
     name: str
     sign: str
@@ -75,13 +83,19 @@ class Keep(NamedTuple):
         return self.sign.startswith(">")
 
     def miss(self, value: float) -> float:
-        """Return by how much `value` misses the limit, as a share of the limit; 0 or less if the limit is kept."""
+        """Return by how much `value` misses the limit, as a share of the limit; 0 or less if the limit is kept.
+
+        For a limit of 0, return the plain difference. A value at a strict limit misses it by `AT_LIMIT`.
+        """
         over = (self.limit - value if self.more_is_better else value - self.limit) / (abs(self.limit) or 1.0)
         return max(over, AT_LIMIT) if over == 0 and "=" not in self.sign else over
 
 
 def keep_of(text: str) -> Keep:
-    """Read a limit such as `psnr>=33dB`. Raises BadInputError."""
+    """Return the limit that `text` states, such as `psnr>=33dB`.
+
+    Raises BadInputError for a text of another form, an unknown figure, and a unit that is not the figure's.
+    """
     found = KEEP.fullmatch(text)
     try:
         limit = float(found[3]) if found else math.nan
@@ -101,9 +115,10 @@ def keep_of(text: str) -> Keep:
 
 @dataclass(frozen=True)
 class Aim:
-    """What a search is asked for.
+    """The goals and limits of a search.
 
-    `goals`: keys of `METRICS`; the first chooses the answer. `keeps`: limits that the answer keeps.
+    `goals`: keys of `METRICS`; the best value of the first goal decides which trial is the answer. `keeps`: limits that
+    the answer keeps.
     """
 
     goals: tuple[str, ...] = ("fps",)
@@ -114,7 +129,10 @@ class Aim:
         return tuple(dict.fromkeys([*self.goals, *(keep.name for keep in self.keeps)]))
 
     def costs(self, figures: Mapping[str, float], names: Sequence[str]) -> tuple[float, ...]:
-        """Return the figures `names`, negated where more is better, so that less is always better."""
+        """Return the figures with the given `names`, in their order. A figure of which more is better is negated.
+
+        Therefore less is always better in the result. `figures`: figures of a trial, by name.
+        """
         return tuple(-figures[name] if self.more_is_better(name) else figures[name] for name in names)
 
     def misses(self, figures: Mapping[str, float]) -> list[float]:
@@ -136,9 +154,9 @@ class Aim:
 
 
 def figures_of(record: Record | None, names: Sequence[str] = ()) -> dict[str, float]:
-    """Return the `METRICS` that a trial's result has, and the numbers at the dotted keys among `names`.
+    """Return the figures of a trial, by name: the `METRICS` that its result has, and the dotted keys among `names`.
 
-    Empty for a trial that is not done.
+    Return an empty mapping for a trial that is not done. `record`: record of the trial; None for a trial not tried.
     """
     result = (record or {}).get("result")
     if record is None or record["status"] != "done" or not isinstance(result, dict):
@@ -152,7 +170,10 @@ def figures_of(record: Record | None, names: Sequence[str] = ()) -> dict[str, fl
 
 
 def _is_no_time(name: str, value: float) -> bool:
-    """Say whether `name` is a time, but `value` is 0, because the run has no times. 0 would win every comparison."""
+    """Return whether the figure `name` is a time, but `value` is 0 or less, because the run has no times.
+
+    Such a 0 would win every comparison.
+    """
     return name in METRICS and METRICS[name].unit == "ms" and value <= 0
 
 
@@ -164,10 +185,18 @@ def _at(found: Any, path: Sequence[str]) -> float | None:
 
 
 class Space:
-    """The configurations of a grid, each a trial. Places identify a trial: axis -> index of the trial's value."""
+    """The configurations of a grid, each with its trial.
+
+    The places of a trial are a mapping from each axis to the index of the trial's value on this axis.
+    `trials`: all trials, in the grid's order. `axes`: axis -> values. `words`: as for `trials_of`.
+    """
 
     def __init__(self, definition: Definition, words: Callable[[Options], Sequence[str]]) -> None:
-        """`words`: as for `trials_of`. Raises BadInputError for no grid, repeats, or a single configuration."""
+        """Make the trials of `definition`. `words`: as for `trials_of`.
+
+        Raises BadInputError for another kind than a grid, for repeats, for a single configuration, and as `trials_of`
+        does.
+        """
         if definition.kind is not SweepKind.GRID or definition.repeats > 1:
             found = f"kind = '{definition.kind}', repeats = {definition.repeats}"
             raise BadInputError("sweep", found, "a grid without repeats", "tune chooses by itself what to try")
@@ -184,7 +213,7 @@ class Space:
         return self.trials[number]
 
     def places(self, number: int) -> dict[str, int]:
-        """Return the places of trial `number`: the inverse of `at`."""
+        """Return the places of trial number `number`. This is the inverse of `at`."""
         found: dict[str, int] = {}
         for name, values in reversed(self.axes.items()):
             number, found[name] = divmod(number, len(values))
@@ -193,19 +222,23 @@ class Space:
     def steps(self, one: Mapping[str, int], other: Mapping[str, int]) -> int:
         """Return the distance between the trials at places `one` and `other`: a sum over the axes.
 
-        An ordered axis adds the number of steps between the two values. Any other axis adds 1 if the values differ.
+        An ordered axis adds the number of steps between the two values. Any other axis adds 1 if the values differ, and
+        0 if they are equal.
         """
         apart = {name: abs(one[name] - other[name]) for name in self.axes}
         return sum(steps if name in self.ordered else min(steps, 1) for name, steps in apart.items())
 
     def shortened(self, trial: Trial, frames: int) -> Trial:
-        """Return `trial` with only `frames` frames. The result is not among `trials`."""
+        """Return a copy of `trial` with only `frames` frames. The copy is not among `trials`."""
         options = {**trial.options, FRAMES: frames}
         return replace(trial, options=options, words=tuple(self.words(options)))
 
     @cached_property
     def ordered(self) -> set[str]:
-        """The axes whose values are rising numbers, so that neighbouring values should give similar results."""
+        """The names of the axes whose values are rising numbers.
+
+        Neighbouring values of such an axis should give similar results.
+        """
         return {name for name, values in self.axes.items() if _rises(values)}
 
 
@@ -218,7 +251,7 @@ def _rises(values: Sequence[Value]) -> bool:
 
 
 def required_optuna() -> Any:
-    """Return the package `optuna`, with its log set to errors only. Raises MissingPartError without it."""
+    """Return the package `optuna`, after setting its log to errors only. Raises MissingPartError without Optuna."""
     try:
         import optuna
     except ImportError as error:
@@ -228,13 +261,14 @@ def required_optuna() -> Any:
 
 
 class Search:
-    """Optuna's proposals and their results.
+    """A search of `space` for `aim`: Optuna's proposals and their results.
 
-    `tried`: proposed trials that ended, in order, by name. `pruned`: names of trials that a short run ended.
+    `seed`: seed of the proposals. `tried`: proposed trials that ended, by name, in the order of their ends.
+    `pruned`: names of the trials that a short run ended.
     """
 
     def __init__(self, space: Space, aim: Aim, seed: int) -> None:
-        """Raises MissingPartError without Optuna."""
+        """Begin a search without results. Raises MissingPartError without Optuna."""
         self.space, self.aim = space, aim
         self.tried: dict[str, Trial] = {}
         self.pruned: set[str] = set()
@@ -251,16 +285,19 @@ class Search:
 
     @property
     def has_learned(self) -> bool:
-        """Whether any trial had all figures that were asked for."""
+        """Whether any trial had all figures of the goals and limits."""
         return self._best is not None
 
     @property
     def left(self) -> int:
-        """The number of configurations that were not proposed yet."""
+        """The number of configurations that have not been proposed."""
         return len(self.space.trials) - len(self._given)
 
     def propose(self) -> tuple[Any, Trial]:
-        """Return Optuna's trial and a trial of the space that was not proposed before. Call it only if `left` > 0."""
+        """Return (Optuna's trial, trial of the space) for a configuration that was not proposed before.
+
+        Call it only if `left` is above 0.
+        """
         for _ in range(MOST_KNOWN):
             asked, trial = self._asked()
             if trial.id not in self._given:
@@ -273,7 +310,11 @@ class Search:
         return asked, trial
 
     def _untried(self) -> dict[str, int]:
-        """Return the places of an untried configuration: in turn, the nearest to the best so far and a random one."""
+        """Return the places of a configuration that was not proposed before.
+
+        The calls take turns: one returns the configuration nearest to the best so far, the next a random configuration.
+        Without a best configuration, all calls return a random one.
+        """
         left = [
             self.space.places(number) for number, each in enumerate(self.space.trials) if each.id not in self._given
         ]
@@ -293,9 +334,11 @@ class Search:
         return asked, self.space.at(places)
 
     def is_hopeless(self, asked: Any, trial: Trial, record: Record, frames: int) -> bool:
-        """Return whether the short run of `trial` ends the trial: it is worse than the median of other short runs.
+        """Return whether the result of a short run ends `trial`. If so, count the trial as tried and pruned.
 
-        `asked`: Optuna's trial. `record`, `frames`: record and length of the short run.
+        The short run ends the trial if its first goal is worse than the median of the short runs of completed trials.
+
+        `asked`: Optuna's trial. `record`: record of the short run. `frames`: number of its frames.
         """
         figures = figures_of(record, self.aim.names)
         goal = self.aim.goals[0]
@@ -310,7 +353,12 @@ class Search:
         return True
 
     def learn(self, asked: Any, trial: Trial, record: Record | None) -> None:
-        """Tell Optuna the result of a trial. A trial without a figure that was asked for counts as failed."""
+        """Count `trial` as tried, and tell Optuna its result.
+
+        A trial without a figure of a goal or limit counts as failed.
+
+        `asked`: Optuna's trial. `record`: record of the trial; None if it was not done.
+        """
         self.tried[trial.id] = trial
         figures = figures_of(record, self.aim.names)
         if not self.aim.has_all(figures):
@@ -326,10 +374,12 @@ class Search:
 
 
 def tune(search: Search, do: Do, budget: int, together: int = 1, short: int | None = None) -> Mapping[str, Record]:
-    """Try at most `budget` configurations and return the records of all that were done, by name.
+    """Try at most `budget` configurations, and return the records of all trials that were done in full, by name.
 
-    `together`: number of configurations that are proposed and done at once. `short`: frames of a short run before each
-    run; None for no short runs. Raises BadInputError if no result has a figure that was asked for.
+    `search`: search without results. `do`: function that does trials. `together`: number of configurations that are
+    proposed and done at once. `short`: number of frames of a short run before each full run; None for no short runs.
+
+    Raises BadInputError if the first results all lack the same figure of a goal or limit.
     """
     records: dict[str, Record] = {}
     while len(search.tried) < budget and search.left:
@@ -366,9 +416,14 @@ def _require_figures(aim: Aim, done: Sequence[Record]) -> None:
 
 
 def answer(search: Search, records: Mapping[str, Record]) -> dict[str, Any]:
-    """Return the answer: `best` or, if no trial keeps all limits, `nearest`, with the frontier and all trials.
+    """Return the answer of a search.
 
-    `records`: all known records of the space, also from an earlier search or sweep.
+    Keys: `best`: the best trial that keeps all limits; None if no trial keeps them. `nearest`: the trial that misses
+    the limits least; None if there is a `best`. `weighed`: names of the figures that the frontier compares. `frontier`:
+    trials that no other trial beats. `trials`: rows of all trials. `not_tried`: result of `_not_tried`.
+
+    `search`: search that has ended. `records`: all known records of the space by the trial's name, also from an earlier
+    search or sweep.
     """
     aim, space = search.aim, search.space
     found = [trial for trial in space.trials if trial.id in records and trial.id not in search.tried]
@@ -417,7 +472,11 @@ def _row(search: Search, trial: Trial, record: Record | None, figures: Mapping[s
 
 
 def _frontier(costs: Mapping[str, tuple[float, ...]]) -> set[str]:
-    """Return the names that are not beaten. A name beats another if no cost is higher and at least one is lower."""
+    """Return the names of the trials that no other trial beats.
+
+    One trial beats another if none of its costs is higher and at least one is lower. `costs`: costs by the trial's
+    name.
+    """
 
     def beats(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
         return one != other and all(a <= b for a, b in zip(one, other, strict=True))
@@ -428,7 +487,11 @@ def _frontier(costs: Mapping[str, tuple[float, ...]]) -> set[str]:
 
 
 def _not_tried(space: Space, ended: Sequence[Trial]) -> dict[str, Any]:
-    """Return how many configurations were not tried, and for each axis the values that no trial had."""
+    """Return which part of `space` was not tried. `ended`: trials that were tried.
+
+    Keys: `count`: number of configurations not tried. `of`: number of all configurations. `values`: for each axis, the
+    values that no trial had; an axis whose values were all tried is missing.
+    """
     values = {
         name: [each for each in several if all(trial.options[name] != each for trial in ended)]
         for name, several in space.axes.items()
