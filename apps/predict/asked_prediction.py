@@ -62,8 +62,8 @@ def application_of(
 ) -> tuple[Profile, Plan]:
     """Return (chip in the network's precision, avatar application with the network that `options` select).
 
-    With the profile `host`, this machine is measured with this network, except for a published network, a requested
-    precision or another unit than the one for networks.
+    With the profile `host`, this machine is measured with this network. It is not measured for a published network, for
+    a requested precision, and for another unit than the one for networks.
 
     Raises BadInputError for a network or avatar that cannot be read, and for options that no application has.
     """
