@@ -16,7 +16,7 @@ TARGET_FPS = 30.0
 MAX_MINUTES = 24 * 60
 
 #: Names of the avatars that are part of the package.
-AvatarName = Literal["default", "hiker"]
+AvatarName = Literal["default", "hiker", "dancer"]
 AVATARS: tuple[AvatarName, ...] = get_args(AvatarName)
 #: Help text for an option that names an avatar.
 AVATARS_HELP = f"{', '.join(f'`{name}`' for name in AVATARS)}, or the folder of an avatar."

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import pytest
 
+from trilane.avatars.bundle import bundle_folder
 from trilane.bench.lib.stage_chain import AvatarFrames, units_of
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import Checked, configure
@@ -21,20 +24,29 @@ size = "192x96"
 output = { width = 320, height = 240 }
 camera = { source = "builtin:static", place = "none" }
 """
-PEOPLE = {"default": (-1.0, "builtin:walk-wave-turn"), "hiker": (1.0, "builtin:idle")}
+#: Bundle, or its folder beside the scene -> place along x in metres, and motion.
+PEOPLE = {"default": (-1.0, "builtin:walk-wave-turn"), "./hiker": (1.0, "builtin:idle")}
 
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Checked]:
-    """The scenes of both people and of each alone, before the same camera, in tensors of one size."""
+    """The scenes of both people and of each alone, before the same camera, in tensors of one size.
+
+    The second person has a network file of its own, which computes the same.
+    """
     folder, made = tmp_path_factory.mktemp("scenes"), {}
+    shutil.copytree(bundle_folder("hiker"), folder / "hiker")
+    network = folder / "hiker" / "network.onnx"
+    model = onnx.load_model(network)
+    model.doc_string = "another file"
+    onnx.save_model(model, network)
     for name in ("both", *PEOPLE):
         avatars = [
             f'[[avatars]]\nbundle = "{bundle}"\nmotion = "{motion}"\nposition = [{x}, 0.0, 0.0]\n'
             for bundle, (x, motion) in PEOPLE.items()
             if name in ("both", bundle)
         ]
-        path = folder / f"{name}.toml"
+        path = folder / f"{Path(name).name}.toml"
         path.write_text(HEAD + "".join(avatars))
         made[name] = configure(RunOptions(scene=str(path), runtime="ort", skinning="cpu"), Path.cwd())
     return made
@@ -63,6 +75,17 @@ def test_each_person_is_drawn_and_painted_as_if_alone(scenes: dict[str, Checked]
 
 
 def test_the_accuracy_of_each_is_that_of_a_person_alone_in_a_tensor(scenes: dict[str, Checked]) -> None:
-    """The scene fixes another size than the validation has; nobody shares a tensor."""
-    for figures in scenes["both"].accuracy.values():
-        assert "tensor size" in figures["why"] and "share" not in figures["why"]
+    """The scene fixes another size than the validation of `default` has; nobody shares a tensor."""
+    reasons = [figures["why"] for figures in scenes["both"].accuracy.values()]
+    assert len(reasons) == 2 and not any("share" in why for why in reasons)
+    assert any("tensor size" in why for why in reasons)
+
+
+def test_three_people_of_one_network_share_a_tensor(gl: Any) -> None:
+    """Each person has a texture of its own: painted in one tensor, the people differ."""
+    people = configure(RunOptions(scene="people", runtime="ort", skinning="cpu"), Path.cwd())
+    assert len(people.config.avatar_dirs) == 3 and people.config.networks == ()
+    frames = frames_of(people, gl)
+    changed = np.abs(frames.frame(FRAME).astype(int) - frames.background(FRAME)).max(axis=-1) > 40
+    columns = np.flatnonzero(changed[160:240].any(axis=0))
+    assert len(np.split(columns, np.flatnonzero(np.diff(columns) > 8) + 1)) == 3

@@ -331,7 +331,7 @@ def test_whoever_is_whole_throughout_is_not_followed(body: ShapedBody, motion: s
 
 
 @pytest.mark.parametrize(
-    "name", ["closeup", "crowd", "default", "far", "full-body", "pair", "portrait", "strangers", "top-to-floor"]
+    "name", ["closeup", "crowd", "default", "far", "full-body", "pair", "people", "portrait", "top-to-floor"]
 )
 def test_scenes_of_the_package_stay_as_they_are(body: ShapedBody, name: str) -> None:
     scene = scene_from(name, load_scene(find_scene(name)))

@@ -212,7 +212,7 @@ def test_places_of_files_and_names_that_are_built_in(tmp_path: Path) -> None:
     with pytest.raises(BadInputError) as raised:
         find_scene("beach")
     names = (
-        "closeup, crowd, default, far, full-body, leave-and-return, pair, portrait, strangers, top-to-floor, walk-past"
+        "closeup, crowd, default, far, full-body, leave-and-return, pair, people, portrait, top-to-floor, walk-past"
     )
     assert str(raised.value) == f"scene: found 'beach', expected a .toml file or one of {names}"
     path = tmp_path / "my.toml"
