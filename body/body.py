@@ -339,8 +339,8 @@ def _check_weights(path: Path, weights: F32) -> None:
 def weights_of_one(weights: F32) -> F32:
     """Return skinning weights (V,J) with negative weights set to 0 and each row scaled to sum to 1.
 
-    A row without negative weights stays as it is if its sum is 1 within rounding. A sum that is off by e would displace
-    a vertex p metres from the origin by e p.
+    A row without negative weights stays as it is if its sum is 1 within rounding. If a sum is 1 + e, a vertex at a
+    distance of p metres from the origin moves by e * p metres.
     """
     bounded = np.maximum(weights, 0)
     sums = bounded.sum(axis=1, dtype=np.float64, keepdims=True)

@@ -319,6 +319,7 @@ class Moment:
     """The state at one poll of the governor.
 
     `t_s`: time since the start in seconds.
+    `frame_ms`: mean frame time at these corners.
     `device_c`, `junction_c`: temperatures of the device's body and of the hottest junction, in degrees Celsius.
     `power_w`: power of the whole device in watts.
     `throttled`: whether a unit is below its requested corner.
@@ -351,7 +352,7 @@ class Settled(Protocol):
 def over_time(
     profile: Profile, plan: Plan, performance_profile: str, minutes: float, governor: str | None = None
 ) -> list[Moment]:
-    """Return the moments of the application from a cold start, one for each poll of the governor.
+    """Return a `Moment` for each poll of the governor, while an application runs on a chip that is cold at the start.
 
     `profile`: hardware profile of the chip.
     `plan`: application that runs on it.
@@ -371,10 +372,14 @@ def warm_up(
     minutes: float,
     governor: str | None = None,
 ) -> list[Moment]:
-    """Return the moments of any load from a cold start, as `over_time` does for an application.
+    """Return a `Moment` for each poll of the governor, while a load runs on a chip that is cold at the start.
 
-    `at`: function that returns the load's settled state at given corners; it is called once for each combination. The
-    other parameters and the errors are those of `over_time`.
+    The load may be anything; `over_time` does the same for an application.
+
+    `at`: function that returns the load's settled state at given corners. It is called once for each combination of
+    corners that occurs.
+
+    The other parameters and the errors are those of `over_time`.
     """
     name = governor or profile.thermal.governor
     if name not in GOVERNORS:

@@ -70,7 +70,8 @@ class JoiningStage(Protocol):
         The header of the output slot already has the frame's number and the sampling time of the oldest input. Inputs
         that take the newest frame do not count for this time. The header has no other fields of the inputs.
 
-        `slots_in`: slot of each input; None for an input that takes the newest frame, as long as there is no frame.
+        `slots_in`: slot of each input; None for an input that takes the newest frame, while it has no frame, or
+        only one that is too old.
         """
 
     def close(self) -> None:
@@ -294,8 +295,8 @@ class PortedStage:
     def work(self, frame: int, arrays: Sequence[NDArray[Any] | None], outputs: Arrays) -> Mapping[str, float]:
         """Do a frame, and return metrics by name; a `Skip` sends the frame to the bypass that begins at the stage.
 
-        `arrays`: read-only array of each of `reads`; None if there is no newest frame yet, or if the frame took a
-        bypass that lacks the port.
+        `arrays`: read-only array of each of `reads`. It is None for an input with `latest` that has no frame, or only
+        one that is too old. It is also None if the frame took a bypass that lacks the port.
         `outputs`: arrays to fill, by the names in `writes`; empty if no stage reads this one.
         """
         raise NotImplementedError

@@ -351,7 +351,10 @@ class Timeline:
             self._track.start(self._now_ns)
 
     def _on_died(self, event: UnitDied) -> None:
-        """Note that the unit's process is down; the unit's frames are lost, or wait again (`fates`)."""
+        """Note that the unit's process is down, and what becomes of the frames of the unit's jobs.
+
+        The function `fates` decides which of these frames are lost. The other frames wait for their stage again.
+        """
         unit = self.units[event.unit]
         unit.fall(self._now_ns, is_gone=True)
         for job, is_lost in fates([handed.job for handed in unit.held], {self._first}):

@@ -27,7 +27,10 @@ ALL_WORK = 1000
 
 
 def work_of_side(side: float) -> int:
-    """Return the work, in thousandths of all pixels, of a tensor whose sides are scaled by `side`."""
+    """Return the work of a scaled tensor: its pixels in thousandths of all pixels, rounded up.
+
+    `side`: factor by which each side of the tensor is scaled.
+    """
     return math.ceil(ALL_WORK * side * side)
 
 

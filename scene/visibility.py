@@ -248,12 +248,15 @@ class Filming:
 
 
 def filming(path: CameraPath, mount: F64, times_s: F64, output: Shape, points: F64, near_m: float) -> Filming:
-    """Return the `Filming` of the recording `path` at `times_s` (F,).
+    """Return the recorded camera and the bodies at F moments, in the form in which places are scored.
 
+    `path`: recorded camera path.
     `mount` (3, 3): rotation from the camera's axes to those of the path.
+    `times_s` (F,): the moments, in seconds of the path.
     `output`: (height, width) of the picture.
-    `points` (F, P, 3): outermost points of the bodies.
-    `near_m`: distance of the near clip plane, metres.
+    `points` (F, P, 3): outermost points of the bodies at the moments, in the scene.
+    `near_m`: distance of the near clip plane, metres. A body is seen from this depth or NEAREST_M on, whichever is
+    larger.
     """
     poses = [path.pose(float(t_s)) for t_s in times_s]
     clips = np.stack([path.projection(float(t_s), output) for t_s in times_s])

@@ -53,7 +53,7 @@ class Checked:
     `accuracy`: result of `accuracy_of` for each avatar, by its name.
     `asked_cores`: cores that the options request for units.
     `placement`: facts from `trilane.stages.placing` about the units' cores; None before the cores are chosen.
-    `losses`: measured image error of each distinct avatar in smaller tensors.
+    `losses`: loss of PSNR of each distinct avatar in tensors below full size; without figures if it was not measured.
     """
 
     config: RunConfig

@@ -49,7 +49,7 @@ KEY = "error_budget_db"
 def tensor_works(scene: Scene, policy: str, losses: Sequence[SizeLoss]) -> tuple[tuple[int, ...], str]:
     """Return (`RunConfig.works` of a scene under `policy`, note for a person, which may be empty).
 
-    `losses`: measured image errors of the scene's avatars in smaller tensors.
+    `losses`: loss of PSNR of each avatar in tensors below full size; without figures if it was not measured.
 
     Raises BadInputError if the scene has an error budget and an avatar has no measured errors.
     """

@@ -167,7 +167,9 @@ class Corners:
         return (np.hstack([own, own, level[number]]), np.hstack([-ones, 0 * ones, shares])), np.unique(own)
 
     def _crossings(self, edges: I64) -> tuple[I64, F64]:
-        """Return the pairs (`corners`, `shares` of `Pairs`) where edges of the whole mesh and of a level cross in UV.
+        """Return one pair for each point of UV where an edge of the whole mesh crosses an edge of a level.
+
+        Pairs are (`corners`, `shares`) as in `Pairs`. Edges that cross at an end of one of them have no pair here.
 
         `edges`: edges (E,2) of the level, indices of corners.
         """

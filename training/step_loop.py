@@ -211,10 +211,11 @@ def device_words(device: torch.device, threads: int) -> str:
 
 
 def keep_freed_memory() -> None:
-    """Make the C library keep the memory that this process frees, if the C library is glibc.
+    """Make the C library keep blocks below 32 MiB that this process frees, if the C library is glibc.
 
-    By default, glibc returns large tensors to the kernel, which clears the same memory for the next tensor. Without
-    the bound of 32 MiB on what stays in the heap, the heap would grow for as long as tensors have other sizes.
+    By default, glibc returns the memory of large tensors to the kernel, and the kernel clears it for the next tensor.
+    After this call, only blocks below 32 MiB stay in the heap. Larger blocks still go back to the kernel; otherwise
+    each new tensor size would make the heap grow.
     """
     set_option = getattr(ctypes.CDLL(None), "mallopt", None)
     if set_option is not None:

@@ -425,7 +425,7 @@ class ByteGrid:
 
     `places`: names of the K places that store bytes, see `_places`.
     `ends`: (K,2), the real values of bytes 0 and 255 at each place; all 0 until measured.
-    `alike`: (1,), 1 if weights are even multiples of powers of two.
+    `alike`: (1,), 1 if all runtimes must round alike: weights are then even multiples of powers of two.
     """
 
     def __init__(self, network: UNet) -> None:
@@ -491,10 +491,10 @@ class _Rounded(torch.autograd.Function):
 
 
 def rounded_weights(folded: Tensor, alike: bool) -> Tensor:
-    """Return weights `folded` (O,I,h,w) rounded as in the bundle: to whole multiples of a scale per output channel.
+    """Return the weights `folded`, rounded as in the bundle: to whole multiples of the scale of their output channel.
 
-    `folded`: weights times the scale of their batch norm. `alike`: whether the scales are powers of two and the
-    multiples even.
+    `folded` (O,I,h,w): weights times the scale of their batch norm.
+    `alike`: whether all runtimes must round alike. If so, scales are powers of two, and only even multiples are used.
     """
     largest = folded.abs().amax(dim=(1, 2, 3), keepdim=True).clamp(min=1e-30)
     unit = 2 * torch.exp2(torch.ceil(torch.log2(largest / (TOP + 0.99)))) if alike else largest / TOP

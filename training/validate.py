@@ -55,13 +55,16 @@ Painter = Callable[[Any, NDArray[np.float32]], U8]
 
 
 class PackedRenderer(Protocol):
-    """A renderer whose samples the packed pass can draw."""
+    """A renderer whose samples `integer_painter` can draw by the packed pass of the GPU unit.
+
+    `ctx`: OpenGL context. `mesh`: mesh of the body that the samples show.
+    """
 
     ctx: Any
     mesh: SkinnedMesh
 
     def placed(self, sample: Any) -> tuple[F64, Placement]:
-        """Return the view matrix (4,4) of `sample`, and its body's pose, crop and place in the tensor."""
+        """Return (view matrix (4,4) of `sample`, its body's pose, crop and place in the tensor)."""
 
 
 @dataclass(frozen=True)

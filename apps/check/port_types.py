@@ -3,6 +3,8 @@
     types = port_types(file, read_networks(file))
     types["camera"][""].shape  # (480, 640, 3)
 
+The key "" is the port of a block with one output, or of a stage whose key `out` is one type without a name.
+
 Rule: the type of a port of the user's own code may be unknown. If the types at both ends of a connection are known,
 they must fit each other.
 """

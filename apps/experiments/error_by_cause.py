@@ -331,7 +331,8 @@ def heat_map(title: str, picture: F64, reference: F64) -> U8:
     The map shows the mean absolute difference of the three channels, multiplied by a power of two. The sheet states
     this factor. A product above 1 gets the bar's last colour.
 
-    `title`: first line of the sheet. `picture`, `reference`: (h,w,3) sRGB in 0..1.
+    `title`: beginning of the sheet's first line; the mean and the largest difference follow it.
+    `picture`, `reference`: (h,w,3) sRGB in 0..1.
     """
     difference = np.abs(picture - reference).mean(axis=2)
     factor = shown_factor(difference)

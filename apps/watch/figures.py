@@ -142,13 +142,19 @@ class Note:
 class MomentFigures:
     """All figures at one moment. None is null in JSON.
 
-    `t_ms`: time since the first step. `window_s`, `run_s`: lengths of the window and of the run.
-    `clock`: "host" or "virtual". `is_over`: whether the journal has the run's end.
-    `state`: "goes on", "finished", "killed" or "removed".
+    `t_ms`: time since the first step.
+    `window_s`: length of the window, which ends at the moment; it equals `run_s` at the beginning of a run.
+    `run_s`: length of the run until the moment.
+    `clock`: "host" or "virtual".
+    `is_over`: whether the journal has the run's end.
+    `state`: "goes on", "finished", "killed" if the process died and left a partial folder, or "removed" if the run
+    folder is gone.
+    `fps`: `run_fps` for a finished run; otherwise presented frames a second in the window.
     `run_fps`: presented frames a second, from the first presented frame to the last, as in report.json; None for fewer
-    than two. `fps`: `run_fps` for a finished run; otherwise presented frames a second in the window.
-    `frame_time_ms`, `latency_ms`: mean, p50, p90, p95, p99 and max in the window, all exact, and `samples`, their
-    number.
+    than two.
+    `frame_time_ms`, `latency_ms`: mean, p50, p90, p95, p99 and max of the times in the window, all exact. The key
+    `samples` has the number of these times.
+    `frames`: numbers of frames of the run, by what became of them.
     `units`, `stages`: figures by name, in the order of the pipeline.
     `temperature_c`: last temperatures by place. `duty`: last duties by unit, from 0 to 1.
     `memory_bytes`: last memory of each process, by unit; `scheduler` is the scheduler's process.
@@ -159,7 +165,8 @@ class MomentFigures:
     `frame_times`, `latencies`: histograms of the whole run.
     `began_at`: UTC, ISO 8601; "" if the journal has no such time.
     `accuracy`: error by avatar, as in report.json; empty if the journal has no errors.
-    `sources`: source of the figures below each key, as in report.json.
+    `sources`: source of figures by key, such as "computed", as in report.json. A source applies to all figures below
+    its key. If several keys fit a figure, the longest key decides.
     """
 
     t_ms: float

@@ -287,12 +287,12 @@ def contradiction(figures: Figures) -> str:
 
 
 def falling(values: Sequence[float], slack: float = 0.0) -> list[int]:
-    """Return the indices of the longest series of `values`, in their order, that never rises by more than `slack`.
+    """Return the indices of a longest subsequence of `values` that never rises by more than `slack`.
 
-    Values outside the series do not fit most other values. Of several longest series, the one with the largest sum is
-    returned, because a wrong time is more often too short than too long.
+    Of several longest subsequences, the function returns the one with the largest sum, because a wrong time is more
+    often too short than too long. Therefore a value outside may fit most other values: [10, 9, 8, 8.5] gives [0, 1, 3].
 
-    `slack`: largest rise, as a share of the value before.
+    `slack`: largest rise from one value of the subsequence to the next, as a share of the first of the two.
     """
 
     def weight(series: list[int]) -> tuple[int, float]:

@@ -411,7 +411,7 @@ def read_cut_means(document: Mapping[str, Any]) -> Found:
 def rising_rests(points: Sequence[tuple[int, float]]) -> Iterator[tuple[int, str]]:
     """Yield (cut to remove, reason) for each time that must be removed so that times never rise from cut to cut.
 
-    The longest series of times that never rises stays.
+    A longest subsequence of times that never rises stays, see `falling`.
 
     `points`: pairs (number of the layer of the cut, time in ms of the part of the network behind the cut).
     """

@@ -195,7 +195,7 @@ class _Run:
             self.end()
 
     def end(self) -> None:
-        """End the execution: keep the times that fit into each other, and refuse those that do not fit most others."""
+        """End the execution: keep a longest series of times that fit into each other, and refuse the others."""
         names = [name for name, _ in NESTED if name in self._rows]
         ms = [self._rows[name][1] / PER_MS[self._rows[name][2]] for name in names]
         kept = falling(ms, NESTED_SLACK)

@@ -320,11 +320,13 @@ def _guesses(turns: F64, expected: str, prices: _Prices, stated: str) -> list[_G
 
 
 def _is_of_first(turns: F64, best: _Guess) -> bool:
-    """Return whether the world has the axes of the first picture, and the guess `best` takes that picture's up as up.
+    """Return whether the world has the axes of the first picture, and the up of `best` points to this picture's top.
 
-    `turns` (N, 3, 3): camera axes; False for a single picture.
+    Both OpenGL axes and optical axes of the picture count. The world of a SLAM map has these axes. If there is only one
+    picture, the result is False.
 
-    SLAM maps are such worlds.
+    `turns` (N, 3, 3): camera axes of the pictures, in OpenGL's convention.
+    `best`: the guess at up.
     """
     first = turns[0]
     is_unturned = abs(first[0, 0]) > AS_FIRST and abs(first[1, 1]) > AS_FIRST

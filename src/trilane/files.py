@@ -375,9 +375,11 @@ def _checked_bytes(where: Path | str, file: IO[bytes], expected: str) -> int:
 
 
 def whole_number(digits: str) -> int | float:
-    """Return the value of a whole number in a JSON document; ±infinity for a number beyond the range of floats.
+    """Return the value of a whole number in a JSON document.
 
-    `digits`: the number as text.
+    If the text has LONGEST_WHOLE characters or more, the result is infinity with the sign of the number.
+
+    `digits`: the number as text, with its sign if it is negative.
     """
     return int(digits) if len(digits) < LONGEST_WHOLE else math.copysign(math.inf, -1 if digits.startswith("-") else 1)
 

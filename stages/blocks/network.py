@@ -1,8 +1,9 @@
 """A network as a stage: `onnx = "net.onnx"` of a pipeline file, in a runtime that reads and writes the slots.
 
-Rule: the runtime reads an input with the network's type directly from its slot, and writes an output directly to its
-slot. A picture is first converted into memory of the stage, as by the block `prepare`. If there is no newest frame yet,
-the input is zeros.
+Rule: the stage passes an input to the runtime in place if its number type and its number of elements are those of the
+network. Otherwise the input is a picture, and the stage first converts it into its own memory, like the block
+`prepare`. An input with `sync = "latest"` is zeros while it has no frame, or only one older than `max_age_ms`. The
+runtime writes outputs to the memory of their slots.
 
 The module runs networks of any number types, inputs and outputs, in each of the runtimes:
 
@@ -10,14 +11,15 @@ The module runs networks of any number types, inputs and outputs, in each of the
     call = engine.bound({"image": pictures}, {"scores": scores})
     call()
 
-Rule: only the runtime `cuda` copies inputs and outputs. A runtime runs the whole network or refuses it; no runtime
-falls back to another. The number types are those of the file: a float network is computed in floats, unlike an avatar's
-network.
+Rule: the runtime `cuda` copies inputs to the GPU and outputs back. The other runtimes read and write the arrays
+themselves. A runtime runs the whole network or refuses it; no runtime falls back to another. The number types are those
+of the file: a float network is computed in floats, unlike an avatar's network.
 
 `calls_of` measures isolated calls of a network on this machine, on distinct inputs, in a process like a unit of a run.
 A measurement is cached under everything that it depends on, so that a changed machine, package or network is measured
-again. An integer network runs like an avatar's network. Any other network runs with its own number types: in ONNX
-Runtime, or for a stage of a pipeline file in the runtime of the stage.
+again. An integer network runs like an avatar's network if it is no stage of a pipeline file (`as_stage`) and no shapes
+are given. All other networks run with their own number types. A stage of a pipeline file runs in the runtime of the
+stage, any other network in ONNX Runtime.
 """
 
 from __future__ import annotations
@@ -165,8 +167,8 @@ _ENGINES: Mapping[str, Callable[[Path, Shapes, RuntimeOptions], LoadedNetwork]] 
 class _Fed(NamedTuple):
     """An input of the network.
 
-    `own`: memory of the stage for a prepared picture or for zeros.
-    `preparation`: conversion of a picture into this memory; None if the slot is read directly.
+    `own`: memory of the stage for a prepared picture, or for zeros while the input has no frame.
+    `preparation`: conversion of a picture into this memory; None if the runtime gets the array of the slot.
     """
 
     name: str

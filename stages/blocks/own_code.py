@@ -2,9 +2,9 @@
 
 `factory(settings)` is called once in the unit's process and returns a callable. The callable is called for each frame
 with an array for each input: a named port as a keyword argument, a single input without a name as the only argument.
-The argument of an input with `sync = "latest"` is None until its first frame is there. The callable returns a dict of
-arrays by port, or the array of the only port. A callable with a parameter `out` gets there the arrays to fill, by port,
-and may return None.
+The argument of an input with `sync = "latest"` is None while it has no frame, or only one older than `max_age_ms`. The
+callable returns a dict of arrays by port, or the array of the only port. A callable with a parameter `out` gets there
+the arrays to fill, by port, and may return None.
 
 If a bypass begins at the stage, the callable may have an attribute `skips`, which is read after each frame: true sends
 the frame to the bypass. If the callable has a method `forget`, the method is called when the next frame must not rely

@@ -44,7 +44,7 @@ NOTHING = ByteCounter().figures()
 
 @contextmanager
 def full_disk_told(path: Path) -> Iterator[None]:
-    """Turn the errors of a full disk inside the `with` block into an UnwrittenError about `path`."""
+    """Turn the errors of a full or failing disk inside the `with` block into an UnwrittenError about `path`."""
     try:
         yield
     except (OSError, av.error.FFmpegError) as error:
@@ -116,7 +116,10 @@ class Segment:
         self.moved.least += encoded
 
     def close(self) -> None:
-        """Flush the encoder and complete the file. Raises UnwrittenError."""
+        """Encode the last frames, then complete the video file and the file of digests.
+
+        Raises UnwrittenError if the disk is full or fails.
+        """
         with full_disk_told(self._path):
             self._container.mux(self._stream.encode(None))
             self._container.close()
@@ -178,7 +181,7 @@ class PresentStage:
         return {"digest_ms": (digested - start) * MS, "encode_ms": encode_ms, **self._segment.moved.figures()}
 
     def close(self) -> None:
-        """Complete the segment."""
+        """Complete the segment's video file and file of digests, if frames are recorded. Raises UnwrittenError."""
         if self._segment is not None:
             self._segment.close()
             self._segment = None

@@ -1,6 +1,7 @@
 """The runtime `openvino`: OpenVINO on the CPU, which reads and writes the slots' own memory.
 
-Rule: after the first run of a session nothing is allocated and nothing is copied; no layer runs in float.
+Rule: after the first run of a session nothing is allocated and nothing is copied. Only the layers in `float_layers` of
+the network may run in float.
 """
 
 from __future__ import annotations
@@ -54,7 +55,8 @@ class OpenvinoSession:
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OpenvinoSession:
     """Return `network` compiled for the threads of `options`, from the cache if it was compiled before.
 
-    Raises BadInputError if OpenVINO cannot load it or would run a layer in float.
+    Raises BadInputError if OpenVINO cannot load it. Raises it also if OpenVINO would run a layer in float that is not
+    in `float_layers` of the network.
     """
     settings = {
         "PERFORMANCE_HINT": "LATENCY",

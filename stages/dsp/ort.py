@@ -1,6 +1,7 @@
 """The runtime `ort`: ONNX Runtime on the CPU, which reads and writes the slots' own memory.
 
-Rule: after the first run of a session nothing is allocated and nothing is copied; no layer runs in float.
+Rule: after the first run of a session nothing is allocated and nothing is copied. Only the layers in `float_layers` of
+the network may run in float.
 """
 
 from __future__ import annotations
@@ -74,7 +75,8 @@ class OrtSession:
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
     """Return `network` compiled for the threads of `options`.
 
-    Raises BadInputError if ONNX Runtime cannot load it or would run a layer in float.
+    Raises BadInputError if ONNX Runtime cannot load it. Raises it also if ONNX Runtime would run a layer in float that
+    is not in `float_layers` of the network.
     """
     with tempfile.TemporaryDirectory(prefix="trilane-ort-") as folder:
         optimised = Path(folder) / "optimised.onnx"
@@ -93,7 +95,10 @@ def version() -> str:
 
 
 def check_integer(optimised: onnx.ModelProto, network: IntegerNetwork) -> None:
-    """Raise BadInputError naming the layers that compute in float in `optimised`, the optimised graph of `network`."""
+    """Raise BadInputError if layers of `optimised` compute in float that are not in `float_layers` of `network`.
+
+    The error names these layers. `optimised`: optimised graph of `network`.
+    """
     layers = {node_name(node) for node in optimised.graph.node if node.op_type in FLOAT_LAYERS}
     float_layers = sorted(layers - network.float_layers)
     if float_layers:

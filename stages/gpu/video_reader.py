@@ -93,7 +93,7 @@ def pq_code(light: F64) -> F64:
 
 @cache
 def _gains() -> F32:
-    """Return the factors by which light is reduced (STEPS,).
+    """Return the factors (STEPS,) that turn light in cd/m2 into light of a common display, see `roll_off`.
 
     Entry i is for a light whose square root is the i-th of STEPS equal steps from 0 to the square root of PEAK.
     """
@@ -103,7 +103,11 @@ def _gains() -> F32:
 
 
 def roll_off(light: F64) -> F64:
-    """Return `light`, cd/m2 up to PEAK, reduced to the range of a display, where white is 1: BT.2390's spline."""
+    """Return the light of a common display for `light`, an array of any shape, in cd/m2 up to PEAK.
+
+    In the result, 1 is the display's white, which is WHITE cd/m2. Lights below the knee of the curve are only divided
+    by WHITE. The spline of ITU-R BT.2390 compresses brighter lights, so that PEAK becomes 1.
+    """
     peak = pq_code(np.array(PEAK))
     code, most = pq_code(light) / peak, float(pq_code(np.array(WHITE)) / peak)
     knee = 1.5 * most - 0.5
