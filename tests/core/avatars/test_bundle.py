@@ -93,7 +93,7 @@ def test_a_word_like_default_is_no_folder(tmp_path: Path) -> None:
     with pytest.raises(BadInputError, match=r"defalt: found no such folder, expected .*; did you mean 'default'\?"):
         load_bundle(tmp_path / "defalt")
     with pytest.raises(
-        BadInputError, match=r"walker: found no such folder, .* or one of default, hiker; docs/own-avatar"
+        BadInputError, match=r"walker: found no such folder, .* or one of default, hiker, dancer; docs/own-avatar"
     ):
         load_bundle(tmp_path / "walker")
     (tmp_path / "defalt").mkdir()

@@ -93,12 +93,16 @@ def test_a_manifest_s_offsets_lie_in_its_folder(raised: Path, tmp_path: Path) ->
             load_bundle(raised)
 
 
+#: How far clothes and hair of each avatar may stand off, in metres: a skirt spans the gap between the legs.
+STAND_OFF_M = {"default": 0.1, "hiker": 0.1, "dancer": 0.2}
+
+
 @pytest.mark.parametrize("name", AVATARS)
 def test_avatars_of_the_package_wear_clothes_and_their_figures_are_of_their_files(name: str) -> None:
     """Clothes stand off by a centimetre or two in the mean, hair and shoes by some more."""
     bundle = load_bundle(name)
     length = np.linalg.norm(bundle.read_body().offsets, axis=1)  # type: ignore[arg-type]
-    assert 0.005 < length.mean() < 0.03 and 0.03 < length.max() < 0.1
+    assert 0.005 < length.mean() < 0.03 and 0.03 < length.max() < STAND_OFF_M[name]
     assert bundle.manifest.name == name and bundle.folder == bundle_folder(name)
     assert bundle.manifest.validation is not None
     assert bundle.manifest.validation.digests == digests_of(bundle.folder, bundle.manifest)

@@ -211,9 +211,7 @@ def test_places_of_files_and_names_that_are_built_in(tmp_path: Path) -> None:
         find_scene("portait")
     with pytest.raises(BadInputError) as raised:
         find_scene("beach")
-    names = (
-        "closeup, crowd, default, far, full-body, leave-and-return, pair, people, portrait, top-to-floor, walk-past"
-    )
+    names = "closeup, crowd, default, far, full-body, leave-and-return, pair, people, portrait, top-to-floor, walk-past"
     assert str(raised.value) == f"scene: found 'beach', expected a .toml file or one of {names}"
     path = tmp_path / "my.toml"
     path.write_text("[camera]\nnear_m = 0.1\n[[avatars]]\nheading_deg = 3.0\n")

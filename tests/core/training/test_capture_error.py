@@ -107,7 +107,7 @@ def test_what_is_no_avatar_is_answered_with_the_way_to_one(tiny_bundle: Path, tm
     with pytest.raises(BadInputError, match=r"found a body, which has no texture and no network.*docs/own-avatar\.md"):
         load_bundle(tiny_bundle / "body.npz")
     with pytest.raises(
-        BadInputError, match=r"found a file, expected the folder of an avatar, or one of default, hiker; docs"
+        BadInputError, match=r"found a file, expected the folder of an avatar, or one of default, hiker, dancer; docs"
     ):
         load_bundle(tiny_bundle / "network.onnx")
     with pytest.raises(BadInputError, match=r"found a capture, which avatars are trained on.*docs/own-avatar\.md"):
