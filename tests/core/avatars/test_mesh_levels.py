@@ -28,6 +28,7 @@ from trilane.body.skinning import CpuSkinner
 from trilane.errors import BadInputError
 from trilane.scene.crop import error_px, least_w, stretch_of
 from trilane.stages.avatar_assets import AvatarData, load_avatar
+from trilane.units import AVATARS
 
 
 def coarse(shaped: ShapedBody, every: int, rest_m: float) -> MeshLevel:
@@ -275,7 +276,7 @@ def test_a_wave_is_simplified_within_its_tolerance() -> None:
 # --- the levels of the included avatars ------------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module", params=["default", "hiker"])
+@pytest.fixture(scope="module", params=AVATARS)
 def included(request: pytest.FixtureRequest) -> tuple[ShapedBody, tuple[MeshLevel, ...]]:
     bundle = load_bundle(request.param)
     shaped = bundle.shaped_body()
