@@ -25,7 +25,7 @@ from trilane.units import AvatarName
 # Rule: this module needs no PyTorch, so that settings can be checked without PyTorch.
 
 #: Name of a bundled avatar, or `new`.
-BundledName = AvatarName | Literal["new"]
+BundledName = Literal[AvatarName, "new"]
 Repeats = Annotated[int, Field(ge=1, le=100)]
 
 
@@ -223,7 +223,7 @@ class TrainingSettings(Table):
     look: str | Annotated[tuple[str, ...], LISTED, Len(2, 16)] | None = None
     start: BundledName = "default"
     keep_network: bool = False
-    texture: BundledName | Literal["look"] = "new"
+    texture: Literal[BundledName, "look"] = "new"
     width: int = Field(default=16, ge=4, le=64)
     network_rate: float = Field(default=1.5e-3, gt=0, le=1)
     texture_rate: float = Field(default=4e-4, gt=0, le=1)

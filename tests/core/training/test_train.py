@@ -25,6 +25,7 @@ from trilane.training.subject import Person, Subject  # noqa: E402
 from trilane.training.train import TrainingPlaces, train_avatar  # noqa: E402
 from trilane.training.trainable_avatar import NeuralTexture  # noqa: E402
 from trilane.training.training_settings import TrainingSettings, parsed_settings, read_settings  # noqa: E402
+from trilane.units import AVATARS  # noqa: E402
 
 SHAPE, SIDES = (32, 32), (64, 32)
 FACTS = {"body": "that of a capture", "frames": 9}
@@ -217,13 +218,15 @@ def test_several_looks_are_painted_by_one_network(
         assert json.loads((tmp_path / "work" / name / "samples.json").read_text())["look"] == name
 
 
-@pytest.mark.parametrize("name", ["default", "hiker"])
-def test_a_bundled_avatar_is_trained_further_by_its_settings(name: str) -> None:
-    """They are those of the command in its manifest, which trained it on one thread."""
+@pytest.mark.parametrize("name", AVATARS)
+def test_bundled_avatars_are_trained_further_by_the_settings_of_their_training(name: str) -> None:
+    """The manifest states the same training. All avatars have its network and its settings."""
     bundle = load_bundle(name)
-    asked, command_line = read_settings(bundle.folder / "training.toml"), bundle.manifest.training_command
-    assert (asked.look, asked.start, asked.texture) == (name, name, name)
-    assert (asked.width, asked.threads) == (bundle.manifest.network.width, 1)
-    for key in ("samples", "batch", "seed", "precision"):
-        assert f"--{key} {getattr(asked, key)} " in f"{command_line} "
-    assert f"--bytes-from {asked.bytes_from}" in command_line
+    asked, made = read_settings(bundle.folder / "training.toml"), bundle.manifest.provenance
+    assert (asked.look, asked.start, asked.texture) == (AVATARS, "default", "look")
+    assert asked.width == bundle.manifest.network.width and made["look"] == name
+    assert bundle.manifest.training_command == "trilane avatar train --config training.toml"
+    for key in ("samples", "steps", "batch", "seed"):
+        assert getattr(asked, key) == made[key]
+    network, other = (load_bundle(each).network_path.read_bytes() for each in (name, "default"))
+    assert network == other

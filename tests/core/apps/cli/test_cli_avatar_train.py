@@ -128,7 +128,7 @@ def test_without_pytorch_the_lines_that_install_it_are_said(
         (("--minutes", "nan"), "options: minutes: found nan, expected above 0, at most 100000 minutes"),
         (("--minutes", 0), "options: minutes: found 0, expected above 0, at most 100000 minutes"),
         (("--minutes", "soon"), "--minutes: found 'soon', expected a number"),
-        (("--start", "old"), "options: start: found 'old', expected 'default', 'hiker' or 'new'"),
+        (("--start", "old"), "options: start: found 'old', expected 'default', 'hiker', 'dancer' or 'new'"),
         (("--loss", "tesis"), "options: loss: found 'tesis', expected one of default, thesis; did you mean 'thesis'"),
         (("--width", 8), "--width: found 8, expected 16 of a trained network; or --start new"),
         (("--config", "nothing.toml"), "nothing.toml: found no such file"),
