@@ -97,8 +97,11 @@ def level_facts(level: MeshLevel, side: int) -> dict[str, Any]:
     `level`: the coarser level.
     `side`: side of the texture, in texels.
 
-    Keys: `triangles` and `vertices`, counts. `rest_mm`, largest distance at rest between the surface of the level and
-    that of the whole mesh. `seam_texels`, largest shift of the texture at the seams.
+    Keys:
+    `triangles`: number of triangles.
+    `vertices`: number of vertices.
+    `rest_mm`: largest distance at rest between the surface of the level and that of the whole mesh.
+    `seam_texels`: largest shift of the texture at the seams.
     """
     return {
         "triangles": len(level.faces),
@@ -111,8 +114,11 @@ def level_facts(level: MeshLevel, side: int) -> dict[str, Any]:
 def add_levels(bundle: Bundle) -> dict[str, Any]:
     """Make coarser levels of the mesh of `bundle`, write them into the avatar's folder, and return facts about them.
 
-    Keys: `avatar`, path of the folder. `triangles`, number in the whole mesh. `levels`, list with the `level_facts` of
-    each level.
+    Keys:
+    `avatar`: path of the folder.
+    `triangles`: number of triangles of the whole mesh.
+    `levels`: list with the `level_facts` of each level.
+
     Raises BadInputError for a file that is wrong or cannot be written, MissingPartError without meshoptimizer.
     """
     from trilane.training.mesh_levels import make_mesh_levels

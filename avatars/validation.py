@@ -102,8 +102,10 @@ def validation_facts(bundle: Bundle) -> dict[str, Any] | None:
 def refused(bundle: Bundle) -> dict[str, Any]:
     """Return the reason why no figure of the manifest may be shown; empty if they may be shown.
 
-    Keys: `source`, which is `NO_FIGURES`; `changed`, the keys of `PARTS` that were changed since the validation; `why`,
-    the reason as a sentence.
+    Keys:
+    `source`: `NO_FIGURES`.
+    `changed`: keys of `PARTS` that were changed since the validation.
+    `why`: the reason as a sentence.
 
     Raises BadInputError for a file that cannot be read.
     """

@@ -445,9 +445,11 @@ def _derivatives(at: F64, rows: Sequence[_EngineRow], places: Sequence[int], pre
 
 
 def _unit_numbers(profile: Profile, unit: UnitName, rows: Sequence[OwnRow]) -> dict[str, tuple[float, float]]:
-    """Return (value, spread) of each number of a unit without a tensor engine, by key.
+    """Return (value, spread) of each known number of a unit without a tensor engine, by key.
 
-    The fit has one factor on all times of the unit.
+    The fit finds one factor on all times of the unit. It divides the efficiencies by this factor, up to
+    MOST_EFFICIENCY, and multiplies the COSTS by it. The spread of each number stays as in `profile`.
+    `rows`: measurements on `unit`.
     """
     own = profile.units[unit]
     noise = max(NOISE, own.model_error_fraction.or_else(0.3))

@@ -111,10 +111,11 @@ def step_wise(
     requested: Mapping[UnitName, int],
     power_w: Mapping[UnitName, float],
 ) -> None:
-    """Lower a unit if the device is over a limit and still gets warmer, or raise a unit if the device is cool enough.
+    """Move one unit a corner down if the device is too warm, or a corner up if the device is cool enough.
 
-    The unit with the most power is lowered. The most lowered unit is raised if the device is below the limits by the
-    hysteresis.
+    If a temperature is above its limit and the device gets warmer, the unit with the most power moves down. Units at
+    the last corner do not count. If all temperatures are below their limits by more than `hysteresis_k` of the profile,
+    the most lowered unit moves up. Otherwise nothing changes.
 
     `profile`: hardware profile of the chip.
     `thermal_state`: present temperatures.

@@ -187,7 +187,11 @@ def _check_kinds(graph: onnx.GraphProto) -> None:
 
 
 def _made(graph: onnx.GraphProto) -> Iterator[str]:
-    """Yield the name of a tensor each time that it is made; an input that declares a weight does not count."""
+    """Yield the names of the tensors that `graph` makes: its weights, its inputs and its operators' outputs.
+
+    A tensor that is made several times is yielded several times. An input with the name of a weight only declares this
+    weight, and is not yielded.
+    """
     weights = [tensor.name for tensor in graph.initializer]
     yield from weights
     yield from (value.name for value in graph.input if value.name not in set(weights))

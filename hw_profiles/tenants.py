@@ -235,7 +235,7 @@ class Tenant:
         return Plan(self.networks[kind], self.unit, self.variant, avatars=avatars, meshes=meshes, stretch=stretch)
 
     def place(self, frame: int) -> int:
-        """Return the index of the frame's network, or SKIPS."""
+        """Return the index into `networks` of the network of `frame`; SKIPS if the frame takes the bypass."""
         return self.frames[frame % len(self.frames)]
 
     def skips(self, frame: int, is_fresh: bool) -> bool:  # noqa: ARG002 an older result is never shown again here
@@ -395,7 +395,8 @@ class _Priced(NamedTuple):
 class _FileJobs:
     """The `Jobs` of a `FileTenant`. The name of a network is the name of its stage.
 
-    A network whose time the file states takes no bandwidth.
+    A network takes bandwidth only if the chip's model gives its time. If the file states the time, the stage counts as
+    a stage without a network.
     """
 
     def __init__(self, tenant: FileTenant, profile: Profile, corners: Corners, end: Ends, always: float) -> None:

@@ -490,7 +490,7 @@ class StageKeys(Keys):
 
 
 class TimedStage(StageKeys):
-    """A stage with only a time: no network and no code."""
+    """A stage that has a set time and nothing to run."""
 
     kind = "time_ms"
 

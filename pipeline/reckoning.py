@@ -123,7 +123,11 @@ class WhatIf:
         self._handed_ns: list[int] = []
 
     def add(self, explained: ExplainedJob) -> None:
-        """Keep the needs of a job for the replays; call this in the order of the jobs' ends."""
+        """Note the needs of a job for the replays; call this in the order of the jobs' ends.
+
+        The needs of a frame's jobs count only if the frame is presented. Nothing is noted if the run cannot be
+        replayed.
+        """
         if not self._is_known:
             return
         job = explained.job
@@ -220,7 +224,11 @@ class RunEfficiencies:
         self._unsettled: list[JobRecord] = []  # jobs since the last presented frame
 
     def add(self, job: JobRecord, *, presents: bool) -> None:
-        """Count a job; call this in the order of the jobs' ends. `presents`: whether this job presents a frame."""
+        """Take a job; call this in the order of the jobs' ends.
+
+        A job counts from when a frame is presented at its end or later.
+        `presents`: whether this job presents a frame.
+        """
         self._unsettled.append(job)
         if not presents:
             return
@@ -303,7 +311,7 @@ class Reckoning:
         return _bound(self._budget, self._unit_of, None).get("bound")
 
     def add(self, explained: ExplainedJob) -> None:
-        """Add a job; call this in the order of the jobs' ends."""
+        """Take a job into all figures of the run; call this in the order of the jobs' ends."""
         self.paths.add(explained)
         self.sharing.add(explained.job)
         presents = explained.presented is not None

@@ -102,9 +102,11 @@ def seen_at(
 
 
 def _shown(clip: F64) -> tuple[float, float, float]:
-    """Return (share of the points `clip` (K, 4), clip space, in the view volume; lowest, highest visible y in NDC).
+    """Return (share of the points that are in the view volume, lowest visible y, highest visible y); y in NDC.
 
-    If all points are beyond one plane, the lowest y is 1 and the highest is -1.
+    If all points are beyond one plane, the share is 0, the lowest y is 1 and the highest is -1. If only some points are
+    behind the near plane, the lowest y is -1 and the highest is 1.
+    `clip`: points (K, 4) in clip space.
     """
     w = clip[:, 3]
     beyond = np.concatenate([clip[:, :3] > w[:, None], clip[:, :3] < -w[:, None]], axis=1)
@@ -305,7 +307,10 @@ class PlaceJudge:
         return PlaceMerits(*np.concatenate(parts, axis=1))
 
     def _shown(self, places: F64) -> F64:
-        """Return an array (3, S) with `whole`, `well` and `nearly` of at most PLACES_AT_ONCE places (S, 3)."""
+        """Return an array (3, S) whose rows are the fields `whole`, `well` and `nearly` of `PlaceMerits`.
+
+        `places`: at most PLACES_AT_ONCE places (S, 3).
+        """
         film = self._film
         turned = np.rint(facing(film, places) * (HEADINGS / (2 * np.pi))).astype(np.intp) % HEADINGS
         values = (places.astype(np.float32) @ self._along).reshape(len(places), ROWS, -1)

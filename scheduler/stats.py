@@ -65,10 +65,12 @@ def _summary_row(count: int, total: int, largest: int, percentile_of: Callable[[
 
 
 def samples_needed(share: float) -> int:
-    """Return the number of samples whose largest exceeds the percentile at `share` (0 to 1) with 95 % confidence.
+    """Return how many samples are needed so that the largest exceeds a percentile with a probability of 95 %.
 
-    This is the least n with 1 - share^n >= 0.95: 29 for p90, 59 for p95, 299 for p99. Fewer samples do not show that
-    they reach up to the percentile. Wilks, Annals of Mathematical Statistics 12 (1941), 91-96.
+    This is the least n with 1 - share^n >= 0.95: 29 for p90, 59 for p95, 299 for p99. With fewer samples, the
+    probability that all of them are below the percentile is over 5 %.
+    Source: Wilks, Annals of Mathematical Statistics 12 (1941), 91-96.
+    `share`: the percentile as a share, such as 0.99 for p99; above 0 and below 1.
     """
     return ceil(log(1 - CONFIDENCE) / log(share))
 

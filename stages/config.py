@@ -189,7 +189,7 @@ class RunConfig(StrictModel):
 
     @property
     def tensor_budgets(self) -> tuple[TensorBudget, ...]:
-        """The budget of a planned tensor for each of `works`."""
+        """The budgets of a planned tensor: one for each of its sizes, which the field `works` lists."""
         whole = TensorBudget(self.own_pixels, self.scene.most_side**2, curves=self.size_curves)
         return tuple(whole.scaled(work) for work in self.works)
 

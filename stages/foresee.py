@@ -219,7 +219,7 @@ def _foreseen(
 def foreseen_rects(
     scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], frames: Sequence[int]
 ) -> Iterator[Mapping[int, Rect]]:
-    """Yield the rectangle of each visible avatar, by its number, for each of `frames`."""
+    """Yield the rectangles of the visible avatars by number, for each frame. `frames`: numbers of the frames."""
     distinct = {id(body): MeshBounds(body, standoff_m=CLOTHES_STANDOFF_M) for body in bodies}
     skeletons = [Skeleton(body.joints, body.body.parents) for body in bodies]
     for frame in frames:

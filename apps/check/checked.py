@@ -120,7 +120,7 @@ def _routes(file: PipelineFile, rules: Mapping[str, str]) -> list[dict[str, Any]
 
 
 def _what(stage: StageKeys) -> str:
-    """Return the stage's network file, Python factory or block; "" for a stage that has only a time."""
+    """Return the stage's network file, Python factory or block; "" for a stage with a set time and nothing to run."""
     return str(getattr(stage, stage.kind)) if stage.kind != "time_ms" else ""
 
 

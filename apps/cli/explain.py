@@ -176,9 +176,11 @@ def _efficiency(document: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _budget(document: Mapping[str, Any]) -> Table:
-    """Return a table of the frame time: the ms a frame and the share of each stage and cause on the critical path.
+    """Return a table of the frame time on the critical path.
 
-    Parts below LEAST_SHARE are added up in the last row. `document`: document of `trilane explain --json`.
+    Each row has a stage, a cause, the milliseconds per frame and the share. The last row adds up the parts whose share
+    is below LEAST_SHARE.
+    `document`: document of `trilane explain --json`.
     """
     from rich.table import Table
 

@@ -135,10 +135,11 @@ def fit(
     networks: Annotated[Path | None, typer.Option(help="Folder of the networks; if none, the CSV's folder.")] = None,
     json: JsonOption = False,
 ) -> None:
-    """Fit a profile to measured rows; print residuals and the error of each row by a fit without it.
+    """Fit a profile to measured rows; print how well it predicts left-out rows.
 
-    A CSV with the columns `network, ms` fits the numbers of a chip's profile; one of the reference networks fits the
-    efficiencies of its units.
+    A CSV with the columns `network, ms` fits the numbers of a chip's profile. To predict a row, the fit leaves out all
+    rows of the same network. A CSV of the reference networks fits the efficiencies of the units. To predict a
+    measurement, the fit leaves out only this measurement.
     """
     from trilane.hw_profiles.calibrate import calibrate, is_own_table, read_own_rows
     from trilane.hw_profiles.fit import as_toml, fit_profile

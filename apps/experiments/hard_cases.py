@@ -175,9 +175,15 @@ def _moved(picture: F32, by: int, axis: int) -> Iterator[F32]:
 def hard_cases(runtimes: Sequence[str]) -> Iterator[dict[str, Any]]:
     """Yield a row for each network of `NETWORKS`, input of `INPUTS` and runtime of `runtimes`.
 
-    Keys: `name`; `error`, `bound`: mean error and its bound; `unit`: unit of both; `source`: source of the bound;
-    `predicted_error`: expected error; the keys of `wrong_answers`; `verdict`: text; `passed`: whether the verdict is
-    HOLDS. An `error` that is not a finite number is None, and counts as above every bound.
+    Keys, besides the keys of `wrong_answers`:
+    `name`: name of the row.
+    `error`: mean error; None if it is not a finite number, which counts as above every bound.
+    `bound`: bound on the error.
+    `unit`: unit of the error and of the bound.
+    `source`: source of the bound.
+    `predicted_error`: expected error.
+    `verdict`: verdict as text.
+    `passed`: whether the verdict is HOLDS.
 
     Raises MissingPartError without PyTorch or a runtime.
     """

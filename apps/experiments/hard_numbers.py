@@ -84,9 +84,16 @@ Shown = Callable[[float], F64]
 def hard_numbers() -> Iterator[dict[str, Any]]:
     """Yield a row for each hard number.
 
-    Keys: `name`; `error`, `bound`: error and its bound; `unit`: unit of both; `source`: source of the bound; `verdict`:
-    text; `passed`: whether the bound holds. An `error` that is not a finite number is None, and counts as above every
-    bound. Raises MissingPartError if no OpenGL context can be made.
+    Keys:
+    `name`: what is computed.
+    `error`: error; None if it is not a finite number, which counts as above every bound.
+    `bound`: bound on the error.
+    `unit`: unit of the error and of the bound.
+    `source`: source of the bound.
+    `verdict`: verdict as text.
+    `passed`: whether the bound holds.
+
+    Raises MissingPartError if no OpenGL context can be made.
     """
     for case in _cases():
         error = case.error if math.isfinite(case.error) else None

@@ -153,10 +153,17 @@ def runtime_differences(checked: Checked, runtimes: Sequence[str], frames: int) 
     `checked`: the scene and its avatars. `runtimes`: names of two or more runtimes. `frames`: number of frames, evenly
     spread over the scene.
 
-    Keys: `rows`: a row for each pair of runtimes, with `first`, `second`: names; `mean`, `largest`: differences in
-    steps of 1/255, over all channels and frames; `worst_frame`: number of the frame with the largest mean. `sources`:
-    source of the rows. `bounds`: bounds on `mean` and `largest`. `frames`: numbers of the frames that show an avatar.
+    Keys:
+    `rows`: a row for each pair of runtimes.
+    `sources`: source of the rows.
+    `bounds`: bounds on `mean` and `largest`.
+    `frames`: numbers of the frames that show an avatar.
     `runtimes`: version of each runtime, by name.
+
+    Keys of a row:
+    `first` and `second`: names of the runtimes.
+    `mean` and `largest`: differences in steps of 1/255, over all channels and frames.
+    `worst_frame`: number of the frame with the largest mean.
 
     Raises BadInputError for a number of frames out of range, fewer than two runtimes, a runtime given twice, or nobody
     in view. Raises MissingPartError for a runtime that is not installed, or without OpenGL.

@@ -210,7 +210,8 @@ class RunExplanation:
     def _of_cores(self, frame_ms: float | None, efficiency: float | None) -> dict[str, Any] | None:
         """Return figures of the run's cores; None if the mean frame time, the efficiency or a unit's cores are unknown.
 
-        Keys: `numbers`: numbers of the cores.
+        Keys:
+        `numbers`: numbers of the cores.
         `had_ms`: mean frame time multiplied by the number of cores.
         `cpu_ms`: CPU time of all jobs of a mean frame.
 
@@ -252,14 +253,19 @@ def explain_run(folder: Path, slowest: int = 10) -> dict[str, Any]:
 def explain_frame(folder: Path, number: int) -> dict[str, Any]:
     """Return what became of frame `number` of the run in `folder`, as plain data.
 
-    Keys: `schema`, `run`: folder, `frame`: number.
+    Keys:
+    `schema`: version of the keys.
+    `run`: folder of the run.
+    `frame`: number of the frame.
     `outcome`: `presented`, `dropped`, `lost` or `under way`.
     `cause`: key of the report that counts the dropped or lost frame; None for any other frame.
     `after_ms`: time from the frame's release until it was presented, dropped or lost; None for a frame under way.
     `latency_ms`: latency; None if not known.
-    `jobs`: a row for each job of the frame. Its `begin_ms` counts from the frame's release.
+    `jobs`: a row for each job of the frame. Its `begin_ms` counts from the frame's release. For a frame under way, it
+    counts from when the frame's first job was ready.
 
-    Raises BadInputError as `explain_run` does, and for a frame that is not in the journal.
+    Raises BadInputError for a folder without a journal, for a broken journal, and for a frame that is not in the
+    journal.
     """
     begun, records = open_journal(folder)
     timeline = Timeline(begun.graph, begun.settings, waits=True)
@@ -453,9 +459,13 @@ class Joins:
     def rows(self) -> list[dict[str, Any]]:
         """Return a row for each stage with several inputs.
 
-        Keys: `stage`: name of the stage. `inputs`: two figures of each input, by the name of the stage that writes it.
-        `last`: number of jobs in which this input came last. `after_ms`: in these jobs, the mean time by which it came
-        after the input before it.
+        Keys:
+        `stage`: name of the stage.
+        `inputs`: two figures of each input, by the name of the stage that writes it.
+
+        The figures are:
+        `last`: number of jobs in which this input came last.
+        `after_ms`: in these jobs, the mean time by which it came after the input before it.
         """
         return [
             {

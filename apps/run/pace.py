@@ -52,9 +52,12 @@ class Pace:
 def pace_of(config: RunConfig, profile: str, slow_motion: float = 1.0) -> Pace:
     """Return the pace of a chip for the run that `config` describes.
 
-    The times are for the largest tensor that the scene's size allows, with all avatars in view.
-    `profile`: hardware profile of the chip, by name or TOML file. `slow_motion`: factor on all times.
-    Raises BadInputError for a profile that describes no chip, or a factor outside of 0 to MAX_SLOW_MOTION.
+    The times are for the largest shape in `config.buckets`, with all avatars in view, under the performance profile
+    SUSTAINED. Each network has a tensor of this shape.
+    `profile`: hardware profile of the chip, by name or TOML file.
+    `slow_motion`: factor on all times, above 0 and at most MAX_SLOW_MOTION.
+    Raises BadInputError for a profile that describes no chip, for a factor out of range, and for a bundle that cannot
+    be read.
     """
     if not 0 < slow_motion <= MAX_SLOW_MOTION:
         raise BadInputError("--slow-motion", f"{slow_motion:g}", f"above 0, at most {MAX_SLOW_MOTION:g}")

@@ -213,10 +213,12 @@ def cores_of(file: PipelineFile, cores: Sequence[int]) -> dict[str, UnitSettings
 
 
 def _all_types(file: PipelineFile, networks: Mapping[str, GraphFile]) -> PortTypes:
-    """Return the types of the ports that the stages of `file` write: PortType by port name, by stage name.
+    """Return the types of the ports that the stages of `file` write, by the name of the stage.
 
-    `networks`: networks by stage. Raises BadInputError for a camera, for a stage that is only a time, and for a port of
-    unknown type.
+    The types of a stage are a `PortType` for each port, by the name of the port.
+    `networks`: networks by stage.
+    Raises BadInputError for a camera, for a stage that has a set time and nothing to run, and for a port of unknown
+    type.
     """
     types = port_types(file, networks)
     for name, stage in file.stages.items():

@@ -57,13 +57,13 @@ class _Actor:
 
 
 class Cast:
-    """The avatars and the camera of the scene in `checked`.
+    """The avatars and the camera of a scene; says which avatars a frame shows, and where.
 
     `avatars`: loaded avatars, by the folder of the bundle.
     """
 
     def __init__(self, checked: Checked) -> None:
-        """Load the avatars. Raises BadInputError if an avatar cannot be read."""
+        """Load the avatars. `checked`: run of the scene. Raises BadInputError if an avatar cannot be read."""
         scene, folders = checked.config.scene, checked.config.avatar_dirs
         self._fps = scene.fps
         self._output: Shape = (scene.output.height, scene.output.width)

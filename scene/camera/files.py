@@ -320,13 +320,23 @@ def _require_row_order(path: Path, matrices: F64, columns: str, kind: str, slack
 
 
 def _signs(matrices: F64, up_axis: str, times: F64 | None) -> dict[str, tuple[str, ...]]:
-    """Return, by format, which features of the poses `matrices` (N, 3, 4) speak for KITTI and for ARKit, in words.
+    """Return the features of the poses `matrices` (N, 3, 4) that speak for KITTI and for ARKit, in words, by format.
 
-    `up_axis`: axis that is up, by the scene. `times` (N,): times of the table; None if it has no times.
+    `up_axis`: axis that is up, by the scene. If it is AUTO, Y or Z may be up.
+    `times` (N,): times of the table; None if it has no times.
 
-    KITTI's axes are x right, y down, looking along +Z. If the table has times, two features speak for ARKit, because
-    other programs seldom write times before such matrices: the clock of a device, and Y up. A device that is held
-    upright fits both directions of Z. Therefore an upright device speaks for ARKit only if the table has no times.
+    A camera of KITTI looks along +Z, and its Y is down. A camera of ARKit looks along -Z, and its Y is up. A device is
+    upright if its X is nearer to the vertical than its Y.
+
+    With and without times, these features count for both formats: the camera moves along its view, or it looks at one
+    point. If the device is not upright, the direction of Y also counts. Here AUTO allows KITTI both axes, and ARKit
+    only Z. For KITTI, a first pose that is the identity counts too.
+
+    These features count only with times. For both formats, a device with its lower end down looks down. For KITTI, Y
+    tends up and the camera is below 0 by a depth in BELOW_M. For ARKit, the times are of a device's clock, or Y tends
+    up. Here AUTO means Y.
+
+    One feature counts only without times: an upright device speaks for ARKit. It fits both directions of Z.
     """
     turns, places = matrices[:, :, :3], matrices[:, :, 3]
     ups = ("z", "y") if up_axis == AUTO else (up_axis,)

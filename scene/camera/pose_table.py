@@ -330,10 +330,11 @@ class ColumnTimes(NamedTuple):
 
 
 def times_of(where: str | Path, column: NDArray[np.float64], clock: TableClock) -> ColumnTimes:
-    """Return the times in `column` (N,), or the times of its frame numbers.
+    """Return `ColumnTimes` of the times or frame numbers in `column` (N,): seconds since the first finite time.
 
-    `where`: table, for messages. `clock`: what the scene and the format say about the times. Raises BadInputError when
-    several units are likely, or when no unit fits the steps.
+    `where`: table, for messages. `clock`: what the scene and the format say about the times.
+    Raises BadInputError if the times may have several units. Raises it also if the median step is above 0 and below
+    LEAST_STEP_S in the chosen unit of time. Other units are not tried, and frame numbers are not checked.
     """
     units = units_of(column) if clock.unit == AUTO else (clock.unit,)
     since, step = elapsed(column)

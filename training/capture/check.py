@@ -252,8 +252,10 @@ def capture_facts(
 def texel_facts(coverage: TexelCoverage) -> dict[str, Any]:
     """Return a coverage as JSON values.
 
-    Keys: `seen`, share of the body's texels that were seen; `regions`, share of each region's texels that were seen;
-    `never_seen`, names of the regions whose share is at most `HARDLY`.
+    Keys:
+    `seen`: share of the body's texels that were seen.
+    `regions`: share of each region's texels that were seen.
+    `never_seen`: names of the regions whose share is at most `HARDLY`.
     """
     names = coverage.never_seen()
     return {"seen": coverage.share(), "regions": coverage.share_by_region(), "never_seen": names}
@@ -262,9 +264,12 @@ def texel_facts(coverage: TexelCoverage) -> dict[str, Any]:
 def view_facts(directions: Sequence[tuple[float, float]]) -> dict[str, Any]:
     """Return figures of the frames' cameras as JSON values.
 
-    Keys: `by_side`, number of frames that show each side; `by_yaw`, number of frames in each bin of `STEP_DEG` degrees,
-    from yaw -180 (behind the body) over its right, front and left; `widest_gap_deg`, widest angle between neighbouring
-    cameras; `height_deg`, least and greatest height.
+    Keys:
+    `by_side`: number of frames that show each side.
+    `by_yaw`: number of frames in each bin of `STEP_DEG` degrees. The bins go from yaw -180 (behind the body) over its
+    right, front and left.
+    `widest_gap_deg`: widest angle between neighbouring cameras.
+    `height_deg`: least and greatest height.
 
     `directions`: (yaw, height) of each frame's camera, in degrees.
     """

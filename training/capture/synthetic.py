@@ -156,7 +156,7 @@ def framing_view(rng: np.random.Generator, yaw: float, points: F64, projection: 
 def in_camera(pose: F64, root: F64, view: F64) -> tuple[F64, F64]:
     """Return (pose (55,3), place (3,)) of a body in OpenCV camera axes.
 
-    `pose`: pose (55,3) of the body in the world, where its place is 0.
+    `pose`: pose (55,3) of the body in world axes. The body's place in the world is (0, 0, 0).
     `root`: root joint (3,) at rest, about which the body turns.
     `view`: matrix (4,4) from the world to the OpenGL camera.
     """

@@ -224,11 +224,12 @@ SCALE_LIMITS = (1e-2, 1e2)
 
 
 def equalised(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Return a copy of the float network with every Conv -> ReLU -> Conv chain equalised, except grouped layers.
+    """Return a copy of the float network with the Conv -> ReLU -> Conv chains that `_pairs` finds equalised.
 
-    For a channel between the two Convs, let r1 be the largest weight of the first Conv that makes the channel. Let r2
-    be the largest weight of the second Conv that reads it, and s = sqrt(r1 / r2). The first Conv's weights and bias of
-    the channel are divided by s, and the second Conv's weights are multiplied by s.
+    ROUNDS times, each chain in turn is equalised channel by channel. For a channel between the two Convs, r1 is the
+    largest absolute weight of the first Conv that makes the channel. r2 is the largest absolute weight of the second
+    Conv that reads the channel. The scale s is sqrt(r1 / r2), clipped to SCALE_LIMITS; s is 1 if r1 or r2 is 0. The
+    first Conv's weights and bias of the channel are divided by s. The second Conv's weights are multiplied by s.
     """
     result = copy.deepcopy(model)
     weights = {tensor.name: tensor for tensor in result.graph.initializer}
@@ -245,8 +246,10 @@ def equalised(model: onnx.ModelProto) -> onnx.ModelProto:
 def _pairs(
     graph: onnx.GraphProto, weights: dict[str, onnx.TensorProto]
 ) -> Iterator[tuple[onnx.NodeProto, onnx.NodeProto]]:
-    """Yield pairs (Conv, next Conv) with only a ReLU between them; grouped Convs are left out.
+    """Yield pairs (Conv, next Conv) with only a ReLU between them.
 
+    A pair is skipped if a second operator reads the output of the first Conv or of the ReLU. A pair is also skipped if
+    one of the Convs has groups, or has weights or a bias that are not constants or that another operator reads.
     `weights`: constants of `graph`, by name.
     """
     users: dict[str, list[onnx.NodeProto]] = {}
@@ -267,7 +270,7 @@ def _only(users: dict[str, list[onnx.NodeProto]], node: onnx.NodeProto) -> onnx.
 
 
 def _plain(node: onnx.NodeProto, weights: dict[str, onnx.TensorProto], users: dict[str, list[onnx.NodeProto]]) -> bool:
-    """Return whether `node` is a Conv of one group whose weights no other node reads."""
+    """Return whether `node` is a Conv of one group whose weights and bias are constants that no other node reads."""
     if node.op_type != "Conv" or any(a.name == "group" and a.i != 1 for a in node.attribute):
         return False
     return all(name in weights and len(users[name]) == 1 for name in node.input[1:])
