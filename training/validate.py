@@ -48,7 +48,7 @@ from trilane.training.sample_renderer import BAND_NAMES, Sample, SampleRenderer
 # Evaluates an avatar on held-out samples: compares every painter's picture of a sample with the ground truth.
 #
 # Rule: the integer network is evaluated as it runs in the pipeline: a runtime runs it on the bytes of the packed pass,
-# the GPU stage that draws the network's input.
+# by which the raster stage draws the network's input.
 
 #: A function that returns the picture (h,w,4) uint8 of a sample, given the sample and its UV image (h,w,3).
 Painter = Callable[[Any, NDArray[np.float32]], U8]

@@ -110,7 +110,7 @@ def signature_of_head(head: bytes) -> Signature | None:
 
 MAX_ARRAY_BYTES = 1 << 30
 MAX_TEXT_BYTES = 256 << 20
-LONGEST_WHOLE = 300  # digits; floats have up to 309
+LONGEST_WHOLE = 300  # characters of a number; floats have up to 309 digits
 
 #: Errors that NumPy and zipfile raise on damaged files.
 DAMAGED = (

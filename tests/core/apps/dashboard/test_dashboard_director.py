@@ -14,6 +14,7 @@ from trilane.errors import BadInputError
 from trilane.pipeline.controls import RunControls
 from trilane.scheduler.events import Hold, Stop
 from trilane.stages.run_options import RunOptions
+from trilane.units import AVATARS
 
 ASKED = RunOptions()
 
@@ -162,7 +163,7 @@ def test_what_is_in_force_can_be_chosen_and_a_pace_is_capped_already(tmp_path: A
     }  # fmt: skip
     choices = choices_of(config)
     assert all(config[name] in words and len(set(words)) == len(words) for name, words in choices.items())
-    assert choices["avatar"] == ("default", "hiker", str(tmp_path / "one"), str(tmp_path / "two"))
+    assert choices["avatar"] == (*AVATARS, str(tmp_path / "one"), str(tmp_path / "two"))
     assert reasons_against(ASKED) == {}
     assert set(reasons_against(RunOptions(profile="snapdragon-888", pace=True))) == {"performance_profile"}
 
