@@ -100,7 +100,7 @@ def level_facts(level: MeshLevel, side: int) -> dict[str, Any]:
     Keys:
     `triangles`: number of triangles.
     `vertices`: number of vertices.
-    `rest_mm`: largest distance at rest between the surface of the level and that of the whole mesh.
+    `rest_mm`: largest distance at rest from the surface of the level to the surface of the whole mesh.
     `seam_texels`: largest shift of the texture at the seams.
     """
     return {
@@ -275,7 +275,7 @@ def _provenance(own: Manifest, parts: Parts) -> dict[str, Any]:
 def _kind(base: Bundle, network: NetworkFile) -> tuple[str, str, int]:
     """Return the encoder, norm and width of `network`. The width is the number of channels of the first convolution.
 
-    If the network of `base` has the same operators, encoder and norm are those of `base`. Otherwise, both are `OTHER`.
+    A network with the operators of the network of `base` gets its encoder and norm. Otherwise, both are `OTHER`.
     """
     own = base.manifest.network
     before, now = ([node.op_type for node in each.model.graph.node] for each in (base.read_network(), network))
@@ -327,7 +327,7 @@ class _Recipe:
     """The network of a variant of an avatar.
 
     `width`: number of channels of the first convolution. `channels`: number of input channels.
-    `trained`: whether `width` and `channels` are those of the avatar's own network.
+    `trained`: whether the avatar's own network has this `width` and these `channels`.
     `method`: method of calibration, None to keep the avatar's network.
     `views`: number of views on which to calibrate.
     """

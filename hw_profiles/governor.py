@@ -380,7 +380,7 @@ def warm_up(
     `at`: function that returns the load's settled state at given corners. It is called once for each combination of
     corners that occurs.
 
-    The other parameters and the errors are those of `over_time`.
+    The other parameters and the errors are the same as in `over_time`.
     """
     name = governor or profile.thermal.governor
     if name not in GOVERNORS:

@@ -140,7 +140,7 @@ def _check_fixed(where: str, stage: OnnxStage, graph: onnx.GraphProto) -> None:
 
 
 def _check_output(file: PipelineFile, name: str, each: PortInput, outputs: list[str]) -> None:
-    """Raise BadInputError if an input of stage `name` reads a port that is no output of a network.
+    """Raise BadInputError if an input of stage `name` reads a port, and the network has no output of this name.
 
     `file`: pipeline file. `each`: input that reads from the stage of a network. `outputs`: names of the outputs of this
     network.

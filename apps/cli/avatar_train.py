@@ -44,7 +44,7 @@ CPU_INDEX = "https://download.pytorch.org/whl/cpu"
 NEWEST, LINE_S = 0.05, 30.0
 #: Name of TensorBoard's folder in the work folder; seconds after which logged values are on the disk.
 LOG, FLUSH_S = "tensorboard", 10
-#: Width of the networks of the avatars of the package.
+#: Width of the network of the bundled avatars.
 DEFAULT_WIDTH = 16
 EPILOG_VALIDATE = """\b
 Examples:

@@ -159,7 +159,7 @@ def _what_ifs(answers: list[dict[str, Any]]) -> Table:
 
 
 def predict_pipelines(options: PredictOptions, as_json: bool) -> None:
-    """Print the prediction for several pipelines that share one chip: the scene of `options`, and those of --beside.
+    """Print the prediction for pipelines on one chip: the scene of `options`, and the pipelines of --beside.
 
     Raises BadInputError for an unknown chip, scene or edge, and for a faulty pipeline.
     """

@@ -1,8 +1,8 @@
 """`trilane tune`: finds the fastest configuration of a grid within given limits, in few trials.
 
-Rule: this file reads options and shows results; `trilane.apps.sweep.tuner` searches. Folder, trials and engines are
-those of a sweep. With the engine `local`, predictions for a chip are computed in this process. Every other trial has
-its own process.
+Rule: this file reads options and shows results; `trilane.apps.sweep.tuner` searches. A search has the same folder,
+trials and engines as a sweep. With the engine `local`, predictions for a chip are computed in this
+process. Every other trial has its own process.
 """
 
 from __future__ import annotations

@@ -197,7 +197,7 @@ def _compared(base: Side, other: Side) -> Comparison:
 
 
 def _differing(rows: Rows, figures: Sequence[Figure]) -> tuple[Figure, ...]:
-    """Return those of `figures` that differ significantly.
+    """Return the `figures` with a significant difference.
 
     All figures with scatter are tested together. A figure without scatter needs no test.
     `rows`: difference of each figure.

@@ -214,7 +214,7 @@ def settled(
 
 
 def combined(pairs: Sequence[Difference]) -> Difference:
-    """Return one difference for all `pairs`, of which there is at least one.
+    """Return one difference for all `pairs`, at least one.
 
     `base` and `other` are arithmetic means. The change is the mean of the effects: for ratios, the geometric mean. The
     deviation of this mean follows from the pairs' deviations, as if the pairs were independent. If the scatter of the

@@ -357,7 +357,7 @@ def _unusual(scene: Mapping[str, Any]) -> Iterator[str]:
 def _error(document: Mapping[str, Any]) -> tuple[float | None, str, str]:
     """Return the fields `psnr_db`, `error_source` and `error_of` of an entry.
 
-    If the frames of a run were checked, the PSNR is that of the run. Otherwise, it is the PSNR of the worst avatar, or
+    If the frames of a run were checked, the PSNR is the run's. Otherwise, it is the PSNR of the worst avatar, or
     None if the PSNR of any avatar is unknown.
     `document`: report or prediction.
     """

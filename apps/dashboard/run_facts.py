@@ -1,7 +1,7 @@
 """Facts about a run for the page that do not change during the run, and the controls of the page.
 
-Rule: unknown facts are null, nothing is guessed, and the words are those of report.json. The valid values of a control
-are stated only in its `Control`.
+Rule: unknown facts are null, nothing is guessed, and the words are the same as in report.json. The valid values
+of a control are stated only in its `Control`.
 """
 
 from __future__ import annotations

@@ -297,7 +297,7 @@ class _Split:
 
 
 def _run(moment: ReferenceMoment) -> ReferenceFrame:
-    """Return the run's own frame. Its mask is that of the frame with all causes."""
+    """Return the run's own frame, with the mask of the frame with all causes."""
     return ReferenceFrame(moment.number, moment.own, moment.frame(frozenset(Cause)).mask, moment.boxes)
 
 
@@ -368,7 +368,7 @@ def shown_factor(difference: F64) -> int:
 def coloured(values: F64) -> U8:
     """Return the colours (..., 3) uint8 of `values` (...).
 
-    Values above 1 have the colour of 1, values below 0 that of 0.
+    Values above 1 have the colour of 1, values below 0 the colour of 0.
     """
     place = np.clip(values, 0, 1) * (len(COLOURS) - 1)
     channels = [np.interp(place, np.arange(len(COLOURS)), COLOURS[:, channel]) for channel in range(3)]

@@ -210,7 +210,7 @@ def _similarity(picture: F64, reference: F64) -> tuple[F64, F64]:
 def _means(picture: F64) -> F64:
     """Return the weighted mean (h,w,3) of the window around each pixel.
 
-    The window and its weights are those of skimage's `structural_similarity`.
+    The window and its weights are the same as in skimage's `structural_similarity`.
     """
     from skimage.filters import gaussian
 

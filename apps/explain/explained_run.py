@@ -367,7 +367,7 @@ def figure_names(folder: Path) -> list[str]:
 def job_rows(folder: Path, figures: Sequence[str]) -> Iterator[tuple[Any, ...]]:
     """Yield a row for each job of the run in `folder`, in the order of the jobs' ends.
 
-    A row has the values of COLUMNS, then those of `figures`. The value of a metric that the job's stage lacks is None.
+    A row has the values of COLUMNS, then the values of `figures`. If the job's stage lacks a metric, its value is None.
 
     `figures`: names of metrics of the stages. Raises BadInputError as `open_journal` does.
     """

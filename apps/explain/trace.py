@@ -365,7 +365,7 @@ def _notes_of(job: JobRecord) -> dict[str, int | str]:
 
 
 def _if_any(**notes: int | str) -> dict[str, int | str]:
-    """Return those of `notes` that are neither 0 nor empty."""
+    """Return the `notes` without zeros and empty values."""
     return {name: value for name, value in notes.items() if value}
 
 

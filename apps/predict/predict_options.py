@@ -304,7 +304,7 @@ class PredictOptions(Options):
 
     @property
     def is_as_run(self) -> bool:
-        """Return whether network, policy, edge and batch are those of `trilane run` without options."""
+        """Return whether network, policy, edge and batch are the same as in `trilane run` without options."""
         return not (self.is_published or self.model_fields_set & {"avatar", "network", "policy", "edge", "batch"})
 
     @property

@@ -240,7 +240,7 @@ def canonical(command: tuple[str, ...], options: Options, repeat: int = 1) -> st
 class SweepFile:
     """The content of a sweep file (docs/sweeps.md). The values of options are not checked.
 
-    The fields have the same meaning as those of `Definition`.
+    The fields have the same meaning as in `Definition`.
     """
 
     command: tuple[str, ...]

@@ -63,8 +63,8 @@ class TrialPlace:
     """Where and with which program trials are done.
 
     `folder`: folder of the sweep, for the run folders; None to keep no run folders.
-    `working_folder`: working folder of the trials' processes; None for that of this process.
-    `environment`: environment of the trials' processes; None for that of this process.
+    `working_folder`: working folder of the trials' processes; None: the folder of this process.
+    `environment`: environment of the trials' processes; None: the environment of this process.
     `program`: module that the trials run.
     """
 
