@@ -100,6 +100,7 @@ class MeshLevel:
             uv_faces=self.uv_faces,
             posedirs=None if body.posedirs is None else body.posedirs[used],
             offsets=None if body.offsets is None else body.offsets[used],
+            skin=None,
         )
         return ShapedBody(shaped.vertices[used], shaped.joints, smaller)
 

@@ -133,6 +133,8 @@ _LAYOUT: dict[str, tuple[tuple[int | str, ...], bool]] = {
     "hands_meanl": ((45,), False),
     "hands_meanr": ((45,), False),
 }
+#: Key of an array (2,), which a file may lack: numbers of vertices and faces of the skin. The others are garments.
+SKIN_KEY = "skin"
 _LIMITS = {"V": MAX_VERTICES, "F": MAX_FACES, "T": 3 * MAX_FACES}
 
 #: Least number of columns of `shapedirs`, first expression column, number of expression columns.
@@ -155,6 +157,8 @@ class Body:
     `hand_components`: left (C,45) and right (C,45), principal components of hand poses.
     `hand_mean` (90,): mean hand pose, axis-angle, left then right.
     `offsets` (V,3): vectors from the rest shape to the drawn surface, such as clothes and hair; None for a bare body.
+    `skin`: numbers of the first vertices and faces, which are the skin; the others are garments that hang, such as a
+    skirt. None if all of them are the skin.
     """
 
     source: str
@@ -171,6 +175,7 @@ class Body:
     hand_components: tuple[F32, F32]
     hand_mean: F32
     offsets: F32 | None = None
+    skin: tuple[int, int] | None = None
 
     @property
     def has_pose_blend_shapes(self) -> bool:
@@ -224,17 +229,35 @@ class ShapedBody:
     body: Body
 
     def bare(self) -> ShapedBody:
-        """Return the person without offsets, which is the skin under clothes and hair."""
+        """Return the person without offsets and garments, which is the skin under clothes and hair."""
+        moved = self._without_offsets()
+        if moved.body.skin is None:
+            return moved
+        (vertices, faces), body = moved.body.skin, moved.body
+        skin = replace(
+            body,
+            v_template=body.v_template[:vertices],
+            shape_dirs=body.shape_dirs[:vertices],
+            expression_dirs=body.expression_dirs[:vertices],
+            posedirs=None if body.posedirs is None else body.posedirs[:vertices],
+            j_regressor=body.j_regressor[:, :vertices],
+            weights=body.weights[:vertices],
+            faces=body.faces[:faces],
+            uv_faces=body.uv_faces[:faces],
+            skin=None,
+        )
+        return ShapedBody(moved.vertices[:vertices], self.joints, skin)
+
+    def with_offsets(self, offsets: F32) -> ShapedBody:
+        """Return the person with `offsets` (V,3), metres at rest, which replace all earlier offsets."""
+        moved = (self._without_offsets().vertices.astype(np.float64) + offsets).astype(np.float32)
+        # Copied, because freezing would make the caller's array read-only.
+        return ShapedBody(_frozen(moved), self.joints, replace(self.body, offsets=_frozen(offsets.copy())))
+
+    def _without_offsets(self) -> ShapedBody:
         if self.body.offsets is None:
             return self
         return ShapedBody(_frozen(self.vertices - self.body.offsets), self.joints, replace(self.body, offsets=None))
-
-    def with_offsets(self, offsets: F32) -> ShapedBody:
-        """Return the person with `offsets` (V,3), metres from the skin at rest, which replace all earlier offsets."""
-        bare = self.bare()
-        moved = (bare.vertices.astype(np.float64) + offsets).astype(np.float32)
-        # Copied, because freezing would make the caller's array read-only.
-        return ShapedBody(_frozen(moved), self.joints, replace(self.body, offsets=_frozen(offsets.copy())))
 
 
 def load_body(path: Path) -> Body:
@@ -243,7 +266,7 @@ def load_body(path: Path) -> Body:
     Raises BadInputError when the file is missing, truncated, pickled, too large, not finite, inconsistent or of another
     layout.
     """
-    arrays = read_npz(path, _LAYOUT, EXPECTED)
+    arrays = read_npz(path, (*_LAYOUT, SKIN_KEY), EXPECTED)
     _check_layout(path, arrays)
     vertices = len(arrays["v_template"])
     parents = _parents(path, arrays["kintree_table"])
@@ -272,6 +295,7 @@ def load_body(path: Path) -> Body:
         uv_faces=_frozen(arrays["ft"].astype(np.int32)),
         hand_components=(_floats(path, arrays, "hands_componentsl"), _floats(path, arrays, "hands_componentsr")),
         hand_mean=_frozen(np.concatenate([_floats(path, arrays, "hands_meanl"), _floats(path, arrays, "hands_meanr")])),
+        skin=_skin(path, arrays),
     )
 
 
@@ -346,6 +370,27 @@ def weights_of_one(weights: F32) -> F32:
     sums = bounded.sum(axis=1, dtype=np.float64, keepdims=True)
     kept = (np.abs(sums - 1.0) <= weights.shape[1] * ROUNDING) & (weights >= 0).all(axis=1, keepdims=True)
     return _frozen(np.where(kept, weights, (bounded / sums).astype(np.float32)))
+
+
+def _skin(path: Path, arrays: dict[str, NDArray[Any]]) -> tuple[int, int] | None:
+    """Return the numbers of vertices and faces of the skin; None without the array.
+
+    Raises BadInputError if it is no such array, if the skin has garments' vertices, or if a joint depends on one.
+    """
+    array, vertices, faces = arrays.get(SKIN_KEY), len(arrays["v_template"]), len(arrays["f"])
+    if array is None:
+        return None
+    where = f"{path}[{SKIN_KEY}]"
+    if array.shape != (2,) or array.dtype.kind not in "iu":
+        raise BadInputError(where, f"{array.dtype} of shape {array.shape}", "two integers, of vertices and faces")
+    skin = int(array[0]), int(array[1])
+    if not (0 < skin[0] <= vertices and 0 < skin[1] <= faces):
+        raise BadInputError(where, f"{skin}", f"1 to {vertices} vertices, 1 to {faces} faces")
+    if arrays["f"][: skin[1]].max() >= skin[0]:
+        raise BadInputError(where, "a face of the skin with a garment's vertex", f"vertices 0 to {skin[0] - 1}")
+    if arrays["J_regressor"][:, skin[0] :].any():
+        raise BadInputError(where, "a joint that depends on a garment's vertex", "zeros there in J_regressor")
+    return skin
 
 
 def _split_shape(path: Path, dirs: F32) -> tuple[F32, F32]:

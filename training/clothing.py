@@ -287,7 +287,7 @@ def clothing_layers(body: BodyArrays, landmarks: Landmarks, look: Look = DEFAULT
 def _garment(body: BodyArrays, landmarks: Landmarks, name: str) -> _Sheet:
     if name in HANGING:
         (vertices, faces), weights = HANGING[name](body, landmarks)
-        below = body.vertices[_nearest(vertices, body.vertices, 1)[:, 0]]
+        below = body.vertices[nearest(vertices, body.vertices, 1)[:, 0]]
         return _Sheet(name, vertices, faces, below, weights)
     covers, thickness = GARMENTS[name]
     offset, least, rounds = thickness(body.vertices, landmarks)
@@ -305,14 +305,14 @@ def _shoes(body: BodyArrays, landmarks: Landmarks) -> list[_Sheet]:
         vertices = np.vstack([vertices for vertices, _ in pieces])
         count = len(pieces[0][0])
         faces = np.vstack([faces + count * number for number, (_, faces) in enumerate(pieces)])
-        nearest = _nearest(vertices, body.vertices)
-        weights = body.weights[nearest].mean(axis=1)
+        near = nearest(vertices, body.vertices)
+        weights = body.weights[near].mean(axis=1)
         weights = Smoother(faces, len(vertices)).smooth(weights, 4)
-        sheets.append(_Sheet(part, vertices, faces, body.vertices[nearest[:, 0]], weights))
+        sheets.append(_Sheet(part, vertices, faces, body.vertices[near[:, 0]], weights))
     return sheets
 
 
-def _nearest(points: F64, vertices: F64, count: int = 8) -> NDArray[np.int64]:
+def nearest(points: F64, vertices: F64, count: int = 8) -> NDArray[np.int64]:
     """Return the indices (N,count) of the `vertices` (V,3) nearest to each of `points` (N,3), nearest first."""
     _, order = cKDTree(vertices).query(points, range(1, count + 1))
     return np.asarray(order, np.int64)
@@ -476,7 +476,7 @@ GARMENTS: dict[str, tuple[Covers, Thickness]] = {
 
 def _skirt(body: BodyArrays, landmarks: Landmarks) -> tuple[Stitched, F64]:
     points, faces = skirt(body.vertices, landmarks.joints)
-    trunk = body.weights[_nearest(points, body.vertices)].mean(axis=1)
+    trunk = body.weights[nearest(points, body.vertices)].mean(axis=1)
     return (points, faces), skirt_weights(points, trunk, landmarks.joints)
 
 

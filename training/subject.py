@@ -238,6 +238,8 @@ def stand_off(shaped: ShapedBody, outlines: Iterable[Outline]) -> StandOff:
         weights.append(weight)
     middle, count = _medians(np.concatenate(vertices), np.concatenate(heights), np.concatenate(weights), len(rest))
     raised = smoothed(middle, np.minimum(count / ENOUGH, 1.0), faces)
+    if shaped.body.skin is not None:
+        raised[shaped.body.skin[0] :] = 0.0  # a garment is a mesh of its own, where it is seen
     before = 0 if shaped.body.offsets is None else shaped.body.offsets
     return StandOff((before + raised[:, None] * normals).astype(np.float32), float((count > 0).mean()))
 

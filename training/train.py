@@ -35,7 +35,8 @@ from trilane.training.dataset import (
     plan_training,
     write_dataset,
 )
-from trilane.training.first_texture import first_texture
+from trilane.training.first_texture import first_texture, used_texels
+from trilane.training.hanging import dressed_body
 from trilane.training.image_error import MEANS, ImageError, image_error
 from trilane.training.make_bundle import (
     integer_network,
@@ -199,7 +200,7 @@ def _subjects(
     for look in settings.looks:
         alone = len(settings.looks) == 1
         own = places if alone else replace(places, out=places.out / look, work=places.work / look, name=look)
-        yield clothed_subject(body, settings.threads, look), own
+        yield clothed_subject(dressed_body(body, look, own.work), settings.threads, look), own
 
 
 def _prepared(subject: Subject, places: TrainingPlaces, settings: TrainingSettings, listener: Listener) -> Trained:
@@ -317,12 +318,23 @@ def _first_avatar(people: Sequence[Trained], places: TrainingPlaces, settings: T
 
 
 def _first_image(person: Trained, number: int, settings: TrainingSettings) -> F32:
-    """Return the texture (S,S,C) from which the training of `person`, whose number is `number`, starts."""
+    """Return the texture (S,S,C) from which the training of `person`, whose number is `number`, starts.
+
+    The texture of an avatar is taken as it is, except for texels that only this person's body uses, for a garment.
+    """
     name = person.subject.facts.get(KEY) if settings.texture == "look" else settings.texture
-    if name in AVATARS:
-        return load_bundle(str(name)).read_texture()
-    groups = open_groups(person.places.work / SAMPLES, number)
-    return first_texture(body_arrays(person.subject.shaped), groups, SIDES[0], CHANNELS)
+    body = body_arrays(person.subject.shaped)
+
+    def new() -> F32:
+        return first_texture(body, open_groups(person.places.work / SAMPLES, number), SIDES[0], CHANNELS)
+
+    if name not in AVATARS:
+        return new()
+    bundle = load_bundle(str(name))
+    texture = bundle.read_texture()
+    theirs = used_texels(body_arrays(bundle.shaped_body()), SIDES[0], 1)
+    only_here = used_texels(body, SIDES[0], 1) & ~theirs
+    return np.where(only_here[..., None], new(), texture) if only_here.any() else texture
 
 
 def _with_steps(

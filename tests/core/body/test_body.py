@@ -99,6 +99,12 @@ BROKEN: dict[str, tuple[Callable[[Arrays], None], str]] = {
     "pose blend shapes of another body": (_with("posedirs", np.ones((91, 3, 486))), "posedirs"),
     "pickled weights": (_with("weights", np.array([None, {}], dtype=object)), "pickled"),
     "pickled pose blend shapes": (_with("posedirs", np.array([None], dtype=object)), "pickled"),
+    "skin of three numbers": (_with("skin", np.array([1, 2, 3])), "two integers"),
+    "skin of fractions": (_with("skin", np.array([1.0, 2.0])), "two integers"),
+    "skin without a vertex": (_with("skin", np.array([0, 2])), "1 to 90 vertices"),
+    "skin of too many faces": (_with("skin", np.array([90, 10**6])), "1 to 90 vertices, 1 to"),
+    "skin with a face of a garment": (_with("skin", np.array([1, 2])), "a face of the skin"),
+    "skin with a garment's joint": (_with("skin", np.array([89, 1])), "a joint that depends|a face of the skin"),
 }
 
 
@@ -150,6 +156,28 @@ def test_huge_header_takes_no_memory(tmp_path: Path, body_arrays: Arrays) -> Non
 def test_bad_shapes_are_refused(tmp_path: Path, body_arrays: Arrays, betas: Any) -> None:
     with pytest.raises(BadInputError, match="betas"):
         load(tmp_path, body_arrays).shape(betas)
+
+
+def test_the_skin_is_the_body_without_its_garments(tmp_path: Path, body_arrays: Arrays) -> None:
+    """The last ten vertices and the faces that use one of them are a garment; the skin has the same joints."""
+    is_skin = (body_arrays["f"] < 80).all(axis=1)
+    order = np.argsort(~is_skin, kind="stable")
+    body_arrays["f"], body_arrays["ft"] = body_arrays["f"][order], body_arrays["ft"][order]
+    body_arrays["J_regressor"][:, 80:] = 0
+    faces = int(is_skin.sum())
+    whole = load(tmp_path, body_arrays).shape((1.0,), (0.5,))
+    assert faces > 0 and whole.bare() is whole
+    body_arrays["skin"] = np.array([80, faces])
+    dressed = load(tmp_path, body_arrays).shape((1.0,), (0.5,)).with_offsets(np.full((90, 3), 0.25, np.float32))
+    np.testing.assert_allclose(dressed.vertices, whole.vertices + 0.25, atol=2e-7)
+    bare = dressed.bare()
+    np.testing.assert_allclose(bare.vertices, whole.vertices[:80], atol=2e-7)
+    np.testing.assert_array_equal(bare.joints, whole.joints)
+    np.testing.assert_array_equal(bare.body.faces, body_arrays["f"][:faces])
+    np.testing.assert_array_equal(bare.body.uv_faces, body_arrays["ft"][:faces])
+    np.testing.assert_array_equal(bare.body.weights, whole.body.weights[:80])
+    np.testing.assert_allclose(bare.body.shape((1.0,), (0.5,)).vertices, whole.vertices[:80], atol=1e-6)
+    np.testing.assert_allclose(bare.body.shape((1.0,), (0.5,)).joints, whole.joints, atol=1e-6)
 
 
 def test_full_pose_adds_the_mean_hand(tmp_path: Path, body_arrays: Arrays) -> None:

@@ -44,7 +44,7 @@ def sphere(rings: int = 24, around: int = 48) -> Any:
         faces += [(top, other, column), (last + column, last + other, top + 1)]
     weights = np.zeros((len(vertices), JOINTS), np.float32)
     weights[:, 0] = 1
-    body = SimpleNamespace(faces=np.array(faces), weights=weights, posedirs=None, offsets=None)
+    body = SimpleNamespace(faces=np.array(faces), weights=weights, posedirs=None, offsets=None, skin=None)
     return SimpleNamespace(vertices=vertices.astype(np.float32), body=body)
 
 
@@ -106,6 +106,17 @@ def test_offsets_are_added_to_those_that_the_body_is_drawn_with() -> None:
     eyes = [(np.sin(a), 0.3, np.cos(a)) for a in np.arange(8) * np.pi / 4]
     bare = stand_off(sphere(), [outline(eye) for eye in eyes]).offsets
     np.testing.assert_allclose(stand_off(shaped, [outline(eye) for eye in eyes]).offsets, bare + 0.5, atol=1e-6)
+
+
+def test_a_garment_stays_where_it_is() -> None:
+    """The second half of the vertices is a garment: only the skin is raised to the mask."""
+    shaped = sphere()
+    half = len(shaped.vertices) // 2
+    shaped.body.skin = (half, 1)
+    eyes = [(np.sin(a), b, np.cos(a)) for a in np.arange(12) * np.pi / 6 for b in (-0.5, 0.1, 0.6)]
+    offsets = stand_off(shaped, [outline(eye) for eye in eyes]).offsets
+    assert not offsets[half:].any()
+    np.testing.assert_allclose(offsets[:half], SHELL * normals(shaped)[:half], atol=TOLERANCE_M)
 
 
 def test_a_joint_moves_what_is_measured() -> None:
