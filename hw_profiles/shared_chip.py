@@ -35,7 +35,7 @@ LEAST_S, LEAST_FRAMES, MOST_S = 10.0, 64, 600.0
 
 @dataclass(frozen=True)
 class Together:
-    """The settled state of several tenants at constant corners.
+    """The settled state of several tenants, with each unit at one voltage corner, which fixes its clock.
 
     `runs`: simulated run of each tenant.
     `stages_ms`: for each tenant, the mean time of a job by stage if no other tenant ran.

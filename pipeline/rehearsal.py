@@ -95,7 +95,9 @@ class Chain:
 
 
 def on_rungs(chain: Chain, frames: Sequence[int], rungs: int, follow: Sequence[str]) -> list[StageAlone]:
-    """Return the isolated time of each stage of `follow` on each rung of a ladder.
+    """Return the isolated time of each stage of `follow` on each rung of a ladder of work.
+
+    Rung 0 is all the work; each further rung is a smaller share of it.
 
     Each time is the median over `frames`. All frames are done on one rung before the next rung, so that no stage does
     the same frame twice in a row. With several frames, the first frame of each rung warms up and does not count. If a

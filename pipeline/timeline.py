@@ -1,12 +1,11 @@
 """Turns the journal of a run into frames, jobs, waits and idle time.
 
-Rule: no other module interprets a journal's events. The timeline uses two parts of the scheduler. The scheduler's
-source says which frames are released and wait (policy.py); its state of a frame has the sampling time and the latency
-(state.py).
+Rule: no other module interprets a journal's events. The timeline uses two parts of the scheduler. The source
+(policy.py) says which frames are released and wait. The frame state (state.py) has a frame's sampling time and latency.
 
 A frame waits before the first stage from its release on. It waits before another stage from the step in which the
-scheduler heard of the frame's input there; where branches meet, of the last input. The wait ends when the frame is
-handed to a unit, dropped or lost. A track knows before which stages the frames wait (tracks.py).
+scheduler heard that the frame's input there was ready. Where branches meet, all inputs have to be ready. The wait ends
+when the frame is handed to a unit, dropped or lost. A track knows before which stages the frames wait (tracks.py).
 """
 
 from __future__ import annotations

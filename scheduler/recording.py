@@ -78,7 +78,7 @@ class Recording:
 
 
 def header_line(graph: Graph, settings: Settings) -> str:
-    """Return the first line of a recording: `schema`, `graph`, `settings`."""
+    """Return the first line of a recording: a JSON object with the keys `schema`, `graph` and `settings`."""
     return json.dumps({"schema": SCHEMA, "graph": graph.written(), "settings": asdict(settings)}) + "\n"
 
 

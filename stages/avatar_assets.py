@@ -28,7 +28,8 @@ from trilane.stages.config import Quantisation, RunConfig
 
 SCENE = "scene/"
 HANDS = ("hand_components_left", "hand_components_right")
-BODY_ARRAYS = tuple(field.name for field in fields(Body) if field.name not in ("source", "hand_components"))
+#: A run draws skin and garments alike, so it does not need `skin`.
+BODY_ARRAYS = tuple(field.name for field in fields(Body) if field.name not in ("source", "hand_components", "skin"))
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,10 @@ class SampleSource(Protocol[One]):
     """A renderer that plans and renders samples. Each rendering process opens its own."""
 
     def training_sample(self, seed: Sequence[int], band: str, density: float) -> One:
-        """Return the planned sample of `seed`, in the band named `band`, with about this `density` of its tensor."""
+        """Return the planned sample of `seed`, in the band named `band`.
+
+        `density`: approximate number of tensor pixels for one pixel of the picture, along a side.
+        """
 
     def render(self, sample: One) -> tuple[F32, U8]:
         """Return the UV image (h,w,3) float32 (u, v, coverage) and the ground truth (h,w,4) uint8 of `sample`."""

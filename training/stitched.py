@@ -54,7 +54,10 @@ def shoe(vertices: F64, ankle: F64, side: int, sole: bool) -> Stitched:
 
 
 def _ring(foot: F64, height: float, margin: float) -> F64:
-    """Return the outline (ANGLES,3) of the slice at `height` around `foot` (N,3), widened by `margin`; metres."""
+    """Return the smoothed outline (ANGLES,3) of the points `foot` (N,3) as seen from above, metres.
+
+    The outline is widened by `margin` and lies at `height`.
+    """
     flat = foot[:, [2, 0]]
     centre = 0.5 * (flat.min(axis=0) + flat.max(axis=0))
     angle = np.arange(ANGLES) * (2 * np.pi / ANGLES)

@@ -302,7 +302,10 @@ def _sample_cost(subject: Subject, samples: list[Planned], settings: TrainingSet
 
 
 def _first_avatar(people: Sequence[Trained], places: TrainingPlaces, settings: TrainingSettings) -> TrainableAvatar:
-    """Return the avatar that training starts from. If a state is on the disk, only the avatar's shapes matter."""
+    """Return the avatar that training starts from.
+
+    If the work folder has a saved state, only the shapes of the avatar's arrays matter: `_train` loads their values.
+    """
     groups = _groups(people)
     network = UNet(norm=settings.norm, width=settings.width, channels=CHANNELS, input_skip=True)
     resumed = (places.work / STATE).exists()

@@ -20,7 +20,7 @@ class Scored(Protocol):
     """An entry that can be on a frontier.
 
     `frame_ms`: mean frame time, less is better; None if it is unknown.
-    `low_ms`, `high_ms`: interval of `frame_ms`; None if it is unknown.
+    `low_ms`, `high_ms`: ends of the interval of `frame_ms`, from scatter or a model; None if an end is unknown.
     `psnr_db`: PSNR of the pictures, more is better; None if it is unknown.
     `group`: key of the entry's group; only entries of one group are compared.
     """

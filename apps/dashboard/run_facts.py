@@ -38,10 +38,11 @@ class RunFacts:
     `name`: name of the run folder. `scene`: name of the scene. `clock`: host or virtual.
     `machine`: processor, cores and OpenGL driver in one line, for people.
     `fps`: frames a second of the scene. `output`: (width, height) of pictures in pixels.
-    `config`: value of each control at the begin of the run, by name.
+    `config`: value of each control at the beginning of the run, by name.
     `plan`: key `plan` of report.json, with the report's `notes`.
     `placement`, `accuracy`: as in report.json; `placement` is None if it is unknown.
-    `bound`: the keys `BOUND` of report.json, for a finished run; None if they are unknown.
+    `bound`: for a finished run, the values in report.json of the keys that `BOUND` lists: what bounds the run, and its
+    efficiencies. None if they are unknown.
     `verdict`: verdict of a finished run, with its lines; None if it is unknown.
     """
 

@@ -342,9 +342,10 @@ def _crops() -> Iterator[HardNumber]:
 def _on_screen(skinner: CpuSkinner, skeleton: Skeleton) -> Iterator[HardNumber]:
     """Yield rows about places of vertices on the screen: float32, with the shader's roundings, against float64.
 
-    Let C = M [x, 1] be clip coordinates, with M and x in float32. Each coordinate is off by gamma_6 of |M| |x| in
-    float32: four products, two roundings of the inputs. Let X be off by dX, and W by dW. The quotient X / W is off by
-    (dX + |X / W| dW) / W and by its own rounding. X / W is multiplied by half a tensor's side to get pixels.
+    Let C = M [x, 1] be clip coordinates, with M and x in float32. Each coordinate is off by at most gamma_7 of |M| |x|
+    in float32: four products, two roundings of the inputs, and one to spare. Let X be off by dX, and W by dW. The
+    quotient X / W is off by (dX + |X / W| dW) / (|W| - dW) and by its own rounding. X / W is multiplied by half a
+    tensor's side to get pixels.
     """
     posed = skeleton.pose(random_pose(JOINTS))
     vertices = skinner.vertices(posed)

@@ -447,7 +447,8 @@ class _Work(NamedTuple):
 class _StageBook:
     """The jobs of one stage.
 
-    `recent`: jobs in the window, in order. `bytes`: bytes that all jobs of the run moved, by kind.
+    `recent`: jobs that ended within `WINDOW_NS` before the end of the latest one, in the order of adding.
+    `bytes`: bytes that all jobs of the run moved, by kind.
     """
 
     def __init__(self) -> None:

@@ -363,7 +363,9 @@ def _read_array(file: IO[bytes]) -> NDArray[Any]:
 def _checked_bytes(where: Path | str, file: IO[bytes], expected: str) -> int:
     """Read the `.npy` header that comes next in `file`, and return the number of data bytes that it announces.
 
-    Raises BadInputError for an array that is too large, and as `read_header` does.
+    `expected`: what the file should hold, in words, for the error about a negative side.
+
+    Raises BadInputError for a negative side or an array that is too large, and as `read_header` does.
     """
     shape, _, dtype = read_header(where, file)
     if any(side < 0 for side in shape):

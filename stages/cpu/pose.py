@@ -46,7 +46,7 @@ class SeenAvatar:
 
     `rect`: rectangle of the mesh on the screen, NDC.
     `level`: level of detail, an index into `DETAILS`.
-    `error_px`: bound on the error of both levels on the picture, pixels.
+    `error_px`: bound on the error of the level of detail and of the level of the mesh together, pixels of the picture.
     `mesh`: level of the mesh, 0 for the whole mesh.
     `triangles`: number of triangles of this level of the mesh.
     `share`: number of vertices of this level over that of the whole mesh.

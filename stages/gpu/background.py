@@ -154,7 +154,10 @@ def is_picture(path: Path) -> bool:
 
 
 def pictures_in(folder: Path) -> list[Path]:
-    """Return the pictures in `folder`, in order. Raises BadInputError if there are none."""
+    """Return the pictures in `folder`, by name, with numbers in names compared as numbers.
+
+    Raises BadInputError if there are none, or if one of them is no regular file.
+    """
     names = _names_in(folder)
     if not names:
         near = next((sub for sub in sorted(folder.iterdir()) if sub.is_dir() and _names_in(sub)), None)
