@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64, I64, Mask
 from trilane.body.body import SKIN_KEY, load_body
-from trilane.stages.gpu.skinned_mesh import enough_weights
 from trilane.training.clothing import HANGING, Look, find_landmarks, look_named, nearest
 from trilane.training.first_texture import used_texels
 from trilane.training.stitched import ANGLES
@@ -76,7 +75,6 @@ def _dressed(path: Path, look: Look, hanging: list[str]) -> dict[str, Any]:
     with np.load(path, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
     shaped = load_body(path).shape(look.betas)
-    weights_kept = enough_weights(shaped.body)
     body = body_arrays(shaped)
     landmarks = find_landmarks(body.vertices, body.joints, body.weights)
     arrays[SKIN_KEY] = np.array([len(body.vertices), len(body.faces)])
@@ -93,7 +91,7 @@ def _dressed(path: Path, look: Look, hanging: list[str]) -> dict[str, Any]:
             "v_template": sheet.vertices - dirs[:, :, :shaped_by] @ np.asarray(look.betas),
             "shapedirs": dirs,
             "posedirs": np.zeros((len(sheet.vertices), *arrays["posedirs"].shape[1:])),
-            "weights": _kept(sheet.weights, weights_kept),
+            "weights": sheet.weights,
             "f": sheet.faces + len(arrays["v_template"]),
             "ft": sheet.uv_faces + len(arrays["vt"]),
             "vt": uv,
@@ -103,14 +101,6 @@ def _dressed(path: Path, look: Look, hanging: list[str]) -> dict[str, Any]:
         no_joint = np.zeros((len(arrays["J_regressor"]), len(sheet.vertices)), arrays["J_regressor"].dtype)
         arrays["J_regressor"] = np.hstack([arrays["J_regressor"], no_joint])
     return arrays
-
-
-def _kept(weights: F64, count: int) -> F64:
-    """Return `weights` (N,55) with only the `count` largest of each row, which sum to 1."""
-    order = np.argsort(-weights, axis=1, kind="stable")[:, count:]
-    kept = weights.copy()
-    np.put_along_axis(kept, order, 0.0, axis=1)
-    return np.asarray(kept / kept.sum(axis=1, keepdims=True))
 
 
 def _sheet(vertices: F64, weights: F64, lined: bool) -> _Sheet:

@@ -152,7 +152,7 @@ def fit(
         raise BadInputError("--name", repr(named), "letters, digits, dots, hyphens and underscores")
     if write is not None and not write.absolute().parent.is_dir():
         raise BadInputError(write, "no such folder", WRITABLE)
-    with stderr_console().status("fitting, each row left out in turn"):
+    with stderr_console().status(f"fitting, each {'network' if own else 'measurement'} left out in turn"):
         result = calibrate(base, read_own_rows(source, networks or source.parent)) if own else fit_profile(base, source)
     if json:
         print_json(_document(result))
@@ -282,7 +282,7 @@ def _show_calibrated(result: Calibrated) -> None:
     from rich.table import Table
 
     console = stdout_console()
-    title = "each row predicted from the others; 80 % intervals"
+    title = "each row predicted from the rows of other networks; 80 % intervals"
     table = Table("network", "unit", "measured, ms", "before, ms", "error", "left out, ms", "error", title=title)
     for each in result.rows:
         table.add_row(*_cells(each))

@@ -10,6 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import ShapedBody, load_body
@@ -97,12 +99,23 @@ def test_the_mesh_encloses_a_volume_and_the_lining_faces_inward(dressed: ShapedB
     assert ((faced * away).sum(axis=1)[ANGLES:-ANGLES] < 0).all()
 
 
+def parts(faces: np.ndarray) -> list[np.ndarray]:
+    """Numbers of the faces of each connected part."""
+    ends = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]]])
+    count = int(faces.max()) + 1
+    label = connected_components(coo_array((np.ones(len(ends)), ends.T), shape=(count, count)), directed=False)[1]
+    return [np.flatnonzero(label[faces[:, 0]] == number) for number in np.unique(label[faces[:, 0]])]
+
+
 def test_a_garment_s_texels_are_its_own(dressed: ShapedBody, skin: ShapedBody) -> None:
     """Between a garment's texels and the skin's there are at least two more, for bilinear reads."""
     whole = body_arrays(dressed)
     assert dressed.body.skin is not None
     rows = slice(dressed.body.skin[1], None)
     only = replace(whole, faces=whole.faces[rows], uv_faces=whole.uv_faces[rows])
+    charts = [only.uv[only.uv_faces[number]].reshape(-1, 2) for number in parts(only.faces)]
+    skirt, hair = [(chart.min(axis=0), chart.max(axis=0)) for chart in charts]
+    assert (skirt[0] > hair[1]).any() or (hair[0] > skirt[1]).any()
     assert not (used_texels(only, 512, 2) & used_texels(body_arrays(skin), 512, 0)).any()
     assert used_texels(only, 512, 0).mean() > 0.05
     assert whole.uv.min() > 0 and whole.uv.max() < 1
