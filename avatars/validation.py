@@ -182,8 +182,10 @@ def name_of(folder: Path) -> str:
 
 WHOLE = 1000  # pixels of a tensor of the full size, in thousandths
 DIGITS = 2
-#: A tensor is large enough for a body if it loses at most this much of the PSNR at the best measured size, in dB.
-TOLERANCE_DB = 0.3
+#: A tensor is large enough for a body if it loses at most this much of the PSNR at the best measured size, in dB: in a
+#: scene of one avatar, and in a scene of several. Several avatars share a tensor, and each adds to the background
+#: between them, so that a tenth of a dB costs more pixels.
+TOLERANCE_DB, SHARED_TOLERANCE_DB = 0.05, 0.3
 #: Work of the smaller tensors whose loss is told: 3/4 and 1/2 of the sides.
 WORKS = (563, 250)
 
@@ -214,8 +216,16 @@ class SizeLoss:
         return self.by_work[max(measured)] if measured else None
 
 
-def size_loss(bundle: Bundle) -> SizeLoss:
-    """Return the loss of PSNR of `bundle` in smaller tensors. Raises BadInputError for a file that cannot be read."""
+def tolerance_db(avatars: int) -> float:
+    """Return the tolerance of `curve_of`, in dB, for a scene of so many `avatars`."""
+    return TOLERANCE_DB if avatars == 1 else SHARED_TOLERANCE_DB
+
+
+def size_loss(bundle: Bundle, avatars: int = 1) -> SizeLoss:
+    """Return the loss of PSNR of `bundle` in smaller tensors. Raises BadInputError for a file that cannot be read.
+
+    `avatars`: number of avatars in the scene.
+    """
     validation, name = bundle.manifest.validation, bundle.manifest.name
     measures = f"`{VALIDATE} {name_of(bundle.folder)} --sizes` measures them"
     if validation is None or refused(bundle):
@@ -227,29 +237,27 @@ def size_loss(bundle: Bundle) -> SizeLoss:
     source = f"{from_validation(by_size.date)}, by tensor size"
     if by_size.psnr_db_by_picture is not None:
         table = by_size.psnr_db_by_picture
-        return SizeLoss(source, {WHOLE: 0.0, **_losses(table)}, curve_of(table))
+        curve = curve_of(table, tolerance_db(avatars))
+        return SizeLoss(source, {WHOLE: 0.0, **_losses(table, curve)}, curve)
     pixels = {math.prod(parse_shape(size)): psnr for size, psnr in (by_size.psnr_db or {}).items()}
     own = max(pixels)
     losses = {WHOLE * count // own: round(pixels[own] - psnr, DIGITS) for count, psnr in pixels.items()}
     return SizeLoss(source, losses)
 
 
-def curve_of(table: Mapping[int, Mapping[int, float]]) -> tuple[tuple[int, int], ...]:
+def curve_of(table: Mapping[int, Mapping[int, float]], tolerance: float = TOLERANCE_DB) -> tuple[tuple[int, int], ...]:
     """Return the smallest tensor that is large enough by `table`, as (pixels of the picture, pixels of the tensor).
 
-    A larger body never has a smaller tensor than a smaller body.
-
-    `table`: PSNR in dB, as `BySize.psnr_db_by_picture`.
+    `table`: PSNR in dB, as `BySize.psnr_db_by_picture`. `tolerance`: most that a tensor loses against the best, dB.
     """
     curve: list[tuple[int, int]] = []
     for side in sorted(table):
         row = sorted(table[side].items())
-        enough = max(psnr for _, psnr in row) - TOLERANCE_DB
+        enough = max(psnr for _, psnr in row) - tolerance
         at = next(number for number, (_, psnr) in enumerate(row) if psnr >= enough)
         (low, below), (high, above) = row[max(at - 1, 0)], row[at]
         part = (enough - below) / (above - below) if at else 1.0
-        pixels = math.ceil((low * (high / low) ** part) ** 2)
-        curve.append((side * side, max(pixels, curve[-1][1] if curve else 0)))
+        curve.append((side * side, math.ceil((low * (high / low) ** part) ** 2)))
     return tuple(curve)
 
 
@@ -261,7 +269,7 @@ def psnr_at(row: Mapping[int, float], pixels: float) -> float | None:
     return float(np.interp(math.log(pixels) / 2, [math.log(side) for side in sides], [row[side] for side in sides]))
 
 
-def _losses(table: Mapping[int, Mapping[int, float]]) -> dict[int, float]:
+def _losses(table: Mapping[int, Mapping[int, float]], curve: Sequence[tuple[int, int]]) -> dict[int, float]:
     """Return the mean loss over the bodies of `table`, by work; a work that was not measured for any body is left out.
 
     A smaller tensor never counts as better.
@@ -270,7 +278,7 @@ def _losses(table: Mapping[int, Mapping[int, float]]) -> dict[int, float]:
     for work in WORKS:
         found = [
             max(whole - less, 0.0)
-            for (_, pixels), side in zip(curve_of(table), sorted(table), strict=True)
+            for (_, pixels), side in zip(curve, sorted(table), strict=True)
             if (whole := psnr_at(table[side], pixels)) is not None
             and (less := psnr_at(table[side], pixels * work / WHOLE)) is not None
         ]

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from trilane.arrays import BUCKET_STEP, Shape
 from trilane.scene.crop import Rect, covered, tight_shape
 
-#: Pixels of the tensor by pixels of the picture that a body covers, both ascending: (picture, tensor), at least one.
+#: Pixels of the tensor by pixels of the picture that a body covers: (picture, tensor), ascending, at least one.
 Curve = tuple[tuple[int, int], ...]
 #: Largest density, tensor pixels per picture pixel along a side: with more, the picture is no nearer to the truth.
 MOST_DENSITY = 2.25
@@ -55,7 +55,7 @@ class TensorBudget:
 
     def most_of(self, avatars: int) -> int:
         """Return the most pixels for `avatars` visible avatars, whatever their size on the picture."""
-        measured = max((curve[-1][1] for curve in self.curves), default=0)
+        measured = max((tensor for curve in self.curves for _, tensor in curve), default=0)
         return self._allowed(avatars * max(self.own * MOST_GROWTH, measured))
 
     def of(self, rects: Sequence[Rect], output: Shape) -> int:
@@ -87,22 +87,24 @@ class TensorBudget:
 
     def _measured(self, picture: int) -> float:
         """Return the pixels for a body that covers `picture` pixels: those of the curve with the most."""
-        return max(pixels_at(curve, picture) for curve in self.curves)
+        return max(pixels_at(curve, picture, self.own * MOST_GROWTH) for curve in self.curves)
 
     def _allowed(self, pixels: float) -> int:
         return max(int(min(pixels, self.most)) * self.work // ALL_WORK, BUCKET_STEP**2)
 
 
-def pixels_at(curve: Curve, picture: int) -> float:
+def pixels_at(curve: Curve, picture: int, most: float) -> float:
     """Return the tensor pixels of `curve` for a body that covers `picture` pixels, interpolated in their logarithms.
 
     A smaller body than any of the curve has as many as the smallest one, a larger one the density of the largest one.
+
+    `most`: most pixels of a larger body than any of the curve, if the curve's last one does not have more.
     """
     at = bisect_left(curve, picture, key=lambda knot: knot[0])
     if at == 0:
         return curve[0][1]
     if at == len(curve):
-        return curve[-1][1] * picture / curve[-1][0]
+        return min(curve[-1][1] * picture / curve[-1][0], max(most, curve[-1][1]))
     (least, low), (most, high) = curve[at - 1 : at + 1]
     return float(low * (high / low) ** (math.log(picture / least) / math.log(most / least)))
 

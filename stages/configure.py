@@ -152,7 +152,7 @@ def configure(
     cuts = requested_cuts(options.split, list(networks.values()))
     unit, why = skinning_unit(options.skinning, gl)
     own = max(network.shape[1] * network.shape[2] for network in networks.values())
-    losses = tuple(size_loss(avatar.bundle) for avatar in avatars.values())
+    losses = tuple(size_loss(avatar.bundle, len(scene.avatars)) for avatar in avatars.values())
     curves = tuple(loss.curve for loss in losses) if all(loss.curve for loss in losses) else ()
     whole = TensorBudget(own, scene.most_side**2, curves=curves)
     works, sizes = tensor_works(scene, options.policy, losses)

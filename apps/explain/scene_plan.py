@@ -25,7 +25,7 @@ from PIL import Image, ImageDraw
 from trilane.apps.run.report_facts import worst_loss
 from trilane.arrays import F64, I64, Shape
 from trilane.avatars.network_file import NetworkFile
-from trilane.avatars.validation import TOLERANCE_DB
+from trilane.avatars.validation import tolerance_db
 from trilane.body.joints import Skeleton
 from trilane.body.skinning import DETAILS, CpuSkinner, left_out
 from trilane.errors import BadInputError
@@ -279,7 +279,8 @@ def explain(checked: Checked, profile: str, performance_profile: str) -> PlanExp
         "shapes": [list(shape) for shape in checked.config.buckets],
         "avatars": [_avatar(checked, number) for number in range(len(scene.avatars))],
         "phases": [
-            _phase(group, errors, costs, names, bodies) | {"why": _why(group, bool(checked.config.size_curves))}
+            _phase(group, errors, costs, names, bodies)
+            | {"why": _why(group, bool(checked.config.size_curves), len(scene.avatars))}
             for group, errors in zip(groups, rows, strict=True)
         ],
         "image": _image(checked),
@@ -389,10 +390,11 @@ def _most(group: Sequence[PlannedFrame]) -> float:
     return max(planned.plan.density or 0.0 for planned in group)
 
 
-def _why(group: Sequence[PlannedFrame], is_measured: bool) -> str:
+def _why(group: Sequence[PlannedFrame], is_measured: bool, avatars: int) -> str:
     """Return, in words, why the tensor of a phase has its size.
 
     `group`: frames of the phase. `is_measured`: whether the size follows the table in each avatar's manifest.
+    `avatars`: number of avatars in the scene.
     """
     first = group[0].plan
     if first.work in WHY:
@@ -400,7 +402,8 @@ def _why(group: Sequence[PlannedFrame], is_measured: bool) -> str:
     if first.density is None:
         return "the scene fixes the tensor's size"
     if is_measured:
-        return f"the fewest pixels within {TOLERANCE_DB:g} dB of the best size, by the table `by_size` in the manifest"
+        most = f"{tolerance_db(avatars):g} dB"
+        return f"the fewest pixels within {most} of the best size, by the table `by_size` in the manifest"
     if _most(group) >= MOST_DENSITY:
         return f"{MOST_DENSITY:g} tensor pixels along a side of a pixel of the picture: more make no better picture"
     return "the pixels that the network was trained to paint, in the shape that fits best of those that are ready"

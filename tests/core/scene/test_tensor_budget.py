@@ -32,19 +32,28 @@ curves = st.lists(st.tuples(sizes, sizes), min_size=1, max_size=6, unique_by=lam
 def test_the_curve_by_hand() -> None:
     """Half way between 64² and 128², in logarithms, is half way between 96² and 128².
 
-    Smaller bodies have as many as the smallest, and larger ones the density of the largest.
+    Smaller bodies have as many as the smallest, and larger ones the density of the largest, up to a limit that is never
+    below the pixels of the largest.
     """
-    assert [round(pixels_at(CURVE, side * side)) for side in (1, 64, 128, 256)] == [96**2, 96**2, 128**2, 192**2]
-    assert pixels_at(CURVE, 64 * 128) == pytest.approx(96 * 128)
-    assert pixels_at(CURVE, 512**2) == pytest.approx(384**2)
+    found = [round(pixels_at(CURVE, side * side, 1.0)) for side in (1, 64, 128, 256)]
+    assert found == [96**2, 96**2, 128**2, 192**2]
+    assert pixels_at(CURVE, 64 * 128, 1.0) == pytest.approx(96 * 128)
+    assert pixels_at(CURVE, 512**2, math.inf) == pytest.approx(384**2)
+    assert pixels_at(CURVE, 512**2, 320**2) == 320**2
+    assert pixels_at(CURVE, 512**2, 1.0) == CURVE[-1][1]
 
 
 @given(curves, sizes, sizes)
-def test_a_larger_body_never_costs_less(curve: tuple[tuple[int, int], ...], a: int, b: int) -> None:
-    small, large = sorted((40 * a, 40 * b))
-    assert pixels_at(curve, small) <= pixels_at(curve, large) * (1 + 1e-12)
-    inside = min(max(large, curve[0][0]), curve[-1][0])
-    assert curve[0][1] * (1 - 1e-12) <= pixels_at(curve, inside) <= curve[-1][1] * (1 + 1e-12)
+def test_a_body_costs_what_its_neighbours_in_the_curve_cost(
+    curve: tuple[tuple[int, int], ...], a: int, most: int
+) -> None:
+    """Also where the curve falls, as here, where it is read backwards."""
+    falling = tuple(zip((picture for picture, _ in curve), (tensor for _, tensor in reversed(curve)), strict=True))
+    for knots in (curve, falling):
+        below = [tensor for picture, tensor in knots if picture <= 40 * a][-1:]
+        above = [tensor for picture, tensor in knots if picture >= 40 * a][:1]
+        highest = max(below + above) if above else max(most, knots[-1][1])
+        assert min(below + above) * (1 - 1e-12) <= pixels_at(knots, 40 * a, most) <= highest * (1 + 1e-12)
 
 
 @pytest.mark.parametrize(
