@@ -118,7 +118,7 @@ def test_the_truth_is_what_the_training_draws(name: str, tmp_path: Path, gl: Any
     (data,), (seen,), look = cast.avatars.values(), cast.seen(5), LOOKS[name]
     true = true_pictures(cast, gl)
     assert true is not None and data.shaped.body.offsets is not None
-    skin = body_arrays(load_body(data.bundle.body_path).shape(data.bundle.manifest.betas))
+    skin = body_arrays(load_body(data.bundle.body_path).shape(data.bundle.manifest.betas).bare())
     landmarks = find_landmarks(skin.vertices, skin.joints, skin.weights)
     clothed = ClothedBody(gl, clothing_layers(skin, landmarks, look), landmarks, SAMPLES, look)
     wanted = clothed.render(seen.joints, seen.view, seen.projection, seen.box.shape)
