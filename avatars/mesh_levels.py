@@ -28,7 +28,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -88,21 +88,7 @@ class MeshLevel:
     def reduced(self, shaped: ShapedBody) -> ShapedBody:
         """Return `shaped` with only the triangles of this level, and only the vertices that these triangles use."""
         used, corners = np.unique(self.faces, return_inverse=True)
-        body = shaped.body
-        smaller = replace(
-            body,
-            v_template=body.v_template[used],
-            shape_dirs=body.shape_dirs[used],
-            expression_dirs=body.expression_dirs[used],
-            j_regressor=body.j_regressor[:, used],
-            weights=body.weights[used],
-            faces=corners.reshape(self.faces.shape).astype(np.int32),
-            uv_faces=self.uv_faces,
-            posedirs=None if body.posedirs is None else body.posedirs[used],
-            offsets=None if body.offsets is None else body.offsets[used],
-            skin=None,
-        )
-        return ShapedBody(shaped.vertices[used], shaped.joints, smaller)
+        return shaped.part(used, corners.reshape(self.faces.shape).astype(np.int32), self.uv_faces)
 
 
 def grouped(rest: F64, swing: F64, blend: F64) -> tuple[F32, F32, F32]:

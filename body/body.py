@@ -20,7 +20,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from trilane.arrays import F32, F64, I32
+from trilane.arrays import F32, F64, I32, Ints
 from trilane.body.joints import JOINTS, LEFT_HAND, POSE_FEATURES, POSE_SIZE, RIGHT_HAND
 from trilane.errors import BadInputError
 from trilane.files import DAMAGED, npz_names, read_header, read_npz
@@ -234,19 +234,28 @@ class ShapedBody:
         if moved.body.skin is None:
             return moved
         (vertices, faces), body = moved.body.skin, moved.body
-        skin = replace(
+        return moved.part(np.arange(vertices), body.faces[:faces], body.uv_faces[:faces])
+
+    def part(self, used: Ints, faces: I32, uv_faces: I32) -> ShapedBody:
+        """Return the person with only the vertices `used` (N,) and the triangles `faces`, `uv_faces` (G,3).
+
+        `faces`: indices of `used`. `uv_faces`: indices of the body's texture coordinates.
+        """
+        body = self.body
+        smaller = replace(
             body,
-            v_template=body.v_template[:vertices],
-            shape_dirs=body.shape_dirs[:vertices],
-            expression_dirs=body.expression_dirs[:vertices],
-            posedirs=None if body.posedirs is None else body.posedirs[:vertices],
-            j_regressor=body.j_regressor[:, :vertices],
-            weights=body.weights[:vertices],
-            faces=body.faces[:faces],
-            uv_faces=body.uv_faces[:faces],
+            v_template=body.v_template[used],
+            shape_dirs=body.shape_dirs[used],
+            expression_dirs=body.expression_dirs[used],
+            posedirs=None if body.posedirs is None else body.posedirs[used],
+            j_regressor=body.j_regressor[:, used],
+            weights=body.weights[used],
+            faces=faces,
+            uv_faces=uv_faces,
+            offsets=None if body.offsets is None else body.offsets[used],
             skin=None,
         )
-        return ShapedBody(moved.vertices[:vertices], self.joints, skin)
+        return ShapedBody(self.vertices[used], self.joints, smaller)
 
     def with_offsets(self, offsets: F32) -> ShapedBody:
         """Return the person with `offsets` (V,3), metres at rest, which replace all earlier offsets."""

@@ -1,8 +1,8 @@
 """A body file with the garments that hang, such as a skirt: meshes of their own, skinned and textured with the body.
 
 Offsets move the skin's vertices. They cannot close the gap between two legs, nor follow hair that falls over the back.
-Therefore such a garment is drawn as more vertices, faces and texture coordinates of the body, behind those of the skin.
-Everything that reads a body draws them as it draws the skin.
+Therefore such a garment has vertices, faces and texture coordinates of its own. The body's arrays hold the skin first,
+then the garments. Everything that reads a body draws a garment as it draws the skin.
 
 Rule: a garment takes the largest rectangle of the texture that neither the body nor an earlier garment uses. The mesh
 encloses a volume, so that triangles that face away are not drawn: an open garment has a lining.
