@@ -236,6 +236,7 @@ def batches(
     rng: np.random.Generator,
     repeats: Sequence[int] = (1,) * 5,
     labels: Sequence[NDArray[np.int64]] | None = None,
+    person_repeats: Sequence[int] = (),
 ) -> Iterator[tuple[ShapeGroup, NDArray[np.int64]]]:
     """Yield batches without end. A batch is a group and the indices of the batch's samples in that group.
 
@@ -245,14 +246,16 @@ def batches(
     `repeats`: how often an epoch has a sample, by the index of the sample's band.
     `labels`: label (N,) of each sample, for each group. All samples of a batch have the same label. Samples with a
     label below 0 are left out.
+    `person_repeats`: factor on `repeats`, by the number of the group's person; 1 for all if it is empty.
     """
     kinds = labels if labels is not None else [np.zeros(len(group), np.int64) for group in groups]
     while True:
         epoch: list[tuple[ShapeGroup, NDArray[np.int64]]] = []
         for group, kind in zip(groups, kinds, strict=True):
+            times = np.asarray(repeats) * (person_repeats[group.person] if person_repeats else 1)
             for label in np.unique(kind[kind >= 0]):
                 alike = np.flatnonzero(kind == label)
-                order = rng.permutation(np.repeat(alike, np.asarray(repeats)[group.band[alike]]))
+                order = rng.permutation(np.repeat(alike, times[group.band[alike]]))
                 parts = np.array_split(order, max(1, len(order) // size))
                 epoch += [(group, np.sort(part)) for part in parts if len(part)]
         for index in rng.permutation(len(epoch)):
@@ -297,7 +300,8 @@ def batch_stream(groups: list[ShapeGroup], settings: TrainingSettings, count: in
     per_step = settings.optimiser.batches_per_step
     for number, phase in enumerate(phases(groups, settings, count)):
         rng = np.random.default_rng((settings.seed, 2, number))
-        stream = batches(groups, settings.batch, rng, settings.batches.repeats, phase.labels)
+        shares = settings.batches
+        stream = batches(groups, settings.batch, rng, shares.repeats, phase.labels, shares.look_repeats)
         done = min(max(step - phase.first, 0), phase.end - phase.first)
         yield from islice(stream, done * per_step, (phase.end - phase.first) * per_step)
 

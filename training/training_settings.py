@@ -58,6 +58,7 @@ class BatchOptions(Table):
     these statistics.
     `full_body_from`: share of the steps after which all samples show whole bodies.
     `repeats`: how many times each sample occurs in an epoch, by band: far, full body, upper body, face, anywhere.
+    `look_repeats`: factor on `repeats`, by look of the settings; without looks listed here, 1 for all.
     """
 
     sample_share: float = Field(default=1.0, gt=0, le=1)
@@ -65,6 +66,7 @@ class BatchOptions(Table):
     full_body_statistics: bool = False
     full_body_from: float = Field(default=1.0, ge=0, le=1)
     repeats: Annotated[tuple[Repeats, Repeats, Repeats, Repeats, Repeats], LISTED] = (1, 1, 1, 1, 1)
+    look_repeats: Annotated[tuple[Repeats, ...], LISTED] = ()
 
 
 class RegularisationOptions(Table):
@@ -280,6 +282,12 @@ CLASHES: tuple[tuple[str, Callable[[TrainingSettings], bool], str, str], ...] = 
     ("norm", lambda s: s.start != "new" and s.norm != "batch", "batch of a trained network", 'or start = "new"'),
     ("keep_network", lambda s: s.keep_network and s.start == "new", "false with random weights", "or another start"),
     ("look", lambda s: len(set(s.looks)) < len(s.looks), "each look once", ""),
+    (
+        "batches",
+        lambda s: len(s.batches.look_repeats) not in (0, len(s.looks)),
+        "one number in look_repeats for each look",
+        "or no look_repeats",
+    ),
     (
         "bytes_from",
         lambda s: s.bytes_from < 1 and s.norm in ("instance", "group"),

@@ -83,7 +83,10 @@ def _avatar(path: Path) -> None:
 
 
 def _body(path: Path) -> None:
-    assert np.isfinite(load_body(path).shape().vertices).all()
+    shaped = load_body(path).shape()
+    bare = shaped.bare()
+    assert np.isfinite(shaped.vertices).all() and np.isfinite(bare.vertices).all()
+    assert bare.body.faces.max() < len(bare.vertices), "a triangle of the skin that has a vertex of a garment"
 
 
 def _scene(path: Path) -> None:

@@ -38,6 +38,8 @@ from trilane.body.joints import JOINT_PARENTS, JOINTS
 from trilane.scene.motion.motion import T_POSE
 
 VERTICES, FACES, CORNERS = 60, 80, 90
+#: Vertices and faces of the skin of the small body.
+SKIN = (52, 64)
 #: Name, depth below the root, offset from its parent in centimetres.
 BVH_JOINTS = (
     ("Hips", 0, "0 95 0"),
@@ -160,7 +162,7 @@ def nerf_text() -> str:
 
 
 def body_arrays(seed: int = 11) -> dict[str, NDArray[Any]]:
-    """The arrays of a body file: vertices about a person's height, one to four weights each."""
+    """The arrays of a body file: vertices about a person's height, one to four weights each; the last are a garment."""
     random = np.random.default_rng(seed)
     vertices = random.uniform((-0.4, -1.2, -0.2), (0.4, 0.5, 0.2), (VERTICES, 3))
     weights = np.zeros((VERTICES, JOINTS))
@@ -168,6 +170,9 @@ def body_arrays(seed: int = 11) -> dict[str, NDArray[Any]]:
         row[random.choice(JOINTS, random.integers(1, 5), replace=False)] = 1.0
     weights /= weights.sum(axis=1, keepdims=True)
     regressor = random.uniform(0, 1, (JOINTS, VERTICES)) ** 8
+    regressor[:, SKIN[0] :] = 0
+    faces = random.integers(0, VERTICES, (FACES, 3))
+    faces[: SKIN[1]] %= SKIN[0]
     floats = {
         "v_template": vertices,
         "shapedirs": random.normal(0, 0.01, (VERTICES, 3, 20)),
@@ -181,7 +186,8 @@ def body_arrays(seed: int = 11) -> dict[str, NDArray[Any]]:
         "hands_meanr": np.zeros(45),
     }
     integers = {
-        "f": random.integers(0, VERTICES, (FACES, 3)),
+        "f": faces,
+        "skin": np.array(SKIN),
         "ft": random.integers(0, CORNERS, (FACES, 3)),
         "kintree_table": np.array([np.array(JOINT_PARENTS) % 2**32, range(JOINTS)]),
     }

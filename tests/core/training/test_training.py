@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -227,6 +228,16 @@ def test_repeats_show_samples_of_a_band_more_often():
     shown = [next(stream) for _ in range(2)]
     assert sorted(np.concatenate([index for _, index in shown])) == [0, 1, 1, 2, 2]
     assert all((np.diff(index) >= 0).all() for _, index in shown)
+
+
+def test_repeats_of_a_look_multiply_the_repeats_of_a_band():
+    """Person 0 once, person 1 three times; the sample of the second band twice: 3 x 2 = 6 times."""
+    arrays = [np.zeros((2, 1, 1, k)) for k in (2, 1, 4)]
+    band = np.array([0, 1], np.int8)
+    groups = [ShapeGroup((1, 1), *arrays, band=band, person=person) for person in (0, 1)]
+    stream = batches(groups, 1, np.random.default_rng(0), (1, 2, 1, 1, 1), person_repeats=(1, 3))
+    shown = Counter((group.person, int(index[0])) for group, index in (next(stream) for _ in range(12)))
+    assert shown == {(0, 0): 1, (0, 1): 2, (1, 0): 3, (1, 1): 6}
 
 
 def test_each_picture_of_a_batch_stands_before_a_background_of_its_own():
