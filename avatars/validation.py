@@ -182,9 +182,9 @@ def name_of(folder: Path) -> str:
 
 WHOLE = 1000  # pixels of a tensor of the full size, in thousandths
 DIGITS = 2
-#: A tensor is large enough for a body if it loses at most this much of the PSNR at the best measured size, in dB: in a
-#: scene of one avatar, and in a scene of several. Several avatars share a tensor, and each adds to the background
-#: between them, so that a tenth of a dB costs more pixels.
+#: A tensor is large enough for a body if it loses at most this much of the PSNR at the best measured size, in dB: for
+#: an avatar with a network of its own, and for avatars that share a network. These share a tensor too. Each adds to the
+#: background between them, so that a tenth of a dB costs more pixels.
 TOLERANCE_DB, SHARED_TOLERANCE_DB = 0.05, 0.3
 #: Work of the smaller tensors whose loss is told: 3/4 and 1/2 of the sides.
 WORKS = (563, 250)
@@ -217,14 +217,14 @@ class SizeLoss:
 
 
 def tolerance_db(avatars: int) -> float:
-    """Return the tolerance of `curve_of`, in dB, for a scene of so many `avatars`."""
+    """Return the tolerance of `curve_of`, in dB, for so many `avatars` that share a network."""
     return TOLERANCE_DB if avatars == 1 else SHARED_TOLERANCE_DB
 
 
-def size_loss(bundle: Bundle, avatars: int = 1) -> SizeLoss:
+def size_loss(bundle: Bundle, avatars: int) -> SizeLoss:
     """Return the loss of PSNR of `bundle` in smaller tensors. Raises BadInputError for a file that cannot be read.
 
-    `avatars`: number of avatars in the scene.
+    `avatars`: number of avatars in the scene that have the network of `bundle`.
     """
     validation, name = bundle.manifest.validation, bundle.manifest.name
     measures = f"`{VALIDATE} {name_of(bundle.folder)} --sizes` measures them"
@@ -245,7 +245,7 @@ def size_loss(bundle: Bundle, avatars: int = 1) -> SizeLoss:
     return SizeLoss(source, losses)
 
 
-def curve_of(table: Mapping[int, Mapping[int, float]], tolerance: float = TOLERANCE_DB) -> tuple[tuple[int, int], ...]:
+def curve_of(table: Mapping[int, Mapping[int, float]], tolerance: float) -> tuple[tuple[int, int], ...]:
     """Return the smallest tensor that is large enough by `table`, as (pixels of the picture, pixels of the tensor).
 
     `table`: PSNR in dB, as `BySize.psnr_db_by_picture`. `tolerance`: most that a tensor loses against the best, dB.

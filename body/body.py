@@ -244,18 +244,18 @@ class ShapedBody:
         body = self.body
         smaller = replace(
             body,
-            v_template=body.v_template[used],
-            shape_dirs=body.shape_dirs[used],
-            expression_dirs=body.expression_dirs[used],
-            posedirs=None if body.posedirs is None else body.posedirs[used],
-            j_regressor=body.j_regressor[:, used],
-            weights=body.weights[used],
+            v_template=_frozen(body.v_template[used]),
+            shape_dirs=_frozen(body.shape_dirs[used]),
+            expression_dirs=_frozen(body.expression_dirs[used]),
+            posedirs=None if body.posedirs is None else _frozen(body.posedirs[used]),
+            j_regressor=_frozen(body.j_regressor[:, used]),
+            weights=_frozen(body.weights[used]),
             faces=faces,
             uv_faces=uv_faces,
-            offsets=None if body.offsets is None else body.offsets[used],
+            offsets=None if body.offsets is None else _frozen(body.offsets[used]),
             skin=None,
         )
-        return ShapedBody(self.vertices[used], self.joints, smaller)
+        return ShapedBody(_frozen(self.vertices[used]), self.joints, smaller)
 
     def with_offsets(self, offsets: F32) -> ShapedBody:
         """Return the person with `offsets` (V,3), metres at rest, which replace all earlier offsets."""
@@ -395,10 +395,16 @@ def _skin(path: Path, arrays: dict[str, NDArray[Any]]) -> tuple[int, int] | None
     skin = int(array[0]), int(array[1])
     if not (0 < skin[0] <= vertices and 0 < skin[1] <= faces):
         raise BadInputError(where, f"{skin}", f"1 to {vertices} vertices, 1 to {faces} faces")
-    if arrays["f"][: skin[1]].max() >= skin[0]:
-        raise BadInputError(where, "a face of the skin with a garment's vertex", f"vertices 0 to {skin[0] - 1}")
-    if arrays["J_regressor"][:, skin[0] :].any():
-        raise BadInputError(where, "a joint that depends on a garment's vertex", "zeros there in J_regressor")
+    (mixed, _), (joints, _) = (
+        np.nonzero(arrays["f"][: skin[1]] >= skin[0]),
+        np.nonzero(arrays["J_regressor"][:, skin[0] :]),
+    )
+    if len(mixed):
+        found = f"face {mixed[0]}, a face of the skin with a garment's vertex"
+        raise BadInputError(where, found, f"vertices 0 to {skin[0] - 1}")
+    if len(joints):
+        found = f"joint {joints[0]}, a joint that depends on a garment's vertex"
+        raise BadInputError(where, found, "zeros there in J_regressor")
     return skin
 
 

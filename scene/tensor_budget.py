@@ -93,18 +93,18 @@ class TensorBudget:
         return max(int(min(pixels, self.most)) * self.work // ALL_WORK, BUCKET_STEP**2)
 
 
-def pixels_at(curve: Curve, picture: int, most: float) -> float:
+def pixels_at(curve: Curve, picture: int, limit: float) -> float:
     """Return the tensor pixels of `curve` for a body that covers `picture` pixels, interpolated in their logarithms.
 
     A smaller body than any of the curve has as many as the smallest one, a larger one the density of the largest one.
 
-    `most`: most pixels of a larger body than any of the curve, if the curve's last one does not have more.
+    `limit`: most pixels of a larger body than any of the curve, if the curve's last one does not have more.
     """
     at = bisect_left(curve, picture, key=lambda knot: knot[0])
     if at == 0:
         return curve[0][1]
     if at == len(curve):
-        return min(curve[-1][1] * picture / curve[-1][0], max(most, curve[-1][1]))
+        return min(curve[-1][1] * picture / curve[-1][0], max(limit, curve[-1][1]))
     (least, low), (most, high) = curve[at - 1 : at + 1]
     return float(low * (high / low) ** (math.log(picture / least) / math.log(most / least)))
 

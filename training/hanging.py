@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F64, I64, Mask
 from trilane.body.body import SKIN_KEY, load_body
+from trilane.errors import BadInputError
 from trilane.training.clothing import HANGING, Look, find_landmarks, look_named, nearest
 from trilane.training.first_texture import used_texels
 from trilane.training.stitched import ANGLES
@@ -72,9 +73,9 @@ def dressed_body(body: Path, look: str, folder: Path) -> Path:
 
 def _dressed(path: Path, look: Look, hanging: list[str]) -> dict[str, Any]:
     """Return the arrays of the body file `path` with the garments `hanging`, for the shape of `look`."""
+    shaped = load_body(path).shape(look.betas)
     with np.load(path, allow_pickle=False) as file:
         arrays = {name: file[name] for name in file.files}
-    shaped = load_body(path).shape(look.betas)
     body = body_arrays(shaped)
     landmarks = find_landmarks(body.vertices, body.joints, body.weights)
     arrays[SKIN_KEY] = np.array([len(body.vertices), len(body.faces)])
@@ -83,12 +84,9 @@ def _dressed(path: Path, look: Look, hanging: list[str]) -> dict[str, Any]:
         (vertices, _), weights = HANGING[name](body, landmarks)
         sheet = _sheet(vertices, weights, lined=name in OPEN)
         uv, free = _placed(sheet, free)
-        dirs = np.zeros((len(sheet.vertices), *arrays["shapedirs"].shape[1:]))
-        shaped_by = len(look.betas)
-        under = nearest(sheet.vertices, body.vertices)
-        dirs[:, :, :shaped_by] = arrays["shapedirs"][under, :, :shaped_by].mean(axis=1)
+        dirs = arrays["shapedirs"][nearest(sheet.vertices, body.vertices)].mean(axis=1)
         more = {
-            "v_template": sheet.vertices - dirs[:, :, :shaped_by] @ np.asarray(look.betas),
+            "v_template": sheet.vertices - dirs[:, :, : len(look.betas)] @ np.asarray(look.betas),
             "shapedirs": dirs,
             "posedirs": np.zeros((len(sheet.vertices), *arrays["posedirs"].shape[1:])),
             "weights": sheet.weights,
@@ -145,11 +143,14 @@ def _sheet(vertices: F64, weights: F64, lined: bool) -> _Sheet:
 def _placed(sheet: _Sheet, free: Mask) -> tuple[F64, Mask]:
     """Return (texture coordinates (T,2) of `sheet` in the largest free rectangle, `free` without this rectangle).
 
-    The longer side of the sheet lies along the longer side of the rectangle.
+    The longer side of the sheet lies along the longer side of the rectangle. Raises BadInputError without enough room.
 
     `free`: (S,S), whether a texel is used by nothing; row 0 is at v = 0.
     """
     left, bottom, right, top = largest_rectangle(free)
+    if min(right - left, top - bottom) <= 2 * MARGIN:
+        found, expected = f"{right - left} x {top - bottom} free texels", f"more than {2 * MARGIN} on each side"
+        raise BadInputError("texture of the body", found, expected, "use a body that leaves texels for the garment")
     taken = free.copy()
     taken[bottom:top, left:right] = False
     low = np.array([left + MARGIN, bottom + MARGIN]) / len(free)

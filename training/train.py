@@ -268,7 +268,8 @@ def _draw_samples(subject: Subject, places: TrainingPlaces, settings: TrainingSe
     facts = places.work / SAMPLE_FACTS
     decides = ("samples", "seed", "stand_off")
     who = {"look": subject.facts[KEY]} if places.capture is None else {"capture": str(places.capture.resolve())}
-    wanted = who | {key: getattr(settings, key) for key in decides}
+    body = {"body": sha256_of([subject.person.body])}
+    wanted = who | body | {key: getattr(settings, key) for key in decides}
     if facts.exists():
         present = json.loads(facts.read_text(encoding="utf-8"))
         if present != wanted:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Callable
+from operator import attrgetter
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -58,7 +59,7 @@ class BatchOptions(Table):
     these statistics.
     `full_body_from`: share of the steps after which all samples show whole bodies.
     `repeats`: how many times each sample occurs in an epoch, by band: far, full body, upper body, face, anywhere.
-    `look_repeats`: factor on `repeats`, by look of the settings; without looks listed here, 1 for all.
+    `look_repeats`: factor on `repeats`, by look of the settings; if it is empty, 1 for all.
     """
 
     sample_share: float = Field(default=1.0, gt=0, le=1)
@@ -273,7 +274,7 @@ def parsed_settings(values: dict[str, Any], where: str | Path) -> TrainingSettin
         raise _refused(dict(error.errors()[0]), where) from None
     for key, clashes, expected, remedy in CLASHES:
         if clashes(settings):
-            raise BadInputError(f"{where}: {key}", str(getattr(settings, key)), expected, remedy)
+            raise BadInputError(f"{where}: {key}", str(attrgetter(key)(settings)), expected, remedy)
     return settings
 
 
@@ -283,10 +284,10 @@ CLASHES: tuple[tuple[str, Callable[[TrainingSettings], bool], str, str], ...] = 
     ("keep_network", lambda s: s.keep_network and s.start == "new", "false with random weights", "or another start"),
     ("look", lambda s: len(set(s.looks)) < len(s.looks), "each look once", ""),
     (
-        "batches",
+        "batches.look_repeats",
         lambda s: len(s.batches.look_repeats) not in (0, len(s.looks)),
-        "one number in look_repeats for each look",
-        "or no look_repeats",
+        "one number for each look",
+        "or none",
     ),
     (
         "bytes_from",

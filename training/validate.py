@@ -272,7 +272,7 @@ def _origin(motion: str) -> str:
 # pixels.
 
 DIGITS = 2
-#: Sides of squares with as many pixels as the tensor may have. The largest is 5/4 of a network's usual 256.
+#: Sides of squares with as many pixels as the tensor may have. The largest is 7/4 of a network's usual 256.
 TENSOR_SIDES = (48, 64, 96, 128, 160, 192, 256, 320, 384, 448)
 #: Sides of squares with as many pixels of the picture as the body covers, and the band of their views: in pictures of
 #: 480 to 720 rows, most bodies of that size are seen so.

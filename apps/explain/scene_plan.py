@@ -279,8 +279,7 @@ def explain(checked: Checked, profile: str, performance_profile: str) -> PlanExp
         "shapes": [list(shape) for shape in checked.config.buckets],
         "avatars": [_avatar(checked, number) for number in range(len(scene.avatars))],
         "phases": [
-            _phase(group, errors, costs, names, bodies)
-            | {"why": _why(group, bool(checked.config.size_curves), len(scene.avatars))}
+            _phase(group, errors, costs, names, bodies) | {"why": _why(group, _tolerance(checked.config))}
             for group, errors in zip(groups, rows, strict=True)
         ],
         "image": _image(checked),
@@ -390,20 +389,26 @@ def _most(group: Sequence[PlannedFrame]) -> float:
     return max(planned.plan.density or 0.0 for planned in group)
 
 
-def _why(group: Sequence[PlannedFrame], is_measured: bool, avatars: int) -> str:
+def _tolerance(config: RunConfig) -> str:
+    """Return the tolerance by which the tables in the manifests give sizes; empty if sizes do not follow tables."""
+    if not config.size_curves:
+        return ""
+    sharing = Counter(config.networks or [0] * len(config.avatar_dirs))
+    return " or ".join(f"{tolerance:g} dB" for tolerance in sorted({tolerance_db(count) for count in sharing.values()}))
+
+
+def _why(group: Sequence[PlannedFrame], tolerance: str) -> str:
     """Return, in words, why the tensor of a phase has its size.
 
-    `group`: frames of the phase. `is_measured`: whether the size follows the table in each avatar's manifest.
-    `avatars`: number of avatars in the scene.
+    `group`: frames of the phase. `tolerance`: result of `_tolerance`.
     """
     first = group[0].plan
     if first.work in WHY:
         return WHY[first.work]
     if first.density is None:
         return "the scene fixes the tensor's size"
-    if is_measured:
-        most = f"{tolerance_db(avatars):g} dB"
-        return f"the fewest pixels within {most} of the best size, by the table `by_size` in the manifest"
+    if tolerance:
+        return f"the fewest pixels within {tolerance} of the best size, by the table `by_size` in the manifest"
     if _most(group) >= MOST_DENSITY:
         return f"{MOST_DENSITY:g} tensor pixels along a side of a pixel of the picture: more make no better picture"
     return "the pixels that the network was trained to paint, in the shape that fits best of those that are ready"

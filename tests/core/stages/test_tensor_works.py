@@ -99,25 +99,25 @@ def test_losses_are_read_from_a_validation_of_these_files(tiny_bundle: Path, tmp
     from trilane.training.validate import with_sizes
 
     own = shutil.copytree(tiny_bundle, tmp_path / "own")
-    assert "validate" in size_loss(load_bundle(own)).source
+    assert "validate" in size_loss(load_bundle(own), 1).source
     manifest = load_bundle(own).manifest
     write_manifest(own, validated(load_bundle(own)))
     first = load_bundle(own)
-    assert size_loss(first).source.endswith(f"`trilane avatar validate {own} --sizes` measures them")
+    assert size_loss(first, 1).source.endswith(f"`trilane avatar validate {own} --sizes` measures them")
     sizes = {"64x64": 30.0, "32x64": 28.5, "32x32": 25.0}
     measured = BySize(date=date(2026, 3, 4), runtime="ort", seed=1, per_band=2, held_out=("a",), psnr_db=sizes)
     assert first.manifest.validation is not None
     write_manifest(own, manifest.model_copy(update={"validation": with_sizes(first.manifest.validation, measured)}))
-    loss = size_loss(load_bundle(own))
+    loss = size_loss(load_bundle(own), 1)
     assert loss.source == "from the avatar's validation of 2026-03-04, by tensor size"
     assert loss.by_work == {1000: 0.0, 500: 1.5, 250: 5.0}
     text = (own / "manifest.json").read_text().replace("28.5", "29.5")
     (own / "manifest.json").write_text(text)
-    assert not size_loss(load_bundle(own)).by_work
+    assert not size_loss(load_bundle(own), 1).by_work
 
 
 def test_the_default_avatar_loses_more_the_smaller_its_tensor_is() -> None:
-    loss = size_loss(load_bundle("default"))
+    loss = size_loss(load_bundle("default"), 1)
     assert 0 < loss.at(563) < loss.at(250) < 10  # type: ignore[operator]
 
 
@@ -175,7 +175,7 @@ def test_each_row_counts_by_itself() -> None:
 
 def test_several_avatars_give_up_more_than_one() -> None:
     assert [tolerance_db(count) for count in (1, 2, 5)] == [0.05, 0.3, 0.3]
-    loss = size_loss(load_bundle("default")), size_loss(load_bundle("default"), 2)
+    loss = size_loss(load_bundle("default"), 1), size_loss(load_bundle("default"), 2)
     assert all(one[1] > two[1] for one, two in zip(loss[0].curve, loss[1].curve, strict=True))
 
 
@@ -205,14 +205,17 @@ def test_a_table_in_a_valid_manifest_is_the_planners(tiny_bundle: Path, tmp_path
     )
     assert manifest.validation is not None
     write_manifest(own, manifest.model_copy(update={"validation": with_sizes(manifest.validation, measured)}))
-    assert size_loss(load_bundle(own)).curve == curve_of(TABLE)
+    assert size_loss(load_bundle(own), 1).curve == curve_of(TABLE, 0.05)
     file = tmp_path / "scene.toml"
     file.write_text(f'size = "auto"\nframes = 2\n[[avatars]]\nbundle = "{own}"\n')
     config = configure(RunOptions(scene=str(file), runtime="ort"), tmp_path, lambda: None).config
-    assert config.size_curves == (curve_of(TABLE),) == config.tensor_budgets[0].curves
+    assert config.size_curves == (curve_of(TABLE, 0.05),) == config.tensor_budgets[0].curves
+    file.write_text(file.read_text() + f'[[avatars]]\nbundle = "{own}"\nposition = [1.0, 0.0, 0.0]\n')
+    both = configure(RunOptions(scene=str(file), runtime="ort"), tmp_path, lambda: None).config
+    assert both.size_curves == (curve_of(TABLE, 0.3),), "two avatars share a tensor"
     text = (own / "manifest.json").read_text().replace("34.3", "31.3")
     (own / "manifest.json").write_text(text)
-    assert size_loss(load_bundle(own)).curve == ()
+    assert size_loss(load_bundle(own), 1).curve == ()
 
 
 @pytest.mark.parametrize(

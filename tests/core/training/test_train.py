@@ -17,17 +17,21 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("scipy")
 pytest.importorskip("skimage")
 
-from trilane.avatars.bundle import load_bundle  # noqa: E402
+from trilane.avatars.bundle import bundle_folder, load_bundle  # noqa: E402
+from trilane.avatars.manifest import sha256_of  # noqa: E402
 from trilane.errors import BadInputError  # noqa: E402
 from trilane.training import train as command  # noqa: E402
 from trilane.training.dataset import create_group  # noqa: E402
+from trilane.training.first_texture import used_texels  # noqa: E402
 from trilane.training.subject import Person, Subject  # noqa: E402
+from trilane.training.surface import body_arrays  # noqa: E402
 from trilane.training.train import TrainingPlaces, train_avatar  # noqa: E402
 from trilane.training.trainable_avatar import NeuralTexture  # noqa: E402
 from trilane.training.training_settings import TrainingSettings, parsed_settings, read_settings  # noqa: E402
 from trilane.units import AVATARS  # noqa: E402
 
 SHAPE, SIDES = (32, 32), (64, 32)
+BODY = bundle_folder("default") / "body.npz"
 FACTS = {"body": "that of a capture", "frames": 9}
 
 
@@ -69,7 +73,7 @@ def log(monkeypatch: pytest.MonkeyPatch) -> Any:
         return SimpleNamespace(crop=crop, seed=seed, band=band, density=density)
 
     renderer = SimpleNamespace(training_sample=sample, render=render)
-    person = Person(Path("body.npz"))
+    person = Person(BODY)
 
     def subject(folder: Path, _: int, report: Callable[[str], None]) -> Subject:
         report(f"9 frames of {folder.name}")
@@ -154,12 +158,18 @@ def test_an_ended_training_goes_on_and_makes_the_same_avatar(
 
 @pytest.mark.usefixtures("log")
 @pytest.mark.parametrize(
-    ("changed", "said"), [({"capture": "/there"}, "/there"), ({"stand_off": False}, "'stand_off': False")]
+    ("changed", "said"),
+    [
+        ({"capture": "/there"}, "/there"),
+        ({"stand_off": False}, "'stand_off': False"),
+        ({"body": 64 * "0"}, f"'body': '{64 * '0'}'"),
+    ],
 )
 def test_samples_of_another_capture_or_body_are_refused(changed: dict[str, Any], said: str, tmp_path: Path) -> None:
     there = places(tmp_path)
     there.work.mkdir()
     own = {"capture": str(there.capture.resolve()), "samples": 8, "seed": 1, "stand_off": True}
+    own |= {"body": sha256_of([BODY])}
     (there.work / "samples.json").write_text(json.dumps(own | changed))
     with pytest.raises(BadInputError, match=rf"samples\.json: found .*{said}.*use another --work folder"):
         train_avatar(there, settings(), Told())
@@ -216,6 +226,26 @@ def test_several_looks_are_painted_by_one_network(
     assert [words[2][1:] for words in written] == [("default", 0), ("hiker", 1)]
     for name in ("default", "hiker"):
         assert json.loads((tmp_path / "work" / name / "samples.json").read_text())["look"] == name
+
+
+def test_texels_of_a_garment_begin_anew_and_all_others_as_they_were(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The body of `dancer` has garments, on texels that the skin of `default` does not use."""
+    monkeypatch.setattr(command, "open_groups", lambda *_: [])
+    monkeypatch.setattr(command, "first_texture", lambda _, __, side, channels: np.full((side, side, channels), 9.0))
+    shaped = load_bundle("dancer").shaped_body()
+    person = command.Trained(Subject(Person(BODY), shaped, None, None, {}, None), places(tmp_path))  # type: ignore[arg-type]
+    image = command._first_image(person, 0, settings(texture="default"))
+    bundle, whole = load_bundle("default"), body_arrays(shaped)
+    texture, is_new = bundle.read_texture(), (image == 9.0).all(axis=2)
+    skin = used_texels(body_arrays(bundle.shaped_body()), len(texture), 1)
+    assert shaped.body.skin is not None
+    rows = slice(shaped.body.skin[1], None)
+    garments = replace(whole, faces=whole.faces[rows], uv_faces=whole.uv_faces[rows])
+    of_garments = used_texels(garments, len(texture), 0) & ~skin
+    assert of_garments.mean() > 0.05 and is_new[of_garments].all() and not is_new[skin].any()
+    np.testing.assert_array_equal(image[~is_new], texture[~is_new])
 
 
 @pytest.mark.parametrize("name", AVATARS)

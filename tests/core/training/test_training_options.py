@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 import tomllib
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -194,6 +196,10 @@ def test_options_are_written_and_read_again() -> None:
             {"freeze_norms_at": 0.6, "bytes_from": 0.5},
             "bytes_from: found 0.5, expected no less than freeze_norms_at: .*; or a lower freeze_norms_at",
         ),
+        (
+            {"look": ["default", "hiker"], "batches": {"look_repeats": [1, 2, 3]}},
+            r"batches.look_repeats: found \(1, 2, 3\), expected one number for each look; or none",
+        ),
     ],
 )
 def test_wrong_options_are_refused(values: dict[str, Any], words: str) -> None:
@@ -301,6 +307,14 @@ def test_a_step_of_several_batches_goes_by_their_mean_gradient(
 
 def drawn(groups: list[ShapeGroup], count: int = 12, **options: Any) -> list[Any]:
     return list(batch_stream(groups, settings(batches=options), count))
+
+
+def test_a_look_s_samples_occur_as_often_as_its_repeats_say(groups: list[ShapeGroup]) -> None:
+    """Four samples of the first person once, and of the second three times: 16 in an epoch of batches of one."""
+    people = [replace(group, person=number) for number, group in enumerate(groups)]
+    asked = settings(look=["default", "hiker"], batch=1, batches={"look_repeats": [1, 3]})
+    shown = Counter(group.person for group, _ in batch_stream(people, asked, 16))
+    assert shown == {0: 4, 1: 12}
 
 
 def test_a_share_of_the_samples_is_used_again_and_again(groups: list[ShapeGroup]) -> None:

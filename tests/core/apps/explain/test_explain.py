@@ -133,7 +133,7 @@ def test_phases_cover_the_scene_and_add_up(document: Any) -> None:
 
 def test_a_phase_says_what_is_modelled_and_its_error(document: Any) -> None:
     (avatar,) = document["avatars"]
-    is_measured = bool(size_loss(load_bundle(avatar["bundle"])).curve)
+    is_measured = bool(size_loss(load_bundle(avatar["bundle"]), 1).curve)
     for row in document["phases"]:
         assert 0 < row["density"][0] <= row["density"][1]
         assert is_measured or row["density"][1] <= MOST_DENSITY
