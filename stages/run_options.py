@@ -122,8 +122,7 @@ class RunOptions(Options):
     hud: bool | None = Field(default=None, description="Write frame number, rate and latency on the picture.")
     policy: Annotated[str, Option(words=tuple(POLICIES), offered=tuple(POLICIES))] = Field(
         default="pipelined",
-        description="pipelined: highest rate; sequential: one frame at a time; latest: newest pose wins; "
-        "deadline: frames that would be late are dropped.",
+        description="; ".join(f"{name}: {policy.meaning}" for name, policy in POLICIES.items()) + ".",
     )
     edge: Annotated[str, AfterValidator(_known_edge), Option(offered=EDGES)] = Field(
         default=DEFAULT_EDGE,

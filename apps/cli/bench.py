@@ -15,10 +15,11 @@ from typing import Annotated, Any
 
 import typer
 
-from trilane.apps.cli.commands import POLICY_HELP, Commands, JsonOption
+from trilane.apps.cli.commands import Commands, JsonOption
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console, stdout_kept
 from trilane.apps.cli.main import lazy_group
 from trilane.apps.predict.predict_options import ENCODER_HELP, NORM_HELP
+from trilane.scheduler.policy import POLICY_WORDS
 from trilane.stages.run_options import RUNTIME_HELP, SIZE_HELP, WIDTH_HELP
 from trilane.units import AVATARS_HELP
 
@@ -95,7 +96,7 @@ MEANINGS = {
     "network": "An .onnx file or an avatar, at its own size; if none, one of --encoder, --norm, --width and --size.",
     "norm": NORM_HELP,
     "period": "Seconds for which a runtime runs before the next runtime's turn.",
-    "policy": POLICY_HELP,
+    "policy": f"{POLICY_WORDS}.",
     "rate": "Queries a second of the server scenario.",
     "repeats": "How often each variant runs.",
     "runtime": RUNTIME_HELP,
