@@ -21,6 +21,7 @@ from trilane.apps.cli.main import lazy_group
 from trilane.apps.predict.predict_options import ENCODER_HELP, NORM_HELP
 from trilane.scheduler.policy import POLICY_WORDS
 from trilane.stages.run_options import RUNTIME_HELP, SIZE_HELP, WIDTH_HELP
+from trilane.transport.slots import EDGE_WORDS
 from trilane.units import AVATARS_HELP
 
 #: Bench -> its module, and its line in `trilane bench --help`.
@@ -75,7 +76,7 @@ MEANINGS = {
     "calibration": "Network of the avatar: as-it-is, or quantised again by minmax, percentile or entropy.",
     "channels": "Channels of the neural texture: 4, 8, 12 or 16.",
     "cores": "Cores of the three units together; 0: all that this process may use.",
-    "edge": "Buffers between stages: single, double, triple, fifo:N, orphan or orphan:N.",
+    "edge": f"Buffers between stages: {EDGE_WORDS}.",
     "encoder": ENCODER_HELP,
     "events": "Folder of a run, or its events.jsonl, to be replayed.",
     "frames": "Frames of each run.",

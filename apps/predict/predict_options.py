@@ -17,7 +17,7 @@ from trilane.errors import BadInputError
 from trilane.options import Finite, Name, OnePath, Option, Options, Text, Texts, one_of, paths_of
 from trilane.scheduler.policy import MOST_FRAMES, PACED_WORDS, POLICIES, POLICY_WORDS
 from trilane.stages.run_options import PROFILE_HELP
-from trilane.transport.slots import DEFAULT_EDGE
+from trilane.transport.slots import DEFAULT_EDGE, EDGE_WORDS
 from trilane.unexpected_value import UnexpectedValue, either
 from trilane.units import AVATARS_HELP, BURST, HOST, MAX_MINUTES, PERFORMANCE_PROFILES, SUSTAINED, UNITS, UnitName
 
@@ -197,7 +197,7 @@ class PredictOptions(Options):
         "of the published application, and the default with --encoder, --norm, --size or --channels.",
     )
     edge: str | None = Field(
-        default=None, description="Buffers between stages: single, double (if not given), triple, fifo:N, orphan."
+        default=None, description=f"Buffers between stages: {EDGE_WORDS}; {DEFAULT_EDGE} if not given."
     )
     batch: int = Field(default=1, description="Frames in one job of the network.")
     fps: Annotated[float | None, AfterValidator(_rate)] = Field(
