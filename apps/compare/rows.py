@@ -29,7 +29,7 @@ from trilane.apps.compare.difference import (
 from trilane.apps.compare.run_frames import CPU, INSTRUCTION_TIME, INSTRUCTIONS, Key
 from trilane.apps.compare.sides import ComparedRun, RunKind, Side, changes
 from trilane.apps.run.verdict import MOST_OTHERS
-from trilane.hw_profiles.schema import NORMAL_80
+from trilane.hw_profiles.schema import SIGMAS
 from trilane.scheduler.stats import student_quantile
 from trilane.units import HOST_CLOCK
 
@@ -229,7 +229,7 @@ def _deviation_of(told: ComparedRun) -> float | None:
         return deviation
     times = told.document["frame_time_ms"]
     low, high, quantile = (
-        (times["low"], times["high"], NORMAL_80)
+        (times["low"], times["high"], SIGMAS)
         if told.kind is RunKind.PREDICTION
         else (times.get("mean_low"), times.get("mean_high"), student_quantile(inf))
     )
