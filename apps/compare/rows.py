@@ -18,6 +18,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from trilane.apps.compare.difference import (
+    COMPARED,
     MATTERS,
     Chance,
     Difference,
@@ -40,8 +41,8 @@ LOST, DROPPED, ERROR = "lost", "dropped", "error"
 MS, NS, SHARE, BYTES = "ms", "ns", "share", "bytes"
 #: Measure -> its statistics, for runs with a journal.
 MEASURES: Final = {
-    FRAME_TIME: ("mean", "p50", "p90", "p99"),
-    LATENCY: ("mean", "p50", "p90", "p99"),
+    FRAME_TIME: ("mean", *COMPARED),
+    LATENCY: ("mean", *COMPARED),
     INSTRUCTIONS: ("mean",),
     INSTRUCTION_TIME: ("typical",),
     CPU: ("mean", "typical"),
