@@ -28,6 +28,7 @@ from trilane.apps.run.report import Report, read_report
 from trilane.apps.run.verdict import Verdict
 from trilane.apps.run.verdict_facts import predicted_verdict, verdict_of
 from trilane.errors import BadInputError, MissingPartError, TrilaneError, did_you_mean
+from trilane.hw_profiles.schema import SHARE_TEXT
 from trilane.options import EMPTY_PATH, Options
 from trilane.pipeline.journal import Record, Stepped
 from trilane.pipeline.timeline import Presented, Timeline
@@ -292,7 +293,7 @@ class Prediction:
 
     def _repr_html_(self) -> str:
         busy = ", ".join(f"{unit} {row['busy']:.0%}" for unit, row in self.units.items())
-        around = "" if self.low_ms is None else f" (80 %: {self.low_ms:.2f} to {self.high_ms:.2f})"
+        around = "" if self.low_ms is None else f" ({SHARE_TEXT}: {self.low_ms:.2f} to {self.high_ms:.2f})"
         rows = dict(self.verdict.lines()) | {
             "frame time": f"{self.frame_ms:.2f} ms{around}",
             "rate": f"{self.fps:.1f} frames a second{', as the display shows them' if self.is_display_capped else ''}",

@@ -52,13 +52,14 @@ from trilane.hw_profiles.profile_files import load_tables, parse_profile
 from trilane.hw_profiles.schema import (
     KEY_OF_RATE,
     MOST_ERROR_SCALE,
-    NORMAL_80,
+    SHARE,
+    SIGMAS,
     EngineName,
     EngineRuntime,
     Profile,
     Unit,
-    around_80,
     corners_of,
+    interval_around,
 )
 from trilane.hw_profiles.unit_times import amounts, join, numbers_of, time_on
 from trilane.scheduler.stats import student_quantile
@@ -290,7 +291,7 @@ def error_scale(told: Sequence[float]) -> float:
     """Return the factor by which the stated error must grow or shrink. `told`: misses in units of the stated error."""
     freedom = STATED_ROWS + len(told)
     scale = math.sqrt((STATED_ROWS + sum(miss**2 for miss in told)) / freedom)
-    return min(scale * student_quantile(freedom, 0.8) / NORMAL_80, MOST_ERROR_SCALE)
+    return min(scale * student_quantile(freedom, SHARE) / SIGMAS, MOST_ERROR_SCALE)
 
 
 def _error_scales(profile: Profile, left_out: Sequence[CheckedRow]) -> dict[str, tuple[float, float]]:
@@ -308,7 +309,7 @@ def _error_scales(profile: Profile, left_out: Sequence[CheckedRow]) -> dict[str,
 
 
 def _scaled(checked: CheckedRow, scale: float) -> Interval:
-    low_ms, high_ms = around_80(checked.after_ms, scale * spread_of(checked.after))
+    low_ms, high_ms = interval_around(checked.after_ms, scale * spread_of(checked.after))
     return checked.after._replace(low_ms=low_ms, high_ms=high_ms)
 
 

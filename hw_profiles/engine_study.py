@@ -35,7 +35,7 @@ from trilane.hw_profiles.fit_engines import (
 )
 from trilane.hw_profiles.governor import figure_for
 from trilane.hw_profiles.operators import NAMES, Layers
-from trilane.hw_profiles.schema import ENGINES, NORMAL_80, EngineName
+from trilane.hw_profiles.schema import ENGINES, SHARE_TEXT, SIGMAS, EngineName
 from trilane.writing import write_atomically
 
 #: Share of the left-out rows that lie in their 80 % intervals by construction. It is more than 80 % because a user's
@@ -116,7 +116,7 @@ class EngineStudy:
     def coverage(self) -> float:
         """Share of the left-out rows that lie in the interval around their prediction."""
         misses, unsure, unlike = misses_of(self.left_out)
-        return float(np.mean(misses <= NORMAL_80 * np.hypot(unsure, self.error * unlike)))
+        return float(np.mean(misses <= SIGMAS * np.hypot(unsure, self.error * unlike)))
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ def own_error(rows: Sequence[LeftOut]) -> float:
     The error of a row is this error times the unlikeness of its network.
     """
     misses, unsure, unlike = misses_of(rows)
-    beyond = np.sqrt(np.maximum((misses / NORMAL_80) ** 2 - unsure**2, 0)) / unlike
+    beyond = np.sqrt(np.maximum((misses / SIGMAS) ** 2 - unsure**2, 0)) / unlike
     return float(np.quantile(beyond, COVERED))
 
 
@@ -240,7 +240,7 @@ def as_markdown(study: Study) -> str:
 
 
 def _by_engine(study: Study) -> Iterator[str]:
-    yield "| engine | rows | median | p90 | within 15 % | in the 80 % interval |"
+    yield f"| engine | rows | median | p90 | within 15 % | in the {SHARE_TEXT} interval |"
     yield "|---|---|---|---|---|---|"
     for name, engine in study.engines.items():
         all_rows = errors_of(engine.left_out)

@@ -32,7 +32,7 @@ from trilane.hw_profiles.host_model import UNMEASURED, with_known_intervals
 from trilane.hw_profiles.network_work import Operator, Work
 from trilane.hw_profiles.operators import COMPILED, NAMES, EngineLayer
 from trilane.hw_profiles.rates import NOTHING, FrameInterval, FrameLoad, Wanted, answers, device_power
-from trilane.hw_profiles.schema import NORMAL_80, Corners, EngineRuntime, Profile, Unit, around_80, corners_of
+from trilane.hw_profiles.schema import SIGMAS, Corners, EngineRuntime, Profile, Unit, corners_of, interval_around
 from trilane.hw_profiles.unit_times import (
     BOUNDS,
     Bound,
@@ -94,7 +94,7 @@ class Interval(NamedTuple):
 
 def spread_of(around: Interval) -> float:
     """Return the standard deviation of the time's logarithm for which the 80 % interval `around` stands."""
-    return math.log(around.high_ms / around.low_ms) / 2 / NORMAL_80
+    return math.log(around.high_ms / around.low_ms) / 2 / SIGMAS
 
 
 def price(profile: Profile, work: Work, unit: UnitName, corners: Corners) -> NetworkTime:
@@ -167,7 +167,7 @@ def interval(profile: Profile, work: Work, time: NetworkTime) -> Interval:
     odd = sorted({o.op_type for o in work.operators if not o.ruled})
     if odd:
         why.append(f"no rule for {', '.join(odd)}: counted as the movement of its elements")
-    return Interval(*around_80(time.total_ms, relative_error(job, unit)), tuple(why))
+    return Interval(*interval_around(time.total_ms, relative_error(job, unit)), tuple(why))
 
 
 def _likeness(job: JobTime) -> str:

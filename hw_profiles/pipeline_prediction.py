@@ -25,7 +25,7 @@ from trilane.hw_profiles.graph_file import GraphFile
 from trilane.hw_profiles.host_model import MODEL_ERROR, UNMEASURED
 from trilane.hw_profiles.network_time import interval, price
 from trilane.hw_profiles.rates import FrameInterval, holding, wanted_drops, without_interval
-from trilane.hw_profiles.schema import Corners, Profile, around_80
+from trilane.hw_profiles.schema import Corners, Profile, interval_around
 from trilane.pipeline.file_graph import (
     edge_rules,
     graph_of,
@@ -133,7 +133,7 @@ def measured_price(file: PipelineFile, name: str, measured: MeasuredStages) -> S
         return None
     time = measured.times[name].times(factor)
     source = f"measured in {measured.run}" + (f", times {factor:g}" if measured.chip != HOST else "")
-    return StagePrice(time, source, *around_80(time.mean_ms, MODEL_ERROR), is_measured=True)
+    return StagePrice(time, source, *interval_around(time.mean_ms, MODEL_ERROR), is_measured=True)
 
 
 def stages_without_time(file: PipelineFile, measured: MeasuredStages = NOTHING_MEASURED) -> list[str]:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping
 from itertools import product
 from typing import Any, NamedTuple
 
-from trilane.hw_profiles.schema import CORNERS, Corner, Corners, Profile, around_80
+from trilane.hw_profiles.schema import CORNERS, SHARE_TEXT, Corner, Corners, Profile, interval_around
 from trilane.scheduler.events import DropCause
 from trilane.units import UNITS, UnitName
 
@@ -97,7 +97,7 @@ def _sentence(fps: float, times: FrameInterval, missed: Mapping[str, int], frame
         holds = "not for every frame"
     low, high = _short(times.low_ms), _short(times.high_ms)
     span = f"{low} ms" if low == high else f"{low}-{high} ms"
-    share = "" if times.low_ms == times.high_ms else " (80 %)"
+    share = "" if times.low_ms == times.high_ms else f" ({SHARE_TEXT})"
     return f"holds {fps:g} fps: {holds}; {span} of {_short(frame_ms)} ms{share}{left_out}"
 
 
@@ -278,4 +278,4 @@ def _watts(mean: float, deviation: float) -> _Watts:
     if not mean:
         return _Watts(0.0, 0.0, 0.0)
     variance = math.log1p((deviation / mean) ** 2)
-    return _Watts(mean, *around_80(mean * math.exp(-variance / 2), math.sqrt(variance)))
+    return _Watts(mean, *interval_around(mean * math.exp(-variance / 2), math.sqrt(variance)))

@@ -7,7 +7,8 @@ checks only types and ranges. `corners_of` returns the corner of each unit under
 from __future__ import annotations
 
 import math
-from typing import Annotated, Literal, Self
+from statistics import NormalDist
+from typing import Annotated, Final, Literal, Self
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
@@ -21,8 +22,11 @@ CORNERS: tuple[Corner, ...] = ("max", "turbo", "nominal_plus", "nominal", "svs_p
 Kind = Literal["measured", "published", "fitted", "assumed", "unknown"]
 #: Relative error (standard deviation of the logarithm) of a number by its kind, if the profile states none.
 SPREAD_OF_KIND: dict[str, float] = {"measured": 0.05, "published": 0.1, "fitted": 0.15, "assumed": 0.5, "unknown": 1.0}
-#: Number of standard deviations from the mean within which 80 % of a normal distribution lie.
-NORMAL_80 = 1.2816
+#: Probability with which an interval of a prediction contains the true value, as a number and in words.
+SHARE: Final = 0.8
+SHARE_TEXT: Final = f"{100 * SHARE:.0f} %"
+#: Number of standard deviations from the mean within which this share of a normal distribution lies.
+SIGMAS: Final = round(NormalDist().inv_cdf((1 + SHARE) / 2), 4)
 #: Largest `error_scale`: an interval of 20 times the stated error says nothing any more.
 MOST_ERROR_SCALE = 20.0
 BYTES = {"int8": 1, "fp16": 2, "fp32": 4}
@@ -30,9 +34,12 @@ BYTES = {"int8": 1, "fp16": 2, "fp32": 4}
 Corners = tuple[Corner, Corner, Corner]
 
 
-def around_80(middle: float, error: float) -> tuple[float, float]:
-    """Return the ends of the 80 % interval around `middle`. `error`: standard deviation of the value's logarithm."""
-    factor = math.exp(NORMAL_80 * error)
+def interval_around(middle: float, error: float) -> tuple[float, float]:
+    """Return the ends of the interval around `middle` that holds SHARE.
+
+    `error`: standard deviation of the value's logarithm.
+    """
+    factor = math.exp(SIGMAS * error)
     return middle / factor, middle * factor
 
 

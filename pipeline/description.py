@@ -158,7 +158,7 @@ class PipelineEdge(Described):
 
     `payload_bytes`: size of every packet's payload.
     `header`: dtype of every packet's header, made by `trilane.transport.packets.header_dtype`.
-    `rule`: single, double, triple, fifo:N or orphan[:N].
+    `rule`: text that `trilane.transport.slots.edge_rule` takes.
     """
 
     payload_bytes: int = Field(ge=0)

@@ -21,7 +21,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 from trilane.errors import did_you_mean
 from trilane.options import one_of
 from trilane.pipeline.description import FACTORY, LONGEST_NAME
-from trilane.scheduler.policy import MOST_FRAMES, POLICIES
+from trilane.scheduler.policy import MOST_FRAMES, PACED_WORDS, POLICIES, POLICY_WORDS
 from trilane.transport.slots import EDGE_WORDS, edge_rule
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import UNITS
@@ -109,8 +109,7 @@ class RunKeys(Keys):
     )
     policy: Annotated[str, one_of(*POLICIES)] = Field(
         default="pipelined",
-        description="sequential, pipelined, latest or deadline; the last two need fps or arrivals. "
-        "If absent, pipelined.",
+        description=f"{POLICY_WORDS}; {PACED_WORDS} need fps or arrivals. If absent, pipelined.",
     )
     edge: EdgeRule | None = Field(
         default=None,

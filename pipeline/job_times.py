@@ -281,9 +281,19 @@ class JobClock:
         `metrics`: metrics of the stage for this job, by name.
         `skips`: whether its frame takes the bypass.
         """
-        lost = (self._preempted_ns, self._asleep_ns, self._preempted_before_ns)
-        times = (self._begin_ns, self._end_ns, sampled_ns, *lost, int(skips), self._cpu_ns, self._cpu_before_ns)
-        return Done(job_id, *times, metrics)
+        return Done(
+            id=job_id,
+            t_begin_ns=self._begin_ns,
+            t_end_ns=self._end_ns,
+            t_sampled_ns=sampled_ns,
+            preempted_ns=self._preempted_ns,
+            asleep_ns=self._asleep_ns,
+            preempted_before_ns=self._preempted_before_ns,
+            skips=int(skips),
+            cpu_ns=self._cpu_ns,
+            cpu_before_ns=self._cpu_before_ns,
+            metrics=metrics,
+        )
 
     def answered(self) -> None:
         """Read the counts of the time since the job's end; called after the answer was sent.

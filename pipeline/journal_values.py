@@ -22,7 +22,11 @@ ACCOUNTS: Final = {ASSIGNED: "assigned", **NAMES}
 A_TIME: Final = f"nanoseconds, a whole number from 0 to {NEVER}"
 NUMBERS: Final = {int, float}
 PLAIN: Final = {int, float, str, bool, type(None)}
-JOB_TYPES: Final = tuple(get_type_hints(JobRecord).values())  # journals of an older Trilane lack the last field
+#: Types of a job's values. Journals of an older Trilane lack the last fields; none lacks a field before `cpu_ns`.
+JOB_TYPES: Final = {
+    tuple(get_type_hints(JobRecord).values())[:count]
+    for count in range(JobRecord._fields.index("cpu_ns"), len(JobRecord._fields) + 1)
+}
 SETTINGS_TYPES: Final = {
     name: tuple if "tuple" in str(kind) else kind for name, kind in get_type_hints(Settings).items()
 }
@@ -203,7 +207,7 @@ class RunValues:
 
         Its frame must be newer than the last frame of its stage.
         """
-        if type(row) is not tuple or tuple(map(type, row)) not in (JOB_TYPES, JOB_TYPES[:-1]):
+        if type(row) is not tuple or tuple(map(type, row)) not in JOB_TYPES:
             raise UnexpectedValue(f"job {shown(row)}", f"texts and whole numbers: {', '.join(JobRecord._fields)}")
         job = JobRecord(*row)
         fields: tuple[Any, ...] = row

@@ -271,9 +271,20 @@ class RealtimeClock:
             if ready_ns is None:
                 found.append(None)
             else:
-                lost = (done.preempted_ns, done.asleep_ns, done.preempted_before_ns)
-                times = (ready_ns, dispatch_ns, done.t_begin_ns, done.t_end_ns, *lost, done.cpu_ns)
-                found.append(Worked(JobRecord(job.stage, job.unit, job.frame, *times), done.metrics))
+                record = JobRecord(
+                    stage=job.stage,
+                    unit=job.unit,
+                    frame=job.frame,
+                    ready_ns=ready_ns,
+                    dispatch_ns=dispatch_ns,
+                    begin_ns=done.t_begin_ns,
+                    end_ns=done.t_end_ns,
+                    preempted_ns=done.preempted_ns,
+                    asleep_ns=done.asleep_ns,
+                    preempted_before_ns=done.preempted_before_ns,
+                    cpu_ns=done.cpu_ns,
+                )
+                found.append(Worked(record, done.metrics))
             self.cpu.add(job.unit, job.stage, done, self._core.ledger.start_ns)
             sums, counts = self.metrics[job.stage], self.reported[job.stage]
             for name, value in done.metrics.items():
@@ -410,7 +421,17 @@ class RealtimeClock:
         self._unbooked.append((job, dispatch_ns, self._core.ready_ns(job), message))
         if job.frame in self._core.frames and self._requests is not None and job.stage == self._last_stage:
             self._requests.answered(job.frame)
-        return JobDone(unit, *message[:7], message.skips > 0)
+        return JobDone(
+            unit=unit,
+            job=message.id,
+            t_begin_ns=message.t_begin_ns,
+            t_end_ns=message.t_end_ns,
+            t_sampled_ns=message.t_sampled_ns,
+            preempted_ns=message.preempted_ns,
+            asleep_ns=message.asleep_ns,
+            preempted_before_ns=message.preempted_before_ns,
+            skips=message.skips > 0,
+        )
 
     def _failed(self, unit: str, message: Failed) -> Event | None:
         self._log.fail_with(message)

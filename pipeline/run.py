@@ -111,7 +111,7 @@ def run_pipeline(
 ) -> RunResult:
     """Run `frames` frames through the units of `pipeline`, and return the result.
 
-    `policy`: sequential, pipelined, latest or deadline.
+    `policy`: name in `trilane.scheduler.policy.POLICIES`.
     `fps`: target rate in frames a second. If frames have no deadline, a frame time above 1 / `fps` counts as a missed
     deadline.
     `pace_fps`: rate at which frames are released, in frames a second. None: under `latest` and `deadline` frames are

@@ -33,7 +33,7 @@ from typing import Any, Final, NamedTuple
 
 from trilane.scheduler.events import NEVER, DropCause, Settings
 from trilane.scheduler.state import StageState
-from trilane.unexpected_value import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue, either
 
 
 class Candidate(NamedTuple):
@@ -69,6 +69,8 @@ class Policy:
     """One row of `POLICIES`.
 
     `choose`: function that returns the job that a unit takes, from the jobs that could begin.
+    `meaning`: what it does, in the words of helps.
+    `told`: what a comparison says of a run under it.
     `in_flight`: limit of frames between admission and presentation; 0: the policy sets no limit.
     `newest`: whether a stage takes the newest waiting frame; all older waiting frames are stale and dropped.
     `drop_late`: whether a frame that cannot meet its deadline is dropped before its next stage.
@@ -78,6 +80,8 @@ class Policy:
     """
 
     choose: Callable[[Sequence[Candidate]], Candidate]
+    meaning: str
+    told: str
     in_flight: int = 0
     newest: bool = False
     drop_late: bool = False
@@ -86,11 +90,24 @@ class Policy:
 
 
 POLICIES = {
-    "sequential": Policy(oldest_frame, in_flight=1),
-    "pipelined": Policy(oldest_frame),
-    "latest": Policy(furthest_stage, newest=True, lead_ns=1_000_000, paced=True),
-    "deadline": Policy(earliest_deadline, drop_late=True, lead_ns=1_000_000, paced=True),
+    "sequential": Policy(oldest_frame, "one frame at a time", "one frame at a time", in_flight=1),
+    "pipelined": Policy(oldest_frame, "highest rate", "several frames at a time"),
+    "latest": Policy(
+        furthest_stage, "newest pose wins", "the newest pose wins", newest=True, lead_ns=1_000_000, paced=True
+    ),
+    "deadline": Policy(
+        earliest_deadline,
+        "frames that would be late are dropped",
+        "late frames are dropped",
+        drop_late=True,
+        lead_ns=1_000_000,
+        paced=True,
+    ),
 }
+#: The policies in words, for a person.
+POLICY_WORDS: Final = either(POLICIES)
+#: The policies that need a rate, in words.
+PACED_WORDS: Final = " and ".join(name for name, policy in POLICIES.items() if policy.paced)
 
 
 def policy_named(name: str) -> Policy:

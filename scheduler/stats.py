@@ -31,6 +31,8 @@ CONFIDENCE = 0.95
 SCORE_PER_MS = 15.0
 LARGEST_ENERGY_MJ = 1500.0
 LARGEST_EXPONENT = 700.0  # e to this power is still a number
+#: The percentiles of a summary: name -> share of the values below it.
+PERCENTILES: Final = {f"p{rank}": rank / 100 for rank in (50, 90, 95, 99)}
 
 
 def percentile(ordered: Sequence[int], share: float) -> float:
@@ -44,7 +46,7 @@ def percentile(ordered: Sequence[int], share: float) -> float:
 
 
 def summary_ms(values_ns: Iterable[int]) -> dict[str, float]:
-    """Return `mean`, `p50`, `p90`, `p95`, `p99` and `max` in ms (0 without values), and the number `samples`."""
+    """Return `mean`, PERCENTILES and `max` in ms (0 without values), and the number `samples`."""
     ordered = sorted(values_ns)
     return _summary_row(
         len(ordered), sum(ordered), ordered[-1] if ordered else 0, lambda share: percentile(ordered, share)
@@ -58,9 +60,9 @@ def _summary_row(count: int, total: int, largest: int, percentile_of: Callable[[
     `percentile_of`: function that returns their percentile at a share, in ns.
     """
     if not count:
-        return dict.fromkeys(("mean", "p50", "p90", "p95", "p99", "max", "samples"), 0)
-    ranks = {f"p{rank}": percentile_of(rank / 100) for rank in (50, 90, 95, 99)}
-    row = {"mean": total / count, **ranks, "max": largest}
+        return dict.fromkeys(("mean", *PERCENTILES, "max", "samples"), 0)
+    percentiles = {name: percentile_of(share) for name, share in PERCENTILES.items()}
+    row = {"mean": total / count, **percentiles, "max": largest}
     return {**{key: round(value / NS_PER_MS, 6) for key, value in row.items()}, "samples": count}
 
 
@@ -73,6 +75,10 @@ def samples_needed(share: float) -> int:
     `share`: the percentile as a share, such as 0.99 for p99; above 0 and below 1.
     """
     return ceil(log(1 - CONFIDENCE) / log(share))
+
+
+#: The number of samples that each percentile above the median needs, by the percentile's name.
+NEEDED: Final = {name: samples_needed(share) for name, share in PERCENTILES.items() if share > 0.5}
 
 
 def median_interval(values: Sequence[float], confidence: float = 0.95) -> tuple[float, float]:

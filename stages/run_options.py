@@ -14,7 +14,7 @@ from pydantic import AfterValidator, BeforeValidator, Field
 from trilane.errors import BadInputError, did_you_mean
 from trilane.options import NOTHING, Finite, Name, OnePath, Option, Options, Text, Texts, texts_of
 from trilane.scheduler.policy import POLICIES
-from trilane.transport.slots import DEFAULT_EDGE, EDGES, RULES, edge_rule
+from trilane.transport.slots import DEFAULT_EDGE, EDGE_WORDS, EDGES, RULES, edge_rule
 from trilane.unexpected_value import UnexpectedValue
 from trilane.units import AVATARS_HELP, PERFORMANCE_PROFILES
 
@@ -122,13 +122,11 @@ class RunOptions(Options):
     hud: bool | None = Field(default=None, description="Write frame number, rate and latency on the picture.")
     policy: Annotated[str, Option(words=tuple(POLICIES), offered=tuple(POLICIES))] = Field(
         default="pipelined",
-        description="pipelined: highest rate; sequential: one frame at a time; latest: newest pose wins; "
-        "deadline: frames that would be late are dropped.",
+        description="; ".join(f"{name}: {policy.meaning}" for name, policy in POLICIES.items()) + ".",
     )
     edge: Annotated[str, AfterValidator(_known_edge), Option(offered=EDGES)] = Field(
         default=DEFAULT_EDGE,
-        description="Buffers between stages: single, double, triple, fifo:N, orphan or orphan:N "
-        "(docs/policies-and-edges.md).",
+        description=f"Buffers between stages: {EDGE_WORDS} (docs/policies-and-edges.md).",
     )
     runtime: Annotated[str, Option(offered=())] = Field(
         default="auto", description=f"Runtime of the network: {RUNTIME_HELP}"

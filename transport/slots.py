@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from trilane.unexpected_value import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue, either
 
 FREE: Final = "free"
 WRITING: Final = "writing"
@@ -54,8 +54,6 @@ class EdgeRule:
     yields: bool = False
 
 
-#: The rules in words, for a person.
-EDGE_WORDS: Final = "single, double, triple, fifo:N or orphan:N"
 #: The rules by name. A rule of COUNTED may have a number of slots, as NAME:N.
 RULES = {
     "single": EdgeRule("single", 1),
@@ -66,14 +64,16 @@ RULES = {
 }
 #: The rule of an edge unless somebody chooses another.
 DEFAULT_EDGE: Final = "double"
-#: One edge of each rule, for a menu or a comparison.
-EDGES: Final = ("single", "double", "triple", "fifo:4", "orphan")
 #: Least number of slots. An orphan edge needs two slots being read, one being written and one waiting.
 COUNTED = {"fifo": 1, "orphan": 4}
+#: The rules in words, for a person.
+EDGE_WORDS: Final = either(f"{name}:N" if name in COUNTED else name for name in RULES)
+#: One edge of each rule, for a menu or a comparison. The fifo states its slots, so that results show them.
+EDGES: Final = tuple(f"{name}:{rule.slots}" if name == "fifo" else name for name, rule in RULES.items())
 
 
 def edge_rule(text: str) -> EdgeRule:
-    """Return the rule of `single`, `double`, `triple`, `fifo[:N]` or `orphan[:N]`.
+    """Return the rule that `text` names: a name of `RULES`, or NAME:N for a name of `COUNTED`.
 
     Raises UnexpectedValue for other texts.
     """

@@ -15,11 +15,13 @@ from typing import Annotated, Any
 
 import typer
 
-from trilane.apps.cli.commands import POLICY_HELP, Commands, JsonOption
+from trilane.apps.cli.commands import Commands, JsonOption
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console, stdout_kept
 from trilane.apps.cli.main import lazy_group
 from trilane.apps.predict.predict_options import ENCODER_HELP, NORM_HELP
+from trilane.scheduler.policy import POLICY_WORDS
 from trilane.stages.run_options import RUNTIME_HELP, SIZE_HELP, WIDTH_HELP
+from trilane.transport.slots import EDGE_WORDS
 from trilane.units import AVATARS_HELP
 
 #: Bench -> its module, and its line in `trilane bench --help`.
@@ -74,7 +76,7 @@ MEANINGS = {
     "calibration": "Network of the avatar: as-it-is, or quantised again by minmax, percentile or entropy.",
     "channels": "Channels of the neural texture: 4, 8, 12 or 16.",
     "cores": "Cores of the three units together; 0: all that this process may use.",
-    "edge": "Buffers between stages: single, double, triple, fifo:N, orphan or orphan:N.",
+    "edge": f"Buffers between stages: {EDGE_WORDS}.",
     "encoder": ENCODER_HELP,
     "events": "Folder of a run, or its events.jsonl, to be replayed.",
     "frames": "Frames of each run.",
@@ -95,7 +97,7 @@ MEANINGS = {
     "network": "An .onnx file or an avatar, at its own size; if none, one of --encoder, --norm, --width and --size.",
     "norm": NORM_HELP,
     "period": "Seconds for which a runtime runs before the next runtime's turn.",
-    "policy": POLICY_HELP,
+    "policy": f"{POLICY_WORDS}.",
     "rate": "Queries a second of the server scenario.",
     "repeats": "How often each variant runs.",
     "runtime": RUNTIME_HELP,

@@ -28,7 +28,6 @@ from trilane.units import AVATARS_HELP
 OPTIONS = "options_model"
 #: Pydantic's name of a kind of number -> plain name.
 IN_PLAIN_WORDS = {"a valid number": "a number", "a valid integer": "a whole number"}
-POLICY_HELP = "sequential, pipelined, latest or deadline."
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout and nothing else there.")]
 OutFileOption = Annotated[Path, typer.Option("--out", help="File to write.")]
 NewestRunArgument = Annotated[

@@ -26,6 +26,7 @@ from trilane.apps.cli.predict_output import draw, idle_causes, show_answer, show
 from trilane.apps.predict.asked_prediction import answer_of, application_of, predict_networks
 from trilane.apps.predict.predict_options import PredictOptions
 from trilane.errors import BadInputError
+from trilane.hw_profiles.schema import SHARE_TEXT
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -109,7 +110,7 @@ def _digits(value: float) -> str:
     return f"{value:.4g}" if value < 1e4 else f"{value:.0f}"
 
 
-def _span(low: float | None, high: float | None, share: str = ", 80 %") -> str:
+def _span(low: float | None, high: float | None, share: str = f", {SHARE_TEXT}") -> str:
     """Return the interval from `low` to `high` in brackets, with the text `share` after the bounds.
 
     The result is "" if both bounds are equal, or if a bound is None, which means unknown.

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from trilane.apps.cli.console import print_json, print_verdict, stdout_console
+from trilane.hw_profiles.schema import SHARE_TEXT
 from trilane.units import BURST, SUSTAINED
 
 if TYPE_CHECKING:
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
     from trilane.hw_profiles.schema import Profile
 
 MOST_EXPENSIVE = 10
-RANGES = "ranges in brackets hold 80 %"
+RANGES = f"ranges in brackets hold {SHARE_TEXT}"
 AT_RATE = ("holds", "dropped", "W")
 SHOWN = ("bench_gpu_ms", "bench_dsp_ms", "app_gpu_ms", "app_dsp_ms", "confidence")
 
@@ -102,7 +103,7 @@ def _compared_units(answers: list[dict[str, Any]]) -> Table:
     """Return a table with a row for each network on each unit. `answers`: predictions of `predict_network`."""
     from rich.table import Table
 
-    table = Table("network", "unit", "numbers", "ms", "80 %, ms", "a second", "W", "rate")
+    table = Table("network", "unit", "numbers", "ms", f"{SHARE_TEXT}, ms", "a second", "W", "rate")
     for answer in answers:
         table.add_row(
             Path(answer["file"]).name,

@@ -19,6 +19,7 @@ from trilane.apps.cli.commands import Commands, JsonOption
 from trilane.apps.cli.console import print_json, print_line, stderr_console, stdout_console, without_controls
 from trilane.errors import BadInputError
 from trilane.files import read_text
+from trilane.hw_profiles.schema import SHARE_TEXT
 from trilane.writing import WRITABLE, write_bytes
 
 if TYPE_CHECKING:
@@ -282,7 +283,7 @@ def _show_calibrated(result: Calibrated) -> None:
     from rich.table import Table
 
     console = stdout_console()
-    title = "each row predicted from the rows of other networks; 80 % intervals"
+    title = f"each row predicted from the rows of other networks; {SHARE_TEXT} intervals"
     table = Table("network", "unit", "measured, ms", "before, ms", "error", "left out, ms", "error", title=title)
     for each in result.rows:
         table.add_row(*_cells(each))

@@ -10,7 +10,6 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,6 +18,7 @@ import typer
 from trilane.apps.cli.commands import Commands, JsonOption, PortOption, with_options
 from trilane.apps.cli.console import print_json, print_verdict, say, shown_messages, stderr_console, stdout_console
 from trilane.errors import BadInputError
+from trilane.scheduler.stats import NEEDED, PERCENTILES
 from trilane.stages.run_options import RunOptions
 from trilane.units import COMPUTED, MEASURED, NO_FIGURES
 
@@ -161,22 +161,14 @@ def _print_outcome(outcome: RunOutcome, as_json: bool, with_table: bool) -> None
 
 DASH = "–"
 UNSAID = "the report does not say where they come from"
-STATISTICS = ("mean", "p50", "p90", "p95", "p99", "max")
+STATISTICS = ("mean", *PERCENTILES, "max")
 TOO_SHORT = "too short to tell"
 TOO_FEW = " *"
 
 
-@cache
-def needed() -> dict[str, int]:
-    """Return the number of samples that each percentile needs, by the percentile's name: `p90`, `p95` and `p99`."""
-    from trilane.scheduler.stats import samples_needed
-
-    return {name: samples_needed(int(name[1:]) / 100) for name in ("p90", "p95", "p99")}
-
-
 def too_few_note() -> str:
     """Return the explanation of the mark TOO_FEW: how many samples each percentile needs."""
-    return f"{TOO_FEW} of too few frames: " + ", ".join(f"{name} needs {count}" for name, count in needed().items())
+    return f"{TOO_FEW} of too few frames: " + ", ".join(f"{name} needs {count}" for name, count in NEEDED.items())
 
 
 def run_table(report: Report) -> Table:
@@ -221,7 +213,7 @@ def _caption(report: Report) -> str:
     lines.append("in brackets: 95 % interval, by the scatter of this run's frames; two runs may differ by more")
     runs: list[PolicyMetrics] = [report, report.baseline] if report.baseline else [report]
     summaries = [times for run in runs for times in (run.frame_time_ms, run.latency_ms)]
-    if any(_too_few(times, name) for times in summaries for name in needed()):
+    if any(_too_few(times, name) for times in summaries for name in NEEDED):
         lines.append(too_few_note().strip())
     if report.pace:
         lines.append(_pace(report.pace))
@@ -382,7 +374,7 @@ def _too_few(times: TimeSummary, statistic: str) -> bool:
 
     `times`: summary that has the statistic. `statistic`: name of the statistic, such as `p99`.
     """
-    return times.samples is not None and times.samples < needed().get(statistic, 0)
+    return times.samples is not None and times.samples < NEEDED.get(statistic, 0)
 
 
 def _between(low: float | None, high: float | None) -> str:

@@ -38,7 +38,9 @@ from trilane.apps.cli.sweep import (
     text,
     words_text,
 )
+from trilane.apps.sweep.goal_metrics import METRICS
 from trilane.errors import BadInputError, did_you_mean
+from trilane.unexpected_value import either
 from trilane.units import HOST
 
 if TYPE_CHECKING:
@@ -60,8 +62,8 @@ WordsArgument = Annotated[
     list[str],
     typer.Argument(
         metavar="[GOAL] [FILE|COMMAND]",
-        help="GOAL: fps (if not given), frame, p95, p99, latency, power, energy, psnr or worst-psnr, or several with "
-        "commas. After it a sweep file, or a command with its options, as for sweep; run if none, predict with --on.",
+        help=f"GOAL: {either(METRICS)}, or several with commas; fps if not given. "
+        "After it a sweep file, or a command with its options, as for sweep; run if none, predict with --on.",
     ),
 ]
 
@@ -147,7 +149,6 @@ def _goals(words: Sequence[str]) -> tuple[tuple[str, ...], list[str]]:
     goals, nor a sweep file, nor a command.
     """
     from trilane.apps.sweep.definition import COMMANDS
-    from trilane.apps.sweep.tuner import METRICS
 
     first = words[0]
     goals = tuple(dict.fromkeys(first.split(",")))
@@ -340,8 +341,6 @@ def _print_frontier(document: Mapping[str, Any], axes: Sequence[str]) -> None:
 
 def _unit(name: str) -> str:
     """Return the unit of measure of the figure `name`; "" for a figure without a unit, or if `name` is the unit."""
-    from trilane.apps.sweep.tuner import METRICS
-
     return METRICS[name].unit if name in METRICS and METRICS[name].unit != name else ""
 
 

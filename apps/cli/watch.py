@@ -21,8 +21,9 @@ import typer
 
 from trilane.apps.cli.commands import Commands, NewestRunArgument, PortOption
 from trilane.apps.cli.console import print_json, say, spinner, stdout_console, verdict_text
-from trilane.apps.cli.run import DASH, TOO_FEW, accuracy_line, needed, too_few_note
+from trilane.apps.cli.run import DASH, TOO_FEW, accuracy_line, too_few_note
 from trilane.errors import BadInputError, MissingPartError
+from trilane.scheduler.stats import NEEDED, PERCENTILES
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -193,7 +194,7 @@ ENDINGS = {
     "removed": "removed: it ended before any frame, and its folder is gone",
 }
 NO_VERDICT = "no verdict: fewer than two frames were presented"
-PERCENTILES = ("p50", "p90", "p95", "p99")
+IN_LINES = ("p50", "p95", "p99")
 MIB = 1 << 20
 
 
@@ -250,9 +251,10 @@ def heading(look: RunLook) -> str:
     The heading states the run's name and state, how the figures are computed, and each avatar's image error.
     """
     from trilane.apps.watch.followed_run import RunState
+    from trilane.apps.watch.live_figures import WINDOW
 
-    of_fps = "between the first frame and the last" if look.state is RunState.FINISHED else "of the last 5 s"
-    how = f"fps {of_fps}, p50 / p95 / p99 of the last 5 s;{too_few_note()}"
+    of_fps = "between the first frame and the last" if look.state is RunState.FINISHED else f"of the {WINDOW}"
+    how = f"fps {of_fps}, {' / '.join(IN_LINES)} of the {WINDOW};{too_few_note()}"
     return "\n".join([f"run {look.name}: {look.state}; {how}", *errors(look.figures), _sources(look.figures)])
 
 
@@ -331,7 +333,9 @@ def _doing(unit: UnitFigures, state: str) -> str:
 
 
 def _times(figures: MomentFigures) -> Table:
-    table = _table("of the last 5 s, ms", "mean", *PERCENTILES, "max", "samples")
+    from trilane.apps.watch.live_figures import WINDOW
+
+    table = _table(f"of the {WINDOW}, ms", "mean", *PERCENTILES, "max", "samples")
     for name, times in (("frame time", figures.frame_time_ms), ("latency", figures.latency_ms)):
         values = [_time(times, key) for key in ("mean", *PERCENTILES, "max")]
         _add_row(table, name, *values, f"{times['samples']:.0f}")
@@ -339,7 +343,7 @@ def _times(figures: MomentFigures) -> Table:
 
 
 def _three(times: Mapping[str, float]) -> str:
-    return " / ".join(_time(times, key) for key in ("p50", "p95", "p99")) + " ms"
+    return " / ".join(_time(times, key) for key in IN_LINES) + " ms"
 
 
 def _time(times: Mapping[str, float], key: str) -> str:
@@ -349,7 +353,7 @@ def _time(times: Mapping[str, float], key: str) -> str:
     """
     if not times["samples"]:
         return DASH
-    return f"{times[key]:.1f}{TOO_FEW if times['samples'] < needed().get(key, 0) else ''}"
+    return f"{times[key]:.1f}{TOO_FEW if times['samples'] < NEEDED.get(key, 0) else ''}"
 
 
 def _stages(figures: MomentFigures) -> Table:

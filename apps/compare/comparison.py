@@ -38,6 +38,7 @@ from trilane.apps.explain.reasons import bound_text
 from trilane.apps.run.verdict import trust_of
 from trilane.errors import BadInputError
 from trilane.scheduler.ledger import CAUSES
+from trilane.scheduler.policy import POLICIES
 
 SCHEMA: Final = 1
 METHOD: Final = (
@@ -56,12 +57,7 @@ MOST_NAMED: Final = 4
 NOT_EXPLAINED: Final = "no stage, unit or setting alone explains it; the cores may have another speed"
 WITHOUT_FRACTION: Final = 999.5
 #: A setting and its new value -> how the verdict explains a difference by it.
-REASONS: Final = {
-    ("policy", "sequential"): "one frame at a time under sequential",
-    ("policy", "pipelined"): "several frames at a time under pipelined",
-    ("policy", "latest"): "the newest pose wins under latest",
-    ("policy", "deadline"): "late frames are dropped under deadline",
-}
+REASONS: Final = {("policy", name): f"{policy.told} under {name}" for name, policy in POLICIES.items()}
 WAITS: Final = {cause.name: cause.told for cause in CAUSES}
 DASH: Final = "–"
 IN_THOUSANDS: Final = 10_000

@@ -23,7 +23,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from trilane.arrays import F64, I64, Ints
-from trilane.scheduler.stats import student_quantile, student_tails
+from trilane.scheduler.stats import PERCENTILES, student_quantile, student_tails
 
 LEAST_FRAMES: Final = 50
 MOST_FRAMES: Final = 20_000
@@ -148,14 +148,14 @@ def _quantile(share: float) -> Reduce:
     return lambda values, _: float(np.quantile(values, share))
 
 
+#: Names of the percentiles that comparisons have.
+COMPARED: Final = ("p50", "p90", "p99")
 #: Statistic -> function that computes it.
 STATISTICS: Final[dict[str, Reduce]] = {
     "mean": _mean,
     "share": _mean,
     "typical": _typical,
-    "p50": _quantile(0.5),
-    "p90": _quantile(0.9),
-    "p99": _quantile(0.99),
+    **{name: _quantile(PERCENTILES[name]) for name in COMPARED},
 }
 
 
@@ -290,8 +290,7 @@ def _least_frames(statistic: str) -> int:
     For a percentile, each stretch needs on average one frame beyond the percentile. Without such frames, the jackknife
     sees no scatter.
     """
-    share = int(statistic[1:]) / 100 if statistic in ("p50", "p90", "p99") else 0.5
-    return max(LEAST_FRAMES, ceil(STRETCHES / (1 - share)))
+    return max(LEAST_FRAMES, ceil(STRETCHES / (1 - PERCENTILES.get(statistic, 0.5))))
 
 
 def _average(values: Sequence[float]) -> float:

@@ -37,6 +37,7 @@ from trilane.apps.compare.difference import Difference
 from trilane.apps.compare.frontier import SAME_DB, frontier, knees
 from trilane.apps.compare.overview import Entry, columns, table_rows, told_choices
 from trilane.apps.compare.rows import Figure
+from trilane.hw_profiles.schema import SHARE_TEXT
 
 UNITS = {"frame_ms": "frame, ms", "low_ms": "from, ms", "high_ms": "to, ms", "latency_ms": "latency, ms"}
 UNITS |= {"psnr_db": "PSNR, dB", "worst_psnr_db": "worst frame, dB", "p1_psnr_db": "1st percentile, dB"}
@@ -47,13 +48,13 @@ SHARES = ("other_programs",)
 LETTER, BESIDE = 7, 12  # width of a name's letter, and distance of a name from its dot, pixels
 MEANING = (
     "Frame time is the mean between presented frames, from and to its interval: of a run 95 %, by the scatter of its "
-    "own frames; of a prediction 80 %, by the model. PSNR says how near the picture is to the truth; larger is better. "
-    "It is a mean over frames; the worst frame and the 1st percentile beside it tell what the mean hides. The frontier "
-    "holds what nobody beats in both on the same clock and machine, with the same scene and the same kind of error. "
-    f"Pictures within {SAME_DB} dB count as equal, and so do times whose intervals meet. An entry without a known "
-    "error is in the table and on no frontier. After the knee more time buys little picture. The verdict says whether "
-    "an entry holds its rate, the bound what limits it; UNSURE is a run beside other programs, on a hot or changing "
-    "processor, or a prediction whose interval holds the rate."
+    f"own frames; of a prediction {SHARE_TEXT}, by the model. PSNR says how near the picture is to the truth; larger "
+    "is better. It is a mean over frames; the worst frame and the 1st percentile beside it tell what the mean hides. "
+    "The frontier holds what nobody beats in both on the same clock and machine, with the same scene and the same kind "
+    f"of error. Pictures within {SAME_DB} dB count as equal, and so do times whose intervals meet. An entry without a "
+    "known error is in the table and on no frontier. After the knee more time buys little picture. The verdict says "
+    "whether an entry holds its rate, the bound what limits it; UNSURE is a run beside other programs, on a hot or "
+    "changing processor, or a prediction whose interval holds the rate."
 )
 WIDTH, HEIGHT = 720, 400
 LEFT, RIGHT, TOP, BOTTOM = 64, 16, 16, 48

@@ -18,6 +18,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 
 from trilane.apps.compare.difference import (
+    COMPARED,
     MATTERS,
     Chance,
     Difference,
@@ -29,7 +30,7 @@ from trilane.apps.compare.difference import (
 from trilane.apps.compare.run_frames import CPU, INSTRUCTION_TIME, INSTRUCTIONS, Key
 from trilane.apps.compare.sides import ComparedRun, RunKind, Side, changes
 from trilane.apps.run.verdict import MOST_OTHERS
-from trilane.hw_profiles.schema import NORMAL_80
+from trilane.hw_profiles.schema import SIGMAS
 from trilane.scheduler.stats import student_quantile
 from trilane.units import HOST_CLOCK
 
@@ -40,8 +41,8 @@ LOST, DROPPED, ERROR = "lost", "dropped", "error"
 MS, NS, SHARE, BYTES = "ms", "ns", "share", "bytes"
 #: Measure -> its statistics, for runs with a journal.
 MEASURES: Final = {
-    FRAME_TIME: ("mean", "p50", "p90", "p99"),
-    LATENCY: ("mean", "p50", "p90", "p99"),
+    FRAME_TIME: ("mean", *COMPARED),
+    LATENCY: ("mean", *COMPARED),
     INSTRUCTIONS: ("mean",),
     INSTRUCTION_TIME: ("typical",),
     CPU: ("mean", "typical"),
@@ -229,7 +230,7 @@ def _deviation_of(told: ComparedRun) -> float | None:
         return deviation
     times = told.document["frame_time_ms"]
     low, high, quantile = (
-        (times["low"], times["high"], NORMAL_80)
+        (times["low"], times["high"], SIGMAS)
         if told.kind is RunKind.PREDICTION
         else (times.get("mean_low"), times.get("mean_high"), student_quantile(inf))
     )

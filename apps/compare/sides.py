@@ -24,7 +24,7 @@ from typing import Annotated, Any, Final, NamedTuple
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import from_json, to_json
 
-from trilane.apps.compare.difference import STATISTICS
+from trilane.apps.compare.difference import COMPARED, STATISTICS
 from trilane.apps.compare.run_frames import Key, RunFrames, read_frames
 from trilane.apps.run.report import MAX_REPORT_BYTES, read_report
 from trilane.apps.watch.followed_run import FollowedRun, RunState, folder_of
@@ -266,7 +266,7 @@ def _times(frames: RunFrames, key: Key) -> dict[str, float]:
     series = frames.series[key]
     if not len(series.values):
         return {}
-    return {name: float(STATISTICS[name](series.values, series.weights)) for name in ("mean", "p50", "p90", "p99")}
+    return {name: float(STATISTICS[name](series.values, series.weights)) for name in ("mean", *COMPARED)}
 
 
 def _unit(frames: RunFrames, unit: str, config: Mapping[str, Any]) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from trilane.bench.lib.interleaved_processes import ProcessVariant, runners
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host_model import NETWORK
 from trilane.hw_profiles.profile_files import load_runnable
-from trilane.hw_profiles.schema import NORMAL_80
+from trilane.hw_profiles.schema import SIGMAS
 from trilane.stages.configure import requested_runtime
 from trilane.stages.run_options import RunOptions
 from trilane.units import HOST
@@ -135,7 +135,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "of": len(rows),
         "median_error": median(abs(row["error"]) for row in rows),
         "leave_one_out_error": math.sqrt(sum(squares) / len(squares)),
-        "inside_left_out": sum(one <= NORMAL_80**2 * other for one, other in zip(squares, left_out, strict=True)),
+        "inside_left_out": sum(one <= SIGMAS**2 * other for one, other in zip(squares, left_out, strict=True)),
     }
 
 

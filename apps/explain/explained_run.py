@@ -11,8 +11,9 @@ import csv
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, get_type_hints
 
 from trilane.apps.explain.reasons import MOST_SAMPLES, ShownFrame, SlowFrames, Usual, advice, notes, reasons
 from trilane.apps.run.report import Report, read_report
@@ -27,6 +28,7 @@ from trilane.pipeline.timeline import ExplainedJob, Gone, Presented, Timeline
 from trilane.pipeline.tracks import UNKNOWN
 from trilane.pipeline.unit_history import PREEMPTED
 from trilane.scheduler.events import Graph
+from trilane.scheduler.ledger import JobRecord
 from trilane.units import COMPUTED, HOST_CLOCK, MEASURED, NS_PER_MS
 from trilane.writing import write_atomically
 
@@ -35,16 +37,10 @@ GOES_ON = "the run still goes on: the figures cover its frames so far"
 #: Column -> its type, and its value for a job. Times are ns of the run's clock, durations ns; docs/explain.md explains
 #: each column.
 COLUMNS: dict[str, tuple[type, Callable[[ExplainedJob], Any]]] = {
-    "frame": (int, lambda one: one.job.frame),
-    "stage": (str, lambda one: one.job.stage),
-    "unit": (str, lambda one: one.job.unit),
-    "ready_ns": (int, lambda one: one.job.ready_ns),
-    "dispatch_ns": (int, lambda one: one.job.dispatch_ns),
-    "begin_ns": (int, lambda one: one.job.begin_ns),
-    "end_ns": (int, lambda one: one.job.end_ns),
-    "preempted_ns": (int, lambda one: one.job.preempted_ns),
-    "asleep_ns": (int, lambda one: one.job.asleep_ns),
-    "preempted_before_ns": (int, lambda one: one.job.preempted_before_ns),
+    **{
+        name: (get_type_hints(JobRecord)[name], attrgetter(f"job.{name}"))
+        for name in dict.fromkeys(("frame", *JobRecord._fields))
+    },
     "wait_ns": (int, lambda one: one.job.begin_ns - one.job.ready_ns),
     "wait_cause": (str, lambda one: one.cause),
     "wait_cause_ns": (int, lambda one: one.waits_ns.get(one.cause, 0)),

@@ -15,10 +15,10 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from trilane.errors import BadInputError
 from trilane.options import Finite, Name, OnePath, Option, Options, Text, Texts, one_of, paths_of
-from trilane.scheduler.policy import MOST_FRAMES, POLICIES
+from trilane.scheduler.policy import MOST_FRAMES, PACED_WORDS, POLICIES, POLICY_WORDS
 from trilane.stages.run_options import PROFILE_HELP
-from trilane.transport.slots import DEFAULT_EDGE
-from trilane.unexpected_value import UnexpectedValue
+from trilane.transport.slots import DEFAULT_EDGE, EDGE_WORDS
+from trilane.unexpected_value import UnexpectedValue, either
 from trilane.units import AVATARS_HELP, BURST, HOST, MAX_MINUTES, PERFORMANCE_PROFILES, SUSTAINED, UNITS, UnitName
 
 if TYPE_CHECKING:
@@ -193,17 +193,17 @@ class PredictOptions(Options):
     )
     policy: Annotated[str | None, one_of("reference", *POLICIES), Option(synonyms=("--pipelining",))] = Field(
         default=None,
-        description="pipelined (if not given, as in a run), sequential, latest or deadline. Or reference: the policy "
+        description=f"{POLICY_WORDS}; pipelined if not given, as in a run. Or reference: the policy "
         "of the published application, and the default with --encoder, --norm, --size or --channels.",
     )
     edge: str | None = Field(
-        default=None, description="Buffers between stages: single, double (if not given), triple, fifo:N, orphan."
+        default=None, description=f"Buffers between stages: {EDGE_WORDS}; {DEFAULT_EDGE} if not given."
     )
     batch: int = Field(default=1, description="Frames in one job of the network.")
     fps: Annotated[float | None, AfterValidator(_rate)] = Field(
         default=None,
-        description="Frame rate to judge: whether the chip holds this rate, and at which power. If not given, latest "
-        "and deadline use 30.",
+        description="Frame rate to judge: whether the chip holds this rate, and at which power. If not given, "
+        f"{PACED_WORDS} use 30.",
     )
     power_limit_w: Annotated[float | None, AfterValidator(_watts)] = Field(
         default=None, description="Also predict the highest rate at which the device stays within this many watts."
@@ -285,7 +285,7 @@ class PredictOptions(Options):
             if unit == self.unit:
                 return unit
         words = (*units, ALL_UNITS) if self.is_bare else units
-        raise BadInputError("--unit", repr(self.unit), " or ".join(", ".join(words).rsplit(", ", 1)))
+        raise BadInputError("--unit", repr(self.unit), either(words))
 
     @property
     def wanted(self) -> Wanted:

@@ -13,7 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-from trilane.scheduler.stats import samples_needed
+from trilane.scheduler.stats import NEEDED
 from trilane.units import HOST_CLOCK
 
 #: Share of the cores' time. If other programs take more, the run is not trusted, and a comparison names it.
@@ -379,8 +379,8 @@ def slow_percentile(times: Mapping[str, Any]) -> tuple[str, float] | None:
     `times`: percentiles, `max` and `samples` of a frame time or a latency, as in the report.
     """
     samples = times.get("samples")
-    for name in ("p99", "p95", "p90"):
-        if times.get(name) is not None and (samples is None or samples >= samples_needed(int(name[1:]) / 100)):
+    for name, least in reversed(NEEDED.items()):
+        if times.get(name) is not None and (samples is None or samples >= least):
             return name, times[name]
     return ("max", times["max"]) if times.get("max") is not None else None
 

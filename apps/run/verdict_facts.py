@@ -30,6 +30,7 @@ from trilane.apps.run.verdict import (
     trust_of,
 )
 from trilane.hw_profiles.rates import wanted_drops
+from trilane.hw_profiles.schema import SHARE_TEXT
 from trilane.scheduler.policy import POLICIES, works_on_one_frame
 from trilane.units import NO_FIGURES, TARGET_FPS
 
@@ -248,7 +249,7 @@ def predicted_verdict(answer: Mapping[str, Any], of_run: Trust | None = None) ->
     is_own = "cycle" in answer or answer.get("kind") == "pipeline"  # a pipeline file by itself, or beside others
     return judged(
         Facts(
-            Rate(1e3 / times["mean"] if times["mean"] else inf, least, most, "80 %"),
+            Rate(1e3 / times["mean"] if times["mean"] else inf, least, most, SHARE_TEXT),
             target,
             _predicted_lateness(answer),
             _resting_on(of_run, _trust_in(least, most, target, is_held=_is_held_by_display(answer))),
@@ -290,11 +291,12 @@ def _needed(answer: Mapping[str, Any]) -> dict[str, Any]:
 def _trust_in(low: float | None, high: float | None, target: float, *, is_held: bool) -> Trust:
     if low is None or high is None:
         return Trust(False, ("computed, with an unknown error",))
+    interval = f"{SHARE_TEXT} interval"
     if low < target <= high:
-        return Trust(False, (f"computed, and the 80 % interval of {low:.0f} to {high:.0f} fps holds the target",))
+        return Trust(False, (f"computed, and the {interval} of {low:.0f} to {high:.0f} fps holds the target",))
     if low < high:
-        return Trust(True, ("computed, and the whole 80 % interval is on one side of the target",))
-    why = "the display holds the rate over the whole 80 % interval" if is_held else "the times have no interval"
+        return Trust(True, (f"computed, and the whole {interval} is on one side of the target",))
+    why = f"the display holds the rate over the whole {interval}" if is_held else "the times have no interval"
     return Trust(True, (f"computed; {why}",))
 
 

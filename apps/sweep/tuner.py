@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 from trilane.apps.compare.overview import entry_of
 from trilane.apps.sweep.definition import Definition, Options, SweepKind, Trial, Value, trials_of
+from trilane.apps.sweep.goal_metrics import METRICS
 from trilane.apps.sweep.store import Record, row_of
 from trilane.errors import BadInputError, MissingPartError, did_you_mean
 
@@ -35,31 +36,6 @@ FRAMES = "frames"
 KEEP = re.compile(r"\s*([A-Za-z][\w.-]*)\s*(<=|>=|<|>)\s*([-+]?[\d.]+(?:e[-+]?\d+)?)\s*([A-Za-z]*)\s*", re.IGNORECASE)
 #: Function that does those trials that have not ended, and returns the records of all by name.
 Do = Callable[[Sequence[Trial]], Mapping[str, Record]]
-
-
-class GoalMetric(NamedTuple):
-    """A figure of a result that can be a goal or have a limit.
-
-    `unit`: unit of the figure. `more_is_better`: whether larger values are better. `path`: keys that lead to the figure
-    in the `--json` document; empty for the PSNR, which `entry_of` finds.
-    """
-
-    unit: str
-    more_is_better: bool
-    path: tuple[str, ...]
-
-
-METRICS = {
-    "fps": GoalMetric("fps", True, ("fps",)),
-    "frame": GoalMetric("ms", False, ("frame_time_ms", "mean")),
-    "p95": GoalMetric("ms", False, ("frame_time_ms", "p95")),
-    "p99": GoalMetric("ms", False, ("frame_time_ms", "p99")),
-    "latency": GoalMetric("ms", False, ("latency_ms", "mean")),
-    "power": GoalMetric("W", False, ("power_w",)),
-    "energy": GoalMetric("mJ", False, ("energy_mj_per_frame",)),
-    "psnr": GoalMetric("dB", True, ()),
-    "worst-psnr": GoalMetric("dB", True, ("check", "worst_psnr_db")),
-}
 #: Figures that the frontier weighs beside those asked for, if every trial has them.
 WEIGHED = ("psnr", "power")
 

@@ -18,7 +18,7 @@ from prometheus_client.openmetrics.exposition import CONTENT_TYPE_LATEST, genera
 
 from trilane.apps.watch.figures import Histogram, MomentFigures
 from trilane.apps.watch.followed_run import RunState
-from trilane.apps.watch.live_figures import LEAST, LEAST_KEY
+from trilane.apps.watch.live_figures import LEAST, LEAST_KEY, WINDOW
 
 CONTENT_TYPE: Final[str] = CONTENT_TYPE_LATEST
 #: Values of the labels of a row, and its value.
@@ -220,7 +220,7 @@ GAUGES = (
     Metric(
         "trilane_unit_busy_ratio",
         "ratio",
-        "Share of the last 5 s in which a job ran.",
+        f"Share of the {WINDOW} in which a job ran.",
         ("unit",),
         lambda f: [((name,), unit.window.busy) for name, unit in f.units.items()],
         "units",
@@ -228,7 +228,7 @@ GAUGES = (
     Metric(
         "trilane_unit_idle_ratio",
         "ratio",
-        "Share of the last 5 s in which none ran, by cause.",
+        f"Share of the {WINDOW} in which none ran, by cause.",
         ("unit", "cause"),
         _idle,
         "units",

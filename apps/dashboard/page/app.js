@@ -7,6 +7,7 @@ import { listen } from "./keys.js";
 import {
   buildLegend,
   Notes,
+  PERCENTILES,
   showDrops,
   showFacts,
   showSources,
@@ -28,7 +29,6 @@ import { Timeline } from "./timeline.js";
 const FEW_CORES = 4;
 const DRAW_EVERY_MS = navigator.hardwareConcurrency > FEW_CORES ? 0 : 30;
 const NOTE_EVERY_MS = 250;
-const PERCENTILES = ["p50", "p90", "p95", "p99"];
 const STATES = {
   running: "running",
   paused: "paused",

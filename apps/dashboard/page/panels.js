@@ -3,6 +3,7 @@
 import { CAUSES, CAUSE_MEANINGS } from "./slices.js";
 import { byId, bytes, clock, DASH, element, isNumber, ms, number, percent, setRows, setText, short, words } from "./text.js";
 
+export const PERCENTILES = ["p50", "p90", "p95", "p99"];
 const MOST_NOTES = 200;
 const BYTES = ["read", "written", "uploaded", "read_back", "least"];
 const LONG_TEXT = 24;
@@ -38,9 +39,10 @@ export function showSpeed(figures, accuracy) {
     ["latency_ms", "latency"],
   ]) {
     const times = figures[key]?.samples ? figures[key] : {};
-    setText(byId(id), ms(times.p50));
-    const rest = ["p90", "p95", "p99"].map((name) => `${name} ${short(times[name])}`).join(" · ");
-    setText(byId(`${id}-rest`), `p50; ${rest} ms, of ${number(times.samples, 0)}`);
+    const [first, ...others] = PERCENTILES;
+    setText(byId(id), ms(times[first]));
+    const rest = others.map((name) => `${name} ${short(times[name])}`).join(" · ");
+    setText(byId(`${id}-rest`), `${first}; ${rest} ms, of ${number(times.samples, 0)}`);
   }
   setText(byId("run-time"), isNumber(figures.run_s) ? `in ${clock(1000 * figures.run_s)} of the run` : "");
   byId("run-time").dataset.seconds = figures.run_s;

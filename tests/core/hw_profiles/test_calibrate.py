@@ -38,7 +38,7 @@ from trilane.hw_profiles.fit_engines import WORK, read_latencies
 from trilane.hw_profiles.network_time import Interval, interval, price, spread_of
 from trilane.hw_profiles.profile_files import load_profile, load_tables, parse_profile
 from trilane.hw_profiles.reference_networks import NetworkSpec, network_work
-from trilane.hw_profiles.schema import KEY_OF_RATE, MOST_ERROR_SCALE, NORMAL_80, Profile, corners_of
+from trilane.hw_profiles.schema import KEY_OF_RATE, MOST_ERROR_SCALE, SIGMAS, Profile, corners_of
 from trilane.units import BURST, UnitName
 
 Command = Callable[..., tuple[str, str]]
@@ -172,8 +172,8 @@ def test_a_unit_without_an_engine_has_one_factor() -> None:
 def test_the_scale_of_the_error_by_hand() -> None:
     """Without misses t has one degree of freedom, so its quantile is tan(0.4 pi). Misses of 2 and -1: the variance is
     (1 + 4 + 1) / 3, and t of three degrees is within 1.6377 with 80 % (tables of Student's t)."""
-    assert error_scale([]) == pytest.approx(np.tan(0.4 * np.pi) / NORMAL_80)
-    assert error_scale([2, -1]) == pytest.approx(1.6377 * np.sqrt(2) / NORMAL_80, rel=1e-4)
+    assert error_scale([]) == pytest.approx(np.tan(0.4 * np.pi) / SIGMAS)
+    assert error_scale([2, -1]) == pytest.approx(1.6377 * np.sqrt(2) / SIGMAS, rel=1e-4)
     assert error_scale([1.0] * 1000) == pytest.approx(1, rel=2e-3)
     assert error_scale([1e6, 1e6]) == MOST_ERROR_SCALE
 
@@ -188,7 +188,7 @@ def test_intervals_of_chips_of_the_stated_model_hold_in_80_of_100(rows: int) -> 
     told, new = rng.standard_normal((rows, chips)) * deviations, rng.standard_normal(chips) * deviations
     scales = np.array([error_scale(list(each)) for each in told.T])
     free = scales < MOST_ERROR_SCALE
-    inside = np.abs(new[free]) <= NORMAL_80 * scales[free]
+    inside = np.abs(new[free]) <= SIGMAS * scales[free]
     assert free.mean() > 0.8
     assert abs(inside.mean() - 0.8) < 4 * np.sqrt(0.16 / free.sum())
 
@@ -198,16 +198,16 @@ def around(low: float, high: float) -> Interval:
 
 
 def test_misses_are_those_of_other_rows_of_the_unit() -> None:
-    """Twice as long as predicted, and the interval ends at twice the prediction: NORMAL_80 stated errors."""
+    """Twice as long as predicted, and the interval ends at twice the prediction: SIGMAS stated errors."""
     two = CheckedRow(row("resnet18", 4.0), 1.0, around(1, 1), 2.0, around(1, 4))
     same = CheckedRow(row("resnet18-128", 2.0), 1.0, around(1, 1), 2.0, around(1, 4))
     lonely = CheckedRow(row("resnet18", 9.0, unit="gpu"), 1.0, around(1, 1), 2.0, around(1, 4))
     left_out = [two, same, lonely]
-    assert misses(left_out, "dsp") == pytest.approx([NORMAL_80, 0])
+    assert misses(left_out, "dsp") == pytest.approx([SIGMAS, 0])
     assert misses(left_out, two) == [0]
-    assert misses(left_out, same) == pytest.approx([NORMAL_80])
+    assert misses(left_out, same) == pytest.approx([SIGMAS])
     assert misses(left_out, "gpu") == [] == misses(left_out, lonely)
-    assert misses([two, two, same], "dsp") == pytest.approx([NORMAL_80, 0])
+    assert misses([two, two, same], "dsp") == pytest.approx([SIGMAS, 0])
     assert misses([two, two], "dsp") == []
 
 

@@ -40,7 +40,7 @@ from trilane.hw_profiles.fit_engines import (
     read_latencies,
 )
 from trilane.hw_profiles.operators import NAMES, RATES, TERMS
-from trilane.hw_profiles.schema import NORMAL_80, EngineName
+from trilane.hw_profiles.schema import SIGMAS, EngineName
 
 KEYS = ("arithmetic_tmac_s", "activation_gb_s", "spill_gb_s", "weight_gb_s", "operator_us", "job_us")
 COLUMNS = "network,chip,hexagon,precision,runtime,ms,caution,use"
@@ -194,7 +194,7 @@ def test_how_many_rows_lie_in_their_intervals() -> None:
     assert EngineStudy(fitted, tuple(rows), 0.099).coverage == pytest.approx(1 / 3)
     halfway = tuple(row._replace(unlike=0.5) for row in rows)
     assert EngineStudy(fitted, halfway, 0.2).coverage == pytest.approx(2 / 3)
-    assert NORMAL_80 == 1.2816
+    assert SIGMAS == 1.2816
 
 
 def made_study(engines: Sequence[EngineName] = ("int8_tflite", "fp16_tflite")) -> Study:

@@ -50,7 +50,7 @@ from trilane.hw_profiles.network_work import count_work
 from trilane.hw_profiles.operators import INDEX, NAMES, RATES, Layers
 from trilane.hw_profiles.profile_files import load_profile, profile_folder
 from trilane.hw_profiles.reference_networks import NetworkSpec, network_work
-from trilane.hw_profiles.schema import NORMAL_80, corners_of
+from trilane.hw_profiles.schema import SIGMAS, corners_of
 from trilane.hw_profiles.unit_times import nearest
 
 SPECS = {
@@ -162,7 +162,7 @@ def left_out(error: float, unsure: float) -> LeftOut:
 def test_the_models_own_error_makes_intervals_cover_four_fifths() -> None:
     """Errors of 1 to 10 hundredths without any doubt about numbers: the interval ends between the eighth and ninth."""
     rows = [left_out(sign * k / 100, 0.0) for k, sign in zip(range(1, 11), [1, -1] * 5, strict=True)]
-    assert 0.08 <= NORMAL_80 * own_error(rows) <= 0.09
+    assert 0.08 <= SIGMAS * own_error(rows) <= 0.09
     assert own_error([left_out(0.05, 1.0)] * 3) == 0, "doubt about numbers covers them"
     halfway = [row._replace(unlike=0.5) for row in rows]
     assert own_error(halfway) == pytest.approx(2 * own_error(rows)), "it is that of a network wholly unlike"

@@ -208,6 +208,7 @@ def test_jobs_as_csv_are_those_of_the_run(folder: Path, command: Command) -> Non
     for row in rows:
         assert int(row["wait_ns"]) == int(row["begin_ns"]) - int(row["ready_ns"]) >= int(row["wait_cause_ns"])
         assert (row["wait_cause"] == "") == (row["wait_ns"] == "0")
+        assert int(row["cpu_ns"]) == int(row["end_ns"]) - int(row["begin_ns"])
     busy = [row for row in rows if row["wait_cause"] == "busy"]
     assert busy
     assert all(row["behind_stage"] for row in busy)
