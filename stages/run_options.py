@@ -16,7 +16,7 @@ from trilane.options import NOTHING, Finite, Name, OnePath, Option, Options, Tex
 from trilane.scheduler.policy import POLICIES
 from trilane.transport.slots import DEFAULT_EDGE, EDGES, RULES, edge_rule
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import AVATARS_HELP, PERFORMANCE_PROFILES
+from trilane.units import AVATARS_HELP, PERFORMANCE_PROFILES, ROOM
 
 PROFILE_HELP: Final = "Hardware profile: a name or a TOML file."
 RUNTIME_HELP: Final = "auto, ort, openvino, qnn or cuda; auto is the fastest installed one."
@@ -93,7 +93,9 @@ class RunOptions(Options):
     )
     motion: Name | None = Field(default=None, description="Motion: .bvh, .npz, .npy, .pkl, or builtin:NAME.")
     camera: Name | None = Field(default=None, description="Camera: ARKit log, TUM, transforms.json, or builtin:NAME.")
-    background: Name | None = Field(default=None, description="Background: room, or a video, image folder or picture.")
+    background: Name | None = Field(
+        default=None, description=f"Background: {ROOM}, or a video, image folder or picture."
+    )
     avatar: Annotated[Name | None, Option(offered=())] = Field(default=None, description=AVATARS_HELP)
     width: int | None = Field(
         default=None, ge=1, le=256, description=f"{WIDTH_HELP} A width other than the avatar's is untrained."

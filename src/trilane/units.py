@@ -21,6 +21,9 @@ AVATARS: tuple[AvatarName, ...] = get_args(AvatarName)
 #: Help text for an option that names an avatar.
 AVATARS_HELP = f"{', '.join(f'`{name}`' for name in AVATARS)}, or the folder of an avatar."
 
+#: Name of the background that is drawn, and no file.
+ROOM = "room"
+
 UnitName = Literal["cpu", "gpu", "dsp"]
 UNITS: tuple[UnitName, ...] = get_args(UnitName)
 
