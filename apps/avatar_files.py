@@ -49,6 +49,7 @@ from trilane.stages.avatar_assets import distinct, with_network
 from trilane.stages.configure import Checked
 from trilane.stages.run_options import METHOD, VIEWS, RunOptions, calibration_of
 from trilane.training.clothing import KEY as LOOK
+from trilane.units import CHANNELS, either
 
 if TYPE_CHECKING:
     from trilane.training.quantising.quantise import Quantised
@@ -197,11 +198,9 @@ def _drawable(network: NetworkFile) -> NetworkFile:
 
     Raises BadInputError for any other network.
     """
-    from trilane.stages.gpu.raster import CHANNELS
-
     check_integer_layers(network)
     if network.channels not in CHANNELS:
-        expected = f"{', '.join(map(str, CHANNELS[:-1]))} or {CHANNELS[-1]}, which the GPU packs"
+        expected = f"{either(CHANNELS)}, which the GPU packs"
         raise BadInputError(network.where, f"an input of {network.channels} channels", expected, "pad with zeros")
     output = network.output
     if output.zero_point != 0 or not np.isclose(output.scale, PICTURE_SCALE, rtol=1e-5):

@@ -35,6 +35,7 @@ from trilane.unet_tables import (
     squeeze_channels,
 )
 from trilane.unexpected_value import UnexpectedValue
+from trilane.units import MAX_CHANNELS
 
 LAYOUTS = ("packed", "split")
 CHANNELS_PER_PASS = 4
@@ -54,7 +55,7 @@ class NetworkSpec:
     `encoder`: one of ENCODERS.
     `norm`: one of NORMS.
     `height`, `width`: size of the input in pixels, multiples of 32 up to MAX_SIDE.
-    `channels`: channels of the rasterised texture, 1 to 16.
+    `channels`: channels of the rasterised texture, 1 to MAX_CHANNELS.
     `layout`: one of LAYOUTS.
 
     Raises BadInputError for another value.
@@ -74,8 +75,8 @@ class NetworkSpec:
         for name, side in (("height", self.height), ("width", self.width)):
             if side % 32 or not 32 <= side <= MAX_SIDE:
                 raise BadInputError("size", f"{name} {side}", f"a multiple of 32 from 32 to {MAX_SIDE}")
-        if not 1 <= self.channels <= 16:
-            raise BadInputError("channels", str(self.channels), "1 to 16")
+        if not 1 <= self.channels <= MAX_CHANNELS:
+            raise BadInputError("channels", str(self.channels), f"1 to {MAX_CHANNELS}")
 
     @property
     def pixels(self) -> int:
@@ -225,7 +226,7 @@ def spec_of(cells: dict[str, str], place: str) -> NetworkSpec:
         raise BadInputError(f"{place}: size", repr(size), "a side such as 512, or HEIGHTxWIDTH") from None
     channels = cells["channels"]
     if not channels.isdecimal() or len(channels) > 4:
-        raise BadInputError(f"{place}: channels", repr(channels), "1 to 16")
+        raise BadInputError(f"{place}: channels", repr(channels), f"1 to {MAX_CHANNELS}")
     try:
         return NetworkSpec(cells["encoder"], cells["norm"], height, width, int(channels), cells["layout"])
     except BadInputError as error:

@@ -16,11 +16,12 @@ from trilane.options import NOTHING, Finite, Name, OnePath, Option, Options, Tex
 from trilane.scheduler.policy import POLICIES
 from trilane.transport.slots import DEFAULT_EDGE, EDGES, RULES, edge_rule
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import AVATARS_HELP, PERFORMANCE_PROFILES, ROOM
+from trilane.units import AVATARS_HELP, CHANNELS, PERFORMANCE_PROFILES, ROOM, either
 
 PROFILE_HELP: Final = "Hardware profile: a name or a TOML file."
 RUNTIME_HELP: Final = "auto, ort, openvino, qnn or cuda; auto is the fastest installed one."
 SIZE_HELP: Final = "Tensor size in pixels: HEIGHTxWIDTH, or a side S for areas up to SxS."
+CHANNELS_HELP: Final = f"Channels of the neural texture: {either(CHANNELS)}."
 WIDTH_HELP: Final = "Width of the network: 64 is full; all channel counts scale with it."
 
 #: Word for the calibration that the avatar's own network file has.
@@ -30,8 +31,6 @@ METHODS: Final = ("minmax", "percentile", "entropy")
 #: Calibration method of an untrained network if none is asked for, and number of views if none is given.
 METHOD, VIEWS = "minmax", 5
 MOST_VIEWS: Final = 1000
-#: Numbers of channels that the packed pass draws (`stages/gpu/raster.py`).
-CHANNELS: Final = (4, 8, 12, 16)
 
 
 def calibration_of(text: str) -> tuple[str, int] | None:
@@ -59,7 +58,7 @@ def _cores(value: object) -> object:
 
 def _known_channels(channels: int | None) -> int | None:
     if channels is not None and channels not in CHANNELS:
-        raise UnexpectedValue(repr(channels), "4, 8, 12 or 16")
+        raise UnexpectedValue(repr(channels), either(CHANNELS))
     return channels
 
 
@@ -101,8 +100,7 @@ class RunOptions(Options):
         default=None, ge=1, le=256, description=f"{WIDTH_HELP} A width other than the avatar's is untrained."
     )
     channels: Annotated[int | None, AfterValidator(_known_channels)] = Field(
-        default=None,
-        description="Channels of the neural texture: 4, 8, 12 or 16. A number other than the avatar's is untrained.",
+        default=None, description=f"{CHANNELS_HELP} A number other than the avatar's is untrained."
     )
     calibration: Annotated[str | None, AfterValidator(_known_calibration)] = Field(
         default=None,

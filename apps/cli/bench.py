@@ -19,7 +19,7 @@ from trilane.apps.cli.commands import POLICY_HELP, Commands, JsonOption
 from trilane.apps.cli.console import print_json, stderr_console, stdout_console, stdout_kept
 from trilane.apps.cli.main import lazy_group
 from trilane.apps.predict.predict_options import ENCODER_HELP, NORM_HELP
-from trilane.stages.run_options import RUNTIME_HELP, SIZE_HELP, WIDTH_HELP
+from trilane.stages.run_options import CHANNELS_HELP, RUNTIME_HELP, SIZE_HELP, WIDTH_HELP
 from trilane.units import AVATARS_HELP
 
 #: Bench -> its module, and its line in `trilane bench --help`.
@@ -72,7 +72,7 @@ MEANINGS = {
     "beside_size": "Tensor size of the second avatar in pixels: HEIGHTxWIDTH, or a side.",
     "batch": "Frames inferred at once.",
     "calibration": "Network of the avatar: as-it-is, or quantised again by minmax, percentile or entropy.",
-    "channels": "Channels of the neural texture: 4, 8, 12 or 16.",
+    "channels": CHANNELS_HELP,
     "cores": "Cores of the three units together; 0: all that this process may use.",
     "edge": "Buffers between stages: single, double, triple, fifo:N, orphan or orphan:N.",
     "encoder": ENCODER_HELP,

@@ -5,8 +5,15 @@ Rule: each list and each phrase stands only here.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from enum import StrEnum
 from typing import Literal, get_args
+
+
+def either(words: Iterable[object]) -> str:
+    """Return `words` as a phrase, such as "a, b or c"."""
+    return " or ".join(", ".join(map(str, words)).rsplit(", ", 1))
+
 
 #: Nanoseconds in a millisecond and in a second.
 NS_PER_MS, NS_PER_S = 1e6, 1e9
@@ -23,6 +30,10 @@ AVATARS_HELP = f"{', '.join(f'`{name}`' for name in AVATARS)}, or the folder of 
 
 #: Name of the background that is drawn, and no file.
 ROOM = "room"
+
+#: Numbers of channels of the neural texture that the GPU packs in one pass, ascending; the largest of them.
+CHANNELS = (4, 8, 12, 16)
+MAX_CHANNELS = CHANNELS[-1]
 
 UnitName = Literal["cpu", "gpu", "dsp"]
 UNITS: tuple[UnitName, ...] = get_args(UnitName)
