@@ -24,7 +24,7 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from trilane.arrays import F32
+from trilane.arrays import BUCKET_STEP, F32
 from trilane.avatars.bundle import (
     MANIFEST,
     TEXTURE_KEYS,
@@ -37,7 +37,7 @@ from trilane.avatars.bundle import (
 )
 from trilane.avatars.manifest import CAPTURED, UNTRAINED, Manifest, digests_of, network_entry, sha256_of
 from trilane.avatars.mesh_levels import MeshLevel
-from trilane.avatars.network_file import STRIDE, NetworkFile, check_integer_layers, read_network, reshaped
+from trilane.avatars.network_file import NetworkFile, check_integer_layers, read_network, reshaped
 from trilane.avatars.validation import refused, validation_facts
 from trilane.bench.lib.full_picture import float_weights, weights_name
 from trilane.body.body import Body, load_body
@@ -302,10 +302,10 @@ def _shapes(network: NetworkFile) -> str:
     """Return a phrase on the tensor shapes at which the network can run."""
     _, height, width, _ = network.shape
     try:
-        reshaped(network, STRIDE * 3, STRIDE * 5)
+        reshaped(network, BUCKET_STEP * 3, BUCKET_STEP * 5)
     except BadInputError:
         return f"{height}x{width} alone: trilane run --size {height}x{width}"
-    return f"any with sides in multiples of {STRIDE}"
+    return f"any with sides in multiples of {BUCKET_STEP}"
 
 
 def _clipped(texture: NDArray[np.float32], network: NetworkFile) -> float:

@@ -16,10 +16,10 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from trilane.arrays import F32
+from trilane.arrays import F32, MAX_SIDE
 from trilane.avatars.manifest import ByteRange, Manifest, digests_of, parse_manifest
 from trilane.avatars.mesh_levels import MESH_LEVELS, MeshLevel, read_mesh_levels, save_mesh_levels
-from trilane.avatars.network_file import MAX_SIDE, Affine, NetworkFile, read_network
+from trilane.avatars.network_file import Affine, NetworkFile, read_network
 from trilane.body.body import Body, ShapedBody, load_body
 from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_npz, read_text, require_file

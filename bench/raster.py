@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import U8, Floats
+from trilane.arrays import MAX_SIDE, U8, Floats
 from trilane.bench.lib.fixture import ENCODING, INPUTS, SLOTS, Fixture, interleaved_ms, standing, summary_ms
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import BadInputError, TrilaneError
@@ -26,7 +26,6 @@ from trilane.stages.gpu.skinned_mesh import MeshDraw, PosedMesh, SkinnedMesh
 from trilane.training.sample_renderer import UvBytes
 from trilane.units import CHANNELS, either
 
-MAX_SIDE = 4096
 #: Variants whose bytes are compared.
 COMPARED = ("packed", "packed, other way", "split")
 UNEQUAL = 1e-3  # largest share of bytes that may differ, by one step: variants interpolate UVs at other places
