@@ -47,9 +47,9 @@ from trilane.files import read_npz
 from trilane.hw_profiles.network_work import graph_facts
 from trilane.stages.avatar_assets import distinct, with_network
 from trilane.stages.configure import Checked
-from trilane.stages.run_options import METHOD, VIEWS, RunOptions, calibration_of
+from trilane.stages.run_options import AS_IT_IS, VIEWS, RunOptions, calibration_of
 from trilane.training.clothing import KEY as LOOK
-from trilane.units import CHANNELS, either
+from trilane.units import CALIBRATION_METHOD, CHANNELS, either
 
 if TYPE_CHECKING:
     from trilane.training.quantising.quantise import Quantised
@@ -375,7 +375,7 @@ def _recipe(bundle: Bundle, options: RunOptions) -> _Recipe:
     width, channels = options.width or own.width, options.channels or own.channels
     trained = (width, channels) == (own.width, own.channels)
     asked = None if options.calibration is None else calibration_of(options.calibration)
-    method, views = asked or ((None, 0) if trained else (METHOD, VIEWS))
+    method, views = asked or ((None, 0) if trained else (CALIBRATION_METHOD, VIEWS))
     return _Recipe(width, channels, trained, method, views)
 
 
@@ -448,8 +448,9 @@ def _quantised(bundle: Bundle, recipe: _Recipe, chosen: NDArray[np.intp]) -> Qua
     except ImportError as error:
         raise MissingPartError(f"making an avatar again needs {error.name}", extra="train") from None
     model = _float_model(bundle, recipe)
-    frames: list[F32] = training_views(open_renderer(bundle, 1), bundle, recipe.views)
-    return quantise(model, [np.ascontiguousarray(frame[..., chosen]) for frame in frames], recipe.method or METHOD)
+    views: list[F32] = training_views(open_renderer(bundle, 1), bundle, recipe.views)
+    frames = [np.ascontiguousarray(view[..., chosen]) for view in views]
+    return quantise(model, frames, recipe.method or CALIBRATION_METHOD)
 
 
 def _float_model(bundle: Bundle, recipe: _Recipe) -> onnx.ModelProto:
@@ -479,8 +480,6 @@ def _named_weights(bundle: Bundle) -> Path:
     return weights
 
 
-#: Word that stands for the network of the avatar's own file, in place of a method.
-AS_IT_IS = "as-it-is"
 #: Number of views on which `Calibrations` calibrates.
 COMPARED_VIEWS = 50
 
@@ -500,7 +499,7 @@ class Calibrations:
     def changed(self, checked: Checked, method: str) -> Checked:
         """Return `checked` with the network that `method` calibrates.
 
-        `method`: a name in METHODS; `AS_IT_IS` keeps the network.
+        `method`: a name in CALIBRATION_METHODS; `AS_IT_IS` keeps the network.
         Raises BadInputError without the float network, MissingPartError without PyTorch.
         """
         if method == AS_IT_IS:

@@ -16,7 +16,7 @@ from trilane.options import NOTHING, Finite, Name, OnePath, Option, Options, Tex
 from trilane.scheduler.policy import POLICIES
 from trilane.transport.slots import DEFAULT_EDGE, EDGES, RULES, edge_rule
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import AVATARS_HELP, CHANNELS, PERFORMANCE_PROFILES, ROOM, either
+from trilane.units import AVATARS_HELP, CALIBRATION_METHODS, CHANNELS, PERFORMANCE_PROFILES, ROOM, either
 
 PROFILE_HELP: Final = "Hardware profile: a name or a TOML file."
 RUNTIME_HELP: Final = "auto, ort, openvino, qnn or cuda; auto is the fastest installed one."
@@ -26,10 +26,8 @@ WIDTH_HELP: Final = "Width of the network: 64 is full; all channel counts scale 
 
 #: Word for the calibration that the avatar's own network file has.
 AS_IT_IS: Final = "as-it-is"
-#: Methods of `trilane.training.quantising.calibration`, repeated here because that module takes long to import.
-METHODS: Final = ("minmax", "percentile", "entropy")
-#: Calibration method of an untrained network if none is asked for, and number of views if none is given.
-METHOD, VIEWS = "minmax", 5
+#: Number of views on which a network is calibrated if none is given.
+VIEWS: Final = 5
 MOST_VIEWS: Final = 1000
 
 
@@ -41,8 +39,8 @@ def calibration_of(text: str) -> tuple[str, int] | None:
     method, colon, views = text.partition(":")
     if text == AS_IT_IS:
         return None
-    if method not in METHODS:
-        known = (AS_IT_IS, *METHODS)
+    if method not in CALIBRATION_METHODS:
+        known = (AS_IT_IS, *CALIBRATION_METHODS)
         raise UnexpectedValue(repr(text), f"one of {', '.join(known)}", did_you_mean(method, known))
     if colon and not (views.isdecimal() and len(views) < 5 and 1 <= int(views) <= MOST_VIEWS):
         raise UnexpectedValue(repr(text), f"{method} or {method}:VIEWS, VIEWS from 1 to {MOST_VIEWS}")
@@ -104,8 +102,8 @@ class RunOptions(Options):
     )
     calibration: Annotated[str | None, AfterValidator(_known_calibration)] = Field(
         default=None,
-        description="Quantise the avatar's network again: minmax, percentile or entropy, or METHOD:VIEWS "
-        "(5 views if not given).",
+        description=f"Quantise the avatar's network again: {either(CALIBRATION_METHODS)}, or METHOD:VIEWS "
+        f"({VIEWS} views if not given).",
     )
     frames: Annotated[int | None, Option(unit="frames")] = Field(
         default=None, description="Number of frames; the scene's number if not given."

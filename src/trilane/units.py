@@ -34,6 +34,9 @@ ROOM = "room"
 #: Numbers of channels of the neural texture that the GPU packs in one pass, ascending; the largest of them.
 CHANNELS = (4, 8, 12, 16)
 MAX_CHANNELS = CHANNELS[-1]
+#: Methods by which a network is calibrated, and the usual method.
+CALIBRATION_METHODS = ("minmax", "percentile", "entropy")
+CALIBRATION_METHOD = CALIBRATION_METHODS[0]
 
 UnitName = Literal["cpu", "gpu", "dsp"]
 UNITS: tuple[UnitName, ...] = get_args(UnitName)
