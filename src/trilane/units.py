@@ -1,4 +1,4 @@
-"""Words that all folders share: units, profiles, the host's name, the avatar's stages, sources of figures.
+"""Words and numbers that all folders share, about avatars, units, profiles, the host, stages, sources of figures.
 
 Rule: each list and each phrase stands only here.
 """
@@ -34,6 +34,9 @@ ROOM = "room"
 #: Numbers of channels of the neural texture that the GPU packs in one pass, ascending; the largest of them.
 CHANNELS = (4, 8, 12, 16)
 MAX_CHANNELS = CHANNELS[-1]
+#: Most smaller levels of the neural texture. The fifth level of a usual texture of 512x512 has 16 texels along a side;
+#: a sixth would have too few for a body.
+MOST_TEXTURE_LEVELS = 5
 #: Methods by which a network is calibrated, and the usual method.
 CALIBRATION_METHODS = ("minmax", "percentile", "entropy")
 CALIBRATION_METHOD = CALIBRATION_METHODS[0]
