@@ -24,7 +24,7 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from trilane.arrays import F32
+from trilane.arrays import BUCKET_STEP, F32
 from trilane.avatars.bundle import (
     MANIFEST,
     TEXTURE_KEYS,
@@ -37,7 +37,7 @@ from trilane.avatars.bundle import (
 )
 from trilane.avatars.manifest import CAPTURED, UNTRAINED, Manifest, digests_of, network_entry, sha256_of
 from trilane.avatars.mesh_levels import MeshLevel
-from trilane.avatars.network_file import STRIDE, NetworkFile, check_integer_layers, read_network, reshaped
+from trilane.avatars.network_file import NetworkFile, check_integer_layers, read_network, reshaped
 from trilane.avatars.validation import refused, validation_facts
 from trilane.bench.lib.full_picture import float_weights, weights_name
 from trilane.body.body import Body, load_body
@@ -47,8 +47,9 @@ from trilane.files import read_npz
 from trilane.hw_profiles.network_work import graph_facts
 from trilane.stages.avatar_assets import distinct, with_network
 from trilane.stages.configure import Checked
-from trilane.stages.run_options import METHOD, VIEWS, RunOptions, calibration_of
+from trilane.stages.run_options import AS_IT_IS, VIEWS, RunOptions, calibration_of
 from trilane.training.clothing import KEY as LOOK
+from trilane.units import CALIBRATION_METHOD, CHANNELS, either
 
 if TYPE_CHECKING:
     from trilane.training.quantising.quantise import Quantised
@@ -197,11 +198,9 @@ def _drawable(network: NetworkFile) -> NetworkFile:
 
     Raises BadInputError for any other network.
     """
-    from trilane.stages.gpu.raster import CHANNELS
-
     check_integer_layers(network)
     if network.channels not in CHANNELS:
-        expected = f"{', '.join(map(str, CHANNELS[:-1]))} or {CHANNELS[-1]}, which the GPU packs"
+        expected = f"{either(CHANNELS)}, which the GPU packs"
         raise BadInputError(network.where, f"an input of {network.channels} channels", expected, "pad with zeros")
     output = network.output
     if output.zero_point != 0 or not np.isclose(output.scale, PICTURE_SCALE, rtol=1e-5):
@@ -303,10 +302,10 @@ def _shapes(network: NetworkFile) -> str:
     """Return a phrase on the tensor shapes at which the network can run."""
     _, height, width, _ = network.shape
     try:
-        reshaped(network, STRIDE * 3, STRIDE * 5)
+        reshaped(network, BUCKET_STEP * 3, BUCKET_STEP * 5)
     except BadInputError:
         return f"{height}x{width} alone: trilane run --size {height}x{width}"
-    return f"any with sides in multiples of {STRIDE}"
+    return f"any with sides in multiples of {BUCKET_STEP}"
 
 
 def _clipped(texture: NDArray[np.float32], network: NetworkFile) -> float:
@@ -376,7 +375,7 @@ def _recipe(bundle: Bundle, options: RunOptions) -> _Recipe:
     width, channels = options.width or own.width, options.channels or own.channels
     trained = (width, channels) == (own.width, own.channels)
     asked = None if options.calibration is None else calibration_of(options.calibration)
-    method, views = asked or ((None, 0) if trained else (METHOD, VIEWS))
+    method, views = asked or ((None, 0) if trained else (CALIBRATION_METHOD, VIEWS))
     return _Recipe(width, channels, trained, method, views)
 
 
@@ -449,8 +448,9 @@ def _quantised(bundle: Bundle, recipe: _Recipe, chosen: NDArray[np.intp]) -> Qua
     except ImportError as error:
         raise MissingPartError(f"making an avatar again needs {error.name}", extra="train") from None
     model = _float_model(bundle, recipe)
-    frames: list[F32] = training_views(open_renderer(bundle, 1), bundle, recipe.views)
-    return quantise(model, [np.ascontiguousarray(frame[..., chosen]) for frame in frames], recipe.method or METHOD)
+    views: list[F32] = training_views(open_renderer(bundle, 1), bundle, recipe.views)
+    frames = [np.ascontiguousarray(view[..., chosen]) for view in views]
+    return quantise(model, frames, recipe.method or CALIBRATION_METHOD)
 
 
 def _float_model(bundle: Bundle, recipe: _Recipe) -> onnx.ModelProto:
@@ -480,8 +480,6 @@ def _named_weights(bundle: Bundle) -> Path:
     return weights
 
 
-#: Word that stands for the network of the avatar's own file, in place of a method.
-AS_IT_IS = "as-it-is"
 #: Number of views on which `Calibrations` calibrates.
 COMPARED_VIEWS = 50
 
@@ -501,7 +499,7 @@ class Calibrations:
     def changed(self, checked: Checked, method: str) -> Checked:
         """Return `checked` with the network that `method` calibrates.
 
-        `method`: a name in METHODS; `AS_IT_IS` keeps the network.
+        `method`: a name in CALIBRATION_METHODS; `AS_IT_IS` keeps the network.
         Raises BadInputError without the float network, MissingPartError without PyTorch.
         """
         if method == AS_IT_IS:

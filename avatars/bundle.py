@@ -16,14 +16,14 @@ import numpy as np
 import onnx
 from numpy.typing import NDArray
 
-from trilane.arrays import F32
+from trilane.arrays import F32, MAX_SIDE
 from trilane.avatars.manifest import ByteRange, Manifest, digests_of, parse_manifest
 from trilane.avatars.mesh_levels import MESH_LEVELS, MeshLevel, read_mesh_levels, save_mesh_levels
-from trilane.avatars.network_file import MAX_SIDE, Affine, NetworkFile, read_network
+from trilane.avatars.network_file import Affine, NetworkFile, read_network
 from trilane.body.body import Body, ShapedBody, load_body
 from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_npz, read_text, require_file
-from trilane.units import AVATARS
+from trilane.units import AVATARS, MOST_TEXTURE_LEVELS
 from trilane.writing import require_writable, write_atomically, write_bytes, write_folder
 
 MANIFEST, OFFSETS = "manifest.json", "offsets.npz"
@@ -294,9 +294,6 @@ def _check_scale(scale: Any, path: Path, channels: int) -> NDArray[np.float32]:
 # Rule: the levels are stored side by side in one array (H/2, W/2 + W/4 + ..., C), each from row 0 on. Therefore all
 # levels need only one array, and the width of this array tells the number of levels.
 
-#: The fifth level of a usual texture of 512x512 has 16 texels along a side. A sixth would have too few for a body.
-MOST_LEVELS = 5
-
 
 def pack_levels(levels: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """Return the levels side by side in one array (H/2, W/2 + W/4 + ..., C).
@@ -331,12 +328,13 @@ def check_levels(packed: NDArray[Any], texture: NDArray[Any], where: object) -> 
     `where`: file that the error names.
     """
     height, width, channels = texture.shape
-    widths = [sum(width >> (k + 1) for k in range(count)) for count in range(1, MOST_LEVELS + 1)]
+    widths = [sum(width >> (k + 1) for k in range(count)) for count in range(1, MOST_TEXTURE_LEVELS + 1)]
     fits = packed.ndim == 3 and packed.shape[::2] == (height // 2, channels) and packed.shape[1] in widths
-    if not fits or packed.dtype != texture.dtype or height % (1 << MOST_LEVELS) or width % (1 << MOST_LEVELS):
+    step = 1 << MOST_TEXTURE_LEVELS
+    if not fits or packed.dtype != texture.dtype or height % step or width % step:
         found = f"levels of shape {packed.shape}, {packed.dtype}"
         expected = (
-            f"({height // 2}, {widths[0]} to {widths[-1]}, {channels}), {texture.dtype}: 1 to {MOST_LEVELS} levels"
+            f"({height // 2}, {widths[0]} to {widths[-1]}, {channels}), {texture.dtype}: 1 to {len(widths)} levels"
         )
         raise BadInputError(where, found, expected)  # type: ignore[arg-type]
 

@@ -22,6 +22,7 @@ from pydantic import (
     model_validator,
 )
 
+from trilane.arrays import MAX_SIDE
 from trilane.avatars.network_file import MAX_CHANNELS, NetworkFile, network_files
 from trilane.errors import BadInputError
 
@@ -179,7 +180,7 @@ class MadeWith(_Model):
 
 
 #: Side in pixels of a square with as many pixels as a rectangle.
-Side = Annotated[int, Field(ge=8, le=4096)]
+Side = Annotated[int, Field(ge=8, le=MAX_SIDE)]
 
 
 class BySize(_Figures):

@@ -17,6 +17,7 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 from onnx import TensorProto, external_data_helper, numpy_helper, shape_inference
 
+from trilane.arrays import BUCKET_STEP, MAX_SIDE
 from trilane.errors import BadInputError, reason
 from trilane.files import require_file, signature_of
 
@@ -27,7 +28,6 @@ from trilane.files import require_file, signature_of
 
 #: Metadata key of the file: a JSON list of the names of layers that were left in float on purpose.
 FLOAT_LAYERS_KEY = "trilane.float_layers"
-MAX_SIDE = 4096
 MAX_BATCH = 64
 MAX_CHANNELS = 64
 #: Operators that take most of the time and must run in integers.
@@ -295,19 +295,17 @@ def _affine(node: onnx.NodeProto, constants: Mapping[str, TensorProto], where: s
 #
 # Rule: the result has fixed shapes and passes `check_network`; weights do not change.
 
-STRIDE = 32
-
 
 def reshaped(network: NetworkFile, height: int, width: int, batch: int = 1) -> NetworkFile:
     """Return `network` for inputs of another shape; `network` itself if it already has this shape.
 
-    `height`, `width`: size of the input in pixels, multiples of STRIDE.
+    `height`, `width`: size of the input in pixels, multiples of BUCKET_STEP.
     `batch`: number of frames that are inferred together.
 
     Raises BadInputError if the graph cannot run at this shape.
     """
-    if height % STRIDE or width % STRIDE or min(height, width, batch) < 1:
-        raise BadInputError(network.where, f"shape {batch}x{height}x{width}", f"sides in multiples of {STRIDE}")
+    if height % BUCKET_STEP or width % BUCKET_STEP or min(height, width, batch) < 1:
+        raise BadInputError(network.where, f"shape {batch}x{height}x{width}", f"sides in multiples of {BUCKET_STEP}")
     if network.shape[:3] == (batch, height, width):
         return network
     model = onnx.ModelProto()

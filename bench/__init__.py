@@ -10,6 +10,7 @@ from typing import Any
 
 from trilane import machine
 from trilane.errors import BadInputError
+from trilane.units import MAX_CHANNELS
 
 #: Least and greatest value of each option, which means the same in every bench. A bench may check a narrower range.
 LIMITS: dict[str, tuple[float, float]] = {
@@ -22,7 +23,7 @@ LIMITS: dict[str, tuple[float, float]] = {
     "pictures": (1, 10_000),
     "seeds": (1, 1000),
     "width": (1, 8192),
-    "channels": (1, 16),
+    "channels": (1, MAX_CHANNELS),
     "sizes": (1, 4096),
     "avatars": (1, 8),
     "batch": (1, 64),

@@ -15,17 +15,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from trilane.arrays import U8, Floats
+from trilane.arrays import MAX_SIDE, U8, Floats
 from trilane.bench.lib.fixture import ENCODING, INPUTS, SLOTS, Fixture, interleaved_ms, standing, summary_ms
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import BadInputError, TrilaneError
 from trilane.stages.config import Quantisation
 from trilane.stages.gpu.opengl import describe, open_context
-from trilane.stages.gpu.raster import CHANNELS, PackedAvatar, PackedPass, Placement, check_texture, texture_array
+from trilane.stages.gpu.raster import PackedAvatar, PackedPass, Placement, check_texture, texture_array
 from trilane.stages.gpu.skinned_mesh import MeshDraw, PosedMesh, SkinnedMesh
 from trilane.training.sample_renderer import UvBytes
+from trilane.units import CHANNELS, either
 
-MAX_SIDE = 4096
 #: Variants whose bytes are compared.
 COMPARED = ("packed", "packed, other way", "split")
 UNEQUAL = 1e-3  # largest share of bytes that may differ, by one step: variants interpolate UVs at other places
@@ -49,7 +49,7 @@ def measure(size: int = 512, channels: int = 16, repeats: int = 40, threads: int
     if not 1 <= size <= MAX_SIDE:
         raise BadInputError("--size", str(size), f"1 to {MAX_SIDE}")
     if channels not in CHANNELS:
-        raise BadInputError("--channels", str(channels), "4, 8, 12 or 16")
+        raise BadInputError("--channels", str(channels), either(CHANNELS))
     ctx = open_context(threads)
     deferred = not describe(ctx).hardware
     tensors = {name: np.zeros((SLOTS, size * size * channels), np.uint8) for name in COMPARED}

@@ -19,8 +19,9 @@ from trilane.bench.lib.fixture import ENCODING, INPUTS, SLOTS, WARM_UP, interlea
 from trilane.errors import TrilaneError
 from trilane.stages.gpu import opengl
 from trilane.stages.gpu.opengl import describe, open_context
-from trilane.stages.gpu.raster import CHANNELS, PackedAvatar, PackedPass, Placement
+from trilane.stages.gpu.raster import PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
+from trilane.units import CHANNELS
 
 SIZES = (256, 512, 1024)
 TIME_SOURCES = {

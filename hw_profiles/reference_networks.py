@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import onnx
 from onnx import TensorProto, helper
 
-from trilane.arrays import parse_shape
+from trilane.arrays import check_side, parse_shape
 from trilane.errors import BadInputError
 from trilane.hw_profiles.network_work import Network, Work, count_work
 from trilane.unet_tables import (
@@ -35,10 +35,10 @@ from trilane.unet_tables import (
     squeeze_channels,
 )
 from trilane.unexpected_value import UnexpectedValue
+from trilane.units import MAX_CHANNELS
 
 LAYOUTS = ("packed", "split")
 CHANNELS_PER_PASS = 4
-MAX_SIDE = 4096
 
 KEYS = ("encoder", "norm", "size", "channels", "layout")
 MAX_BYTES, MAX_ROWS = 32_000_000, 100_000
@@ -53,8 +53,8 @@ class NetworkSpec:
 
     `encoder`: one of ENCODERS.
     `norm`: one of NORMS.
-    `height`, `width`: size of the input in pixels, multiples of 32 up to MAX_SIDE.
-    `channels`: channels of the rasterised texture, 1 to 16.
+    `height`, `width`: size of the input in pixels, which `check_side` accepts.
+    `channels`: channels of the rasterised texture, 1 to MAX_CHANNELS.
     `layout`: one of LAYOUTS.
 
     Raises BadInputError for another value.
@@ -71,11 +71,13 @@ class NetworkSpec:
         _require_one_of("encoder", self.encoder, ENCODERS)
         _require_one_of("norm", self.norm, NORMS)
         _require_one_of("layout", self.layout, LAYOUTS)
-        for name, side in (("height", self.height), ("width", self.width)):
-            if side % 32 or not 32 <= side <= MAX_SIDE:
-                raise BadInputError("size", f"{name} {side}", f"a multiple of 32 from 32 to {MAX_SIDE}")
-        if not 1 <= self.channels <= 16:
-            raise BadInputError("channels", str(self.channels), "1 to 16")
+        try:
+            check_side(self.height, "height")
+            check_side(self.width, "width")
+        except UnexpectedValue as error:
+            raise BadInputError.at("size", error) from None
+        if not 1 <= self.channels <= MAX_CHANNELS:
+            raise BadInputError("channels", str(self.channels), f"1 to {MAX_CHANNELS}")
 
     @property
     def pixels(self) -> int:
@@ -225,7 +227,7 @@ def spec_of(cells: dict[str, str], place: str) -> NetworkSpec:
         raise BadInputError(f"{place}: size", repr(size), "a side such as 512, or HEIGHTxWIDTH") from None
     channels = cells["channels"]
     if not channels.isdecimal() or len(channels) > 4:
-        raise BadInputError(f"{place}: channels", repr(channels), "1 to 16")
+        raise BadInputError(f"{place}: channels", repr(channels), f"1 to {MAX_CHANNELS}")
     try:
         return NetworkSpec(cells["encoder"], cells["norm"], height, width, int(channels), cells["layout"])
     except BadInputError as error:

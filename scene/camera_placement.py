@@ -32,6 +32,7 @@ from trilane.scene.mover import HEAD, Mover
 from trilane.scene.rotations import about, quat_from_matrix, quat_multiply
 from trilane.scene.schema import MAX_DEPTH_RATIO, CameraSpec, Scene
 from trilane.scene.visibility import SCORED_MOMENTS, SCORED_S, best_place, facing, filming, outermost_points, seen_at
+from trilane.units import ROOM
 
 #: Step between samples of a way, seconds, and most samples; a longer motion has longer steps.
 STEP_S, MOST_SAMPLES = 0.1, 6000
@@ -176,7 +177,6 @@ def _turn(arm: F64, azimuth_deg: float, elevation_deg: float) -> F64:
 #: Range of the camera's median line of sight, degrees above the horizon; a camera beyond it is tilted to its end.
 SIGHT_DEG = (-24.0, 0.0)
 LARGEST_TILT_DEG = 40.0
-SYNTHETIC_BACKGROUNDS = ("room",)
 #: Factor on the farthest distance that a body can have from the camera: the far clip plane is there.
 BEYOND = 1.1
 #: A built-in camera is judged at moments this far apart, seconds, or at this many in a longer cycle.
@@ -251,7 +251,7 @@ def _placed(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Seq
     levelled, level, middle = _from_the_middle(path)
     output = (scene.output.height, scene.output.width)
     points = outermost_points(times, movers, bodies)
-    tilts = [_tilt_deg(path, times), 0.0] if scene.background in SYNTHETIC_BACKGROUNDS else [0.0]
+    tilts = [_tilt_deg(path, times), 0.0] if scene.background == ROOM else [0.0]
     found = []
     for tilt in dict.fromkeys(tilts):
         mount = about(0, np.radians(tilt))

@@ -30,7 +30,7 @@ from trilane.body.joints import JOINT_INDEX
 from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_text
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
-from trilane.units import AVATARS, AVATARS_HELP
+from trilane.units import AVATARS, AVATARS_HELP, ROOM
 
 MAX_DEPTH_RATIO = 1e6  # largest ratio of far to near clip plane; beyond it a depth buffer of 24 bits is too coarse
 AUTO = "auto"  # value of a key that Trilane decides
@@ -313,7 +313,7 @@ class Scene(Table):
             "Tensor size: HEIGHTxWIDTH, or a side S for areas up to SxS. `auto`: planned, up to `most_side`² pixels."
         ),
     )
-    background: str = Field(default="room", description="`room`, a video, a folder of images, or a picture.")
+    background: str = Field(default=ROOM, description=f"`{ROOM}`, a video, a folder of images, or a picture.")
     hud: bool = Field(default=False, description="Whether frame number, rate and latency are written on the picture.")
     planes: Annotated[tuple[PlaneSpec, ...], LISTED] = Field(
         default=(), max_length=32, description="Detected planes, drawn over the background."
@@ -408,7 +408,7 @@ EXPECTED = {
 IN_STEPS = ("multiple_of", "greater_than_equal", "less_than_equal")
 #: Reason why a key cannot have its value, where the range alone does not explain it.
 REASONS = {"error_budget_px": "numbers are rounded, so nothing is drawn without an error"}
-BUILT_IN = ("room", *AVATARS)  # names of a background and of avatars
+BUILT_IN = (ROOM, *AVATARS)  # names of a background and of avatars
 
 
 def bad_input(where: str | Path, error: ValidationError) -> BadInputError:

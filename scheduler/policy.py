@@ -33,7 +33,8 @@ from typing import Any, Final, NamedTuple
 
 from trilane.scheduler.events import NEVER, DropCause, Settings
 from trilane.scheduler.state import StageState
-from trilane.unexpected_value import UnexpectedValue, either
+from trilane.unexpected_value import UnexpectedValue
+from trilane.units import either
 
 
 class Candidate(NamedTuple):

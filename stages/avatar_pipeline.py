@@ -26,11 +26,11 @@ from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.placement import CpuCore, Place, Placement
 from trilane.stages import FACTORIES, PRELOAD
 from trilane.stages.avatar_assets import only_network_of
-from trilane.stages.config import MAX_CHANNELS, PAINTED_CHANNELS, RunConfig, pose_dtype, posed_vertices_bytes
+from trilane.stages.config import PAINTED_CHANNELS, RunConfig, pose_dtype, posed_vertices_bytes
 from trilane.stages.configure import Checked
 from trilane.stages.dsp.infer import crossing_bytes
 from trilane.transport.slots import DEFAULT_EDGE
-from trilane.units import AFTER_INFER, BEFORE_INFER, BYPASS, LATENCY_TO, UNITS
+from trilane.units import AFTER_INFER, BEFORE_INFER, BYPASS, LATENCY_TO, MAX_CHANNELS, UNITS
 
 
 def avatar_pipeline(config: RunConfig, assets: Assets, edge: str = DEFAULT_EDGE) -> Pipeline:

@@ -98,7 +98,6 @@ def posed_vertices_bytes(counts: Sequence[int]) -> int:
     return sum(counts) * 3 * np.dtype(np.float32).itemsize
 
 
-MAX_CHANNELS = 16  # most channels of a tensor, which the GPU packs in one pass
 PAINTED_CHANNELS = 4  # channels of a network's picture: red, green, blue, alpha
 
 

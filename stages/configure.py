@@ -34,9 +34,8 @@ from trilane.stages.dsp.runtime import RUNTIMES, installed, resolve
 from trilane.stages.foresee import Painted, foresee, tensor_works
 from trilane.stages.machine_facts import gl_facts, machine_facts
 from trilane.stages.run_options import RunOptions
-from trilane.units import HOST
+from trilane.units import HOST, ROOM
 
-ROOM = "room"
 COMMAND_LINE = "command line"
 #: Key of a scene for each option of a run that has another name.
 KEYS = {"picture": "output"}

@@ -17,9 +17,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from trilane.arrays import Shape
+from trilane.arrays import BUCKET_STEP, Shape
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
-from trilane.avatars.network_file import STRIDE, NetworkFile, reshaped
+from trilane.avatars.network_file import NetworkFile, reshaped
 from trilane.avatars.validation import SizeLoss
 from trilane.body.body import ShapedBody
 from trilane.body.joints import Skeleton
@@ -169,7 +169,7 @@ def foresee(
         demands = [
             Demand(ideal_shape(rects, output, budget, by), pixels_of(rects, by, output, budget)) for rects, by in seen
         ]
-        anyway = demands or [Demand((STRIDE, STRIDE), budget.own)]
+        anyway = demands or [Demand((BUCKET_STEP, BUCKET_STEP), budget.own)]
         left = scene.memory_mb * MB - chosen.memory_bytes
         is_smaller = bool(chosen.shapes)
         most = MOST_SMALLER if is_smaller else MOST_SHAPES
@@ -242,8 +242,8 @@ def bytes_per_pixel(network: NetworkFile) -> float:
     """
     _, height, width, _ = network.shape
     if not network.model.graph.value_info:
-        network = reshaped(network, height + STRIDE, width)
-        height += STRIDE
+        network = reshaped(network, height + BUCKET_STEP, width)
+        height += BUCKET_STEP
     sizes = [
         math.prod(dim.dim_value for dim in value.type.tensor_type.shape.dim)
         for value in network.model.graph.value_info

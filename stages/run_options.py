@@ -16,22 +16,19 @@ from trilane.options import NOTHING, Finite, Name, OnePath, Option, Options, Tex
 from trilane.scheduler.policy import POLICIES
 from trilane.transport.slots import DEFAULT_EDGE, EDGE_WORDS, EDGES, RULES, edge_rule
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import AVATARS_HELP, PERFORMANCE_PROFILES
+from trilane.units import AVATARS_HELP, CALIBRATION_METHODS, CHANNELS, PERFORMANCE_PROFILES, ROOM, either
 
 PROFILE_HELP: Final = "Hardware profile: a name or a TOML file."
 RUNTIME_HELP: Final = "auto, ort, openvino, qnn or cuda; auto is the fastest installed one."
 SIZE_HELP: Final = "Tensor size in pixels: HEIGHTxWIDTH, or a side S for areas up to SxS."
+CHANNELS_HELP: Final = f"Channels of the neural texture: {either(CHANNELS)}."
 WIDTH_HELP: Final = "Width of the network: 64 is full; all channel counts scale with it."
 
 #: Word for the calibration that the avatar's own network file has.
 AS_IT_IS: Final = "as-it-is"
-#: Methods of `trilane.training.quantising.calibration`, repeated here because that module takes long to import.
-METHODS: Final = ("minmax", "percentile", "entropy")
-#: Calibration method of an untrained network if none is asked for, and number of views if none is given.
-METHOD, VIEWS = "minmax", 5
+#: Number of views on which a network is calibrated if none is given.
+VIEWS: Final = 5
 MOST_VIEWS: Final = 1000
-#: Numbers of channels that the packed pass draws (`stages/gpu/raster.py`).
-CHANNELS: Final = (4, 8, 12, 16)
 
 
 def calibration_of(text: str) -> tuple[str, int] | None:
@@ -42,8 +39,8 @@ def calibration_of(text: str) -> tuple[str, int] | None:
     method, colon, views = text.partition(":")
     if text == AS_IT_IS:
         return None
-    if method not in METHODS:
-        known = (AS_IT_IS, *METHODS)
+    if method not in CALIBRATION_METHODS:
+        known = (AS_IT_IS, *CALIBRATION_METHODS)
         raise UnexpectedValue(repr(text), f"one of {', '.join(known)}", did_you_mean(method, known))
     if colon and not (views.isdecimal() and len(views) < 5 and 1 <= int(views) <= MOST_VIEWS):
         raise UnexpectedValue(repr(text), f"{method} or {method}:VIEWS, VIEWS from 1 to {MOST_VIEWS}")
@@ -59,7 +56,7 @@ def _cores(value: object) -> object:
 
 def _known_channels(channels: int | None) -> int | None:
     if channels is not None and channels not in CHANNELS:
-        raise UnexpectedValue(repr(channels), "4, 8, 12 or 16")
+        raise UnexpectedValue(repr(channels), either(CHANNELS))
     return channels
 
 
@@ -93,19 +90,20 @@ class RunOptions(Options):
     )
     motion: Name | None = Field(default=None, description="Motion: .bvh, .npz, .npy, .pkl, or builtin:NAME.")
     camera: Name | None = Field(default=None, description="Camera: ARKit log, TUM, transforms.json, or builtin:NAME.")
-    background: Name | None = Field(default=None, description="Background: room, or a video, image folder or picture.")
+    background: Name | None = Field(
+        default=None, description=f"Background: {ROOM}, or a video, image folder or picture."
+    )
     avatar: Annotated[Name | None, Option(offered=())] = Field(default=None, description=AVATARS_HELP)
     width: int | None = Field(
         default=None, ge=1, le=256, description=f"{WIDTH_HELP} A width other than the avatar's is untrained."
     )
     channels: Annotated[int | None, AfterValidator(_known_channels)] = Field(
-        default=None,
-        description="Channels of the neural texture: 4, 8, 12 or 16. A number other than the avatar's is untrained.",
+        default=None, description=f"{CHANNELS_HELP} A number other than the avatar's is untrained."
     )
     calibration: Annotated[str | None, AfterValidator(_known_calibration)] = Field(
         default=None,
-        description="Quantise the avatar's network again: minmax, percentile or entropy, or METHOD:VIEWS "
-        "(5 views if not given).",
+        description=f"Quantise the avatar's network again: {either(CALIBRATION_METHODS)}, or METHOD:VIEWS "
+        f"({VIEWS} views if not given).",
     )
     frames: Annotated[int | None, Option(unit="frames")] = Field(
         default=None, description="Number of frames; the scene's number if not given."

@@ -24,6 +24,7 @@ from trilane.arrays import F32, F64, U8, Shape, parse_shape
 from trilane.body.body import load_body
 from trilane.errors import BadInputError
 from trilane.scene.motion.motion import Motion
+from trilane.scene.tensor_budget import MOST_DENSITY, SIDES
 from trilane.training.clothing import look_named
 from trilane.training.random_views import Crop
 from trilane.training.sample_renderer import BAND_NAMES, PoseSource, Sample, SampleRenderer
@@ -33,8 +34,8 @@ One = TypeVar("One")
 #: Share of each band among the training samples. Far samples are the most, because their tensors have many sizes.
 TRAINING_SHARE = {"far": 0.30, "full_body": 0.30, "upper_body": 0.17, "face": 0.13, "anywhere": 0.10}
 #: Least and greatest density of a training sample's tensor: tensor pixels for one pixel of the picture, along a side.
-#: The least is that of the planner's smallest size (`planner.SIDES`), the greatest is `planner.MOST_DENSITY`.
-DENSITY = (0.5, 2.25)
+#: The planner's smallest tensor has the least, its densest tensor has the greatest.
+DENSITY = (min(SIDES), MOST_DENSITY)
 #: Tensor size of validation samples.
 VALIDATION_SIZE = "256"
 #: Number of samples in a part; a rendering process gets one part at a time.

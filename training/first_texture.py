@@ -128,8 +128,8 @@ def used_texels(body: BodyArrays, side: int, margin: int) -> NDArray[np.bool_]:
 def eigenfunctions(vertices: F64, faces: Ints, count: int) -> F64:
     """Return the `count` smoothest non-constant eigenfunctions (V,count) of the cotangent Laplacian, each in -1..1.
 
-    A vertex outside the mesh's largest connected part, such as an eyeball or a garment, takes the values of the nearest vertex of this
-    part. Source: Pinkall and Polthier, Computing discrete minimal surfaces and their conjugates, 1993.
+    A vertex outside the mesh's largest connected part, such as an eyeball or a garment, takes the values of the nearest
+    vertex of this part. Source: Pinkall and Polthier, Computing discrete minimal surfaces and their conjugates, 1993.
 
     `vertices`: (V,3), at rest. `faces`: (F,3) indices of vertices.
     """

@@ -39,7 +39,6 @@ INT8_MAX = 127
 CALIBRATION_SHAPE = (320, 192)
 STORED_SHAPE = (256, 256)
 CALIBRATION_FRAMES = 96
-METHOD = "minmax"
 #: Names of two files from which a person can quantise the avatar again, and the number of inputs in `FRAMES`: 20 inputs
 #: of the calibration's shape take 40 MB.
 FLOAT_NETWORK, FRAMES, WRITTEN_FRAMES = "network.onnx", "frames.npy", 20
@@ -106,7 +105,7 @@ def integer_network(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int
 
     `groups`: training samples. `seed`: seed of the choice of samples.
     """
-    quantised = quantise(*_calibration(avatar, groups, seed, CALIBRATION_FRAMES), METHOD)
+    quantised = quantise(*_calibration(avatar, groups, seed, CALIBRATION_FRAMES))
     return replace(quantised, network=reshaped(quantised.network, *STORED_SHAPE))
 
 
@@ -118,7 +117,7 @@ def kept_network(avatar: str) -> Quantised:
 
 def ranges_of(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> ByteRanges:
     """Return the byte ranges that `integer_network` would give the network's tensors, from the same arguments."""
-    return byte_ranges(*_calibration(avatar, groups, seed, CALIBRATION_FRAMES), METHOD)
+    return byte_ranges(*_calibration(avatar, groups, seed, CALIBRATION_FRAMES))
 
 
 def write_float_network(folder: Path, avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> dict[str, str]:

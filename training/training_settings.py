@@ -19,7 +19,7 @@ from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_text
 from trilane.scene.schema import LISTED, Table
 from trilane.unexpected_value import UnexpectedValue, unexpected_in
-from trilane.units import AvatarName
+from trilane.units import MOST_TEXTURE_LEVELS, AvatarName
 
 # Options of a training, in tables of `training.toml`: the optimiser, the batches, and regularisation.
 #
@@ -240,7 +240,7 @@ class TrainingSettings(Table):
     stand_off: bool = True
     norm: Literal["batch", "instance", "group", "none"] = "batch"
     bytes_from: float = Field(default=1.0, ge=0, le=1)
-    mip_levels: int = Field(default=0, ge=0, le=5)
+    mip_levels: int = Field(default=0, ge=0, le=MOST_TEXTURE_LEVELS)
     vgg: str | None = Field(default=None, pattern="^[0-9a-f]{64}$")
     loss: LossWeights = LossWeights()
     optimiser: OptimiserOptions = OptimiserOptions()

@@ -15,7 +15,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-from trilane.unexpected_value import UnexpectedValue, either
+from trilane.unexpected_value import UnexpectedValue
+from trilane.units import either
 
 FREE: Final = "free"
 WRITING: Final = "writing"

@@ -35,7 +35,7 @@ from trilane.apps.cli.console import (
     stdout_kept,
 )
 from trilane.errors import BadInputError, MissingPartError
-from trilane.units import MEASURED
+from trilane.units import CALIBRATION_METHOD, CALIBRATION_METHODS, MEASURED
 
 if TYPE_CHECKING:
     import onnx
@@ -228,7 +228,7 @@ def quantise(
     source: FloatNetworkArgument,
     frames: FramesFileOption,
     out: OutFileOption,
-    method: Annotated[str, typer.Option(help=METHOD_HELP)] = "minmax",
+    method: Annotated[str, typer.Option(help=METHOD_HELP)] = CALIBRATION_METHOD,
     count: Annotated[int, typer.Option(min=1, max=MAX_FRAMES, help="Frames to calibrate on.")] = 20,
     full_range: Annotated[
         bool, typer.Option("--full-range", help="8-bit weights: only for CPUs with VNNI, and for DSPs.")
@@ -283,10 +283,9 @@ def calibrations(
     from rich.progress import track
     from rich.table import Table
 
-    from trilane.training.quantising.calibration import METHODS
     from trilane.training.quantising.calibration_table import COUNTS, calibration_table, recommendation
 
-    methods = method or list(METHODS)
+    methods = method or CALIBRATION_METHODS
     console = stderr_console()
     if plot is not None:
         from trilane.hw_profiles.governor import figure_for

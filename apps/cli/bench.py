@@ -20,9 +20,9 @@ from trilane.apps.cli.console import print_json, stderr_console, stdout_console,
 from trilane.apps.cli.main import lazy_group
 from trilane.apps.predict.predict_options import ENCODER_HELP, NORM_HELP
 from trilane.scheduler.policy import POLICY_WORDS
-from trilane.stages.run_options import RUNTIME_HELP, SIZE_HELP, WIDTH_HELP
+from trilane.stages.run_options import AS_IT_IS, CHANNELS_HELP, RUNTIME_HELP, SIZE_HELP, WIDTH_HELP
 from trilane.transport.slots import EDGE_WORDS
-from trilane.units import AVATARS_HELP
+from trilane.units import AVATARS_HELP, CALIBRATION_METHODS, either
 
 #: Bench -> its module, and its line in `trilane bench --help`.
 BENCHES = {
@@ -73,8 +73,8 @@ MEANINGS = {
     "beside": "A second avatar, which runs at the same time; both runs are compared with virtual time.",
     "beside_size": "Tensor size of the second avatar in pixels: HEIGHTxWIDTH, or a side.",
     "batch": "Frames inferred at once.",
-    "calibration": "Network of the avatar: as-it-is, or quantised again by minmax, percentile or entropy.",
-    "channels": "Channels of the neural texture: 4, 8, 12 or 16.",
+    "calibration": f"Network of the avatar: {AS_IT_IS}, or quantised again by {either(CALIBRATION_METHODS)}.",
+    "channels": CHANNELS_HELP,
     "cores": "Cores of the three units together; 0: all that this process may use.",
     "edge": f"Buffers between stages: {EDGE_WORDS}.",
     "encoder": ENCODER_HELP,

@@ -22,7 +22,7 @@ from trilane.apps.predict.predict_options import ENCODER_HELP, FIXED_SIZE_HELP, 
 from trilane.errors import BadInputError, did_you_mean
 from trilane.options import EMPTY_PATH, Options, element_of, expected, kind_of, limits_of, option_of
 from trilane.stages.run_options import PROFILE_HELP, WIDTH_HELP, RunOptions
-from trilane.units import AVATARS_HELP
+from trilane.units import AVATARS_HELP, CALIBRATION_METHODS, MAX_CHANNELS, either
 
 #: Attribute of a command's function, with the class of the command's options.
 OPTIONS = "options_model"
@@ -208,13 +208,13 @@ WidthOption = Annotated[int, typer.Option(help=WIDTH_HELP)]
 
 FixedSizeOption = Annotated[str, typer.Option("--size", help=FIXED_SIZE_HELP)]
 
-ChannelsOption = Annotated[int, typer.Option(help="Channels of the neural texture, 1 to 16.")]
+ChannelsOption = Annotated[int, typer.Option(help=f"Channels of the neural texture, 1 to {MAX_CHANNELS}.")]
 
 FloatNetworkArgument = Annotated[Path, typer.Argument(help="Float network (.onnx) with the input N x C x H x W.")]
 
 FramesFileOption = Annotated[Path, typer.Option("--frames", help="Real inputs: .npy (N, H, W, C) of floats.")]
 
-METHOD_HELP = "minmax, percentile or entropy."
+METHOD_HELP = f"{either(CALIBRATION_METHODS)}."
 
 # A body.
 BODY_HELP = "Body file in the SMPL-X layout (.npz)."

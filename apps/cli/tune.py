@@ -40,8 +40,7 @@ from trilane.apps.cli.sweep import (
 )
 from trilane.apps.sweep.goal_metrics import METRICS
 from trilane.errors import BadInputError, did_you_mean
-from trilane.unexpected_value import either
-from trilane.units import HOST
+from trilane.units import HOST, either
 
 if TYPE_CHECKING:
     from trilane.apps.sweep.definition import Definition, Trial

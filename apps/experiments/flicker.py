@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from trilane.apps.avatar_files import AS_IT_IS, Calibrations
+from trilane.apps.avatar_files import Calibrations
 from trilane.apps.experiments.error_by_size import refuse_twice
 from trilane.apps.experiments.scene_pictures import ScenePictures, around, wanted_pictures
 from trilane.arrays import F64, U8
@@ -23,9 +23,8 @@ from trilane.bench.lib.cast import Cast
 from trilane.errors import BadInputError, did_you_mean
 from trilane.stages.configure import Checked, configure
 from trilane.stages.gpu.raster import FILTERS
-from trilane.stages.run_options import RunOptions
-from trilane.training.quantising.calibration import METHODS
-from trilane.units import MEASURED
+from trilane.stages.run_options import AS_IT_IS, RunOptions
+from trilane.units import CALIBRATION_METHODS, MEASURED
 
 STEPS = 255
 
@@ -101,7 +100,7 @@ def measure(
     refuse_twice("--texture-filter", texture_filter)
     refuse_twice("--calibration", calibration)
     _refuse_unknown("--texture-filter", texture_filter, FILTERS)
-    _refuse_unknown("--calibration", calibration, (AS_IT_IS, *METHODS))
+    _refuse_unknown("--calibration", calibration, (AS_IT_IS, *CALIBRATION_METHODS))
     checked = {
         name: configure(RunOptions(scene=scene, size=size, runtime=name, hud=False), Path.cwd()) for name in runtime
     }

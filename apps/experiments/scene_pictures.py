@@ -28,14 +28,14 @@ from trilane.pipeline.job_times import CoreMeter, preempted_ns
 from trilane.pipeline.stage import UnitContext
 from trilane.stages.avatar_assets import networks_of
 from trilane.stages.avatar_pipeline import avatar_pipeline, edge_bytes
-from trilane.stages.config import MAX_CHANNELS, network_parts, pose_dtype
+from trilane.stages.config import network_parts, pose_dtype
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.pose import build as build_pose
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, load_runtime
 from trilane.stages.gpu.opengl import CONTEXT, open_context
 from trilane.stages.gpu.raster import build as build_raster
 from trilane.transport.packets import Packet, SlotLayout, view_packet
-from trilane.units import MEASURED
+from trilane.units import MAX_CHANNELS, MEASURED
 
 MAX_FRAMES = 10_000
 TRUTH = "ground truth: the clothed body that the avatar was trained on"

@@ -40,6 +40,7 @@ from trilane.files import (
     FOREIGN,
     PICKLE,
     PICTURE,
+    PICTURE_SUFFIXES,
     VIDEO,
     Signature,
     npz_names,
@@ -50,7 +51,6 @@ from trilane.files import (
 from trilane.pipeline.journal import NAME as JOURNAL
 from trilane.scene.camera.files import COLMAP_FILES, detect
 from trilane.scene.recordings import Detected
-from trilane.stages.gpu.background import PICTURES
 
 MOTION, CAMERA, PICTURE_FOLDER, BODY, TEXTURE, AVATAR = "motion", "camera", "pictures", "body", "texture", "avatar"
 NETWORK, SCENE, TRACE, RUN, REPORT, SWEEP = "network", "scene", "trace", "run", "report", "sweep"
@@ -71,7 +71,7 @@ ENDINGS = {
     ".webm": VIDEO,
     ".avi": VIDEO,
     ".m4v": VIDEO,
-    **dict.fromkeys(PICTURES, PICTURE),
+    **dict.fromkeys(PICTURE_SUFFIXES, PICTURE),
 }
 #: Names of files, and the kind of a folder that has one of them. The first match counts.
 MARKS: tuple[tuple[tuple[str, ...], str], ...] = (
@@ -196,7 +196,7 @@ def _folder(path: Path) -> str:
             return kind
     if _is_camera(path):
         return CAMERA
-    return PICTURE_FOLDER if any(file.suffix.lower() in PICTURES for file in path.iterdir()) else OTHER
+    return PICTURE_FOLDER if any(file.suffix.lower() in PICTURE_SUFFIXES for file in path.iterdir()) else OTHER
 
 
 def _arrays(path: Path) -> str:

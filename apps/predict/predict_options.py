@@ -18,8 +18,19 @@ from trilane.options import Finite, Name, OnePath, Option, Options, Text, Texts,
 from trilane.scheduler.policy import MOST_FRAMES, PACED_WORDS, POLICIES, POLICY_WORDS
 from trilane.stages.run_options import PROFILE_HELP
 from trilane.transport.slots import DEFAULT_EDGE, EDGE_WORDS
-from trilane.unexpected_value import UnexpectedValue, either
-from trilane.units import AVATARS_HELP, BURST, HOST, MAX_MINUTES, PERFORMANCE_PROFILES, SUSTAINED, UNITS, UnitName
+from trilane.unexpected_value import UnexpectedValue
+from trilane.units import (
+    AVATARS_HELP,
+    BURST,
+    HOST,
+    MAX_CHANNELS,
+    MAX_MINUTES,
+    PERFORMANCE_PROFILES,
+    SUSTAINED,
+    UNITS,
+    UnitName,
+    either,
+)
 
 if TYPE_CHECKING:
     from trilane.hw_profiles.application import Variant
@@ -159,7 +170,7 @@ class PredictOptions(Options):
     encoder: str = Field(default="resnet18", description=f"{PUBLISHED}{ENCODER_HELP}")
     norm: str = Field(default="batch", description=f"{PUBLISHED}{NORM_HELP}")
     size: Text = Field(default="512", description=f"{PUBLISHED}{FIXED_SIZE_HELP}")
-    channels: int = Field(default=16, description=f"{PUBLISHED}channels of the neural texture, 1 to 16.")
+    channels: int = Field(default=16, description=f"{PUBLISHED}channels of the neural texture, 1 to {MAX_CHANNELS}.")
     layout: Annotated[str, _either(lambda: ("packed", "split"))] = Field(
         default="packed", description="packed: one raster pass; split: one for every 4 channels."
     )

@@ -21,11 +21,12 @@ from trilane.pipeline.unit_loop import BoundStage, factory_named
 from trilane.scene.planner import FrameWork
 from trilane.stages.avatar_assets import networks_of
 from trilane.stages.avatar_pipeline import avatar_pipeline
-from trilane.stages.config import MAX_CHANNELS, PAINTED_CHANNELS, network_parts
+from trilane.stages.config import PAINTED_CHANNELS, network_parts
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.pose import PoseStage
 from trilane.stages.gpu.opengl import CONTEXT, open_context
 from trilane.transport.packets import Packet, SlotLayout, view_packet
+from trilane.units import MAX_CHANNELS
 
 Units = Mapping[str, UnitContext]
 RASTER = 1

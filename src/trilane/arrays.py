@@ -48,9 +48,9 @@ def shape_buckets(size: str) -> list[Shape]:
     a multiple of BUCKET_STEP or is out of range.
     """
     if re.fullmatch(r"\d+", size):
-        return shapes_within(_check_side(int(size)) ** 2)
+        return shapes_within(check_side(int(size)) ** 2)
     height, width = parse_shape(size)
-    return [(_check_side(height), _check_side(width))]
+    return [(check_side(height), check_side(width))]
 
 
 def shapes_within(pixels: int) -> list[Shape]:
@@ -75,9 +75,10 @@ def psnr_db(square: float) -> float:
     return float(-10 * np.log10(max(square, LEAST_SQUARE)))
 
 
-def _check_side(side: int) -> int:
+def check_side(side: int, name: str = "side") -> int:
+    """Return `side` unchanged. Raises UnexpectedValue about `name` if a tensor cannot have this side."""
     if side % BUCKET_STEP or not BUCKET_STEP <= side <= MAX_SIDE:
-        raise UnexpectedValue(f"side {side}", f"a multiple of {BUCKET_STEP} from {BUCKET_STEP} to {MAX_SIDE}")
+        raise UnexpectedValue(f"{name} {side}", f"a multiple of {BUCKET_STEP} from {BUCKET_STEP} to {MAX_SIDE}")
     return side
 
 

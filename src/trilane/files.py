@@ -27,6 +27,7 @@ from trilane.errors import BadInputError, reason
 
 HEAD_BYTES = 512
 PICTURE, VIDEO, ARRAY, PICKLE, ARCHIVE, FOREIGN = "picture", "video", "array", "pickle", "archive", "foreign"
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 
 _AS_BVH = "in Blender: File > Import, choose the armature, then File > Export > Motion Capture (.bvh)"
 _OTHER_3D = f"export the motion as BVH, such as {_AS_BVH}"

@@ -7,7 +7,7 @@ scheduler's core may raise the error too.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 
@@ -23,11 +23,6 @@ class UnexpectedValue(ValueError):  # noqa: N818 - the value is at fault, as in 
 
     def __str__(self) -> str:
         return f"found {self.found}, expected {self.expected}" + (f"; {self.remedy}" if self.remedy else "")
-
-
-def either(words: Iterable[str]) -> str:
-    """Return `words` as a text such as `a, b or c`, for messages and helps."""
-    return " or ".join(", ".join(words).rsplit(", ", 1))
 
 
 def unexpected_in(details: Mapping[str, Any]) -> UnexpectedValue | None:

@@ -1,12 +1,19 @@
-"""Words that all folders share: units, profiles, the host's name, the avatar's stages, sources of figures.
+"""Words and numbers that all folders share, about avatars, units, profiles, the host, stages, sources of figures.
 
 Rule: each list and each phrase stands only here.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from enum import StrEnum
 from typing import Literal, get_args
+
+
+def either(words: Iterable[object]) -> str:
+    """Return `words` as a phrase, such as "a, b or c"."""
+    return " or ".join(", ".join(map(str, words)).rsplit(", ", 1))
+
 
 #: Nanoseconds in a millisecond and in a second.
 NS_PER_MS, NS_PER_S = 1e6, 1e9
@@ -20,6 +27,19 @@ AvatarName = Literal["default", "hiker", "dancer"]
 AVATARS: tuple[AvatarName, ...] = get_args(AvatarName)
 #: Help text for an option that names an avatar.
 AVATARS_HELP = f"{', '.join(f'`{name}`' for name in AVATARS)}, or the folder of an avatar."
+
+#: Name of the background that is drawn, and no file.
+ROOM = "room"
+
+#: Numbers of channels of the neural texture that the GPU packs in one pass, ascending; the largest of them.
+CHANNELS = (4, 8, 12, 16)
+MAX_CHANNELS = CHANNELS[-1]
+#: Most smaller levels of the neural texture. The fifth level of a usual texture of 512x512 has 16 texels along a side;
+#: a sixth would have too few for a body.
+MOST_TEXTURE_LEVELS = 5
+#: Methods by which a network is calibrated, and the usual method.
+CALIBRATION_METHODS = ("minmax", "percentile", "entropy")
+CALIBRATION_METHOD = CALIBRATION_METHODS[0]
 
 UnitName = Literal["cpu", "gpu", "dsp"]
 UNITS: tuple[UnitName, ...] = get_args(UnitName)

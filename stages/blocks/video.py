@@ -25,12 +25,12 @@ from PIL import Image, ImageOps, UnidentifiedImageError
 
 from trilane.arrays import U8, Shape
 from trilane.errors import BadInputError
+from trilane.files import PICTURE_SUFFIXES
 from trilane.pipeline.stage import Arrays, PortedStage, UnitContext
 from trilane.stages.cpu.present import Segment
 from trilane.stages.gpu.video_reader import VideoReader, video_stream
 from trilane.transport.live_window import LiveWindow
 
-PICTURES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 DEFAULT_FPS = 30.0
 EXPECTED = "a video or a folder of pictures"
 
@@ -64,9 +64,9 @@ def footage(path: Path) -> FoundPictures:
 
 def picture_files(folder: Path) -> list[Path]:
     """Return the pictures of a folder, sorted by name. Raises BadInputError if there is none."""
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in PICTURES)
+    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES)
     if not files:
-        expected = f"files that end in {', '.join(PICTURES)}"
+        expected = f"files that end in {', '.join(PICTURE_SUFFIXES)}"
         raise BadInputError(folder, "a folder without pictures", expected, "put some there, or change `path`")
     return files
 

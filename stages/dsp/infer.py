@@ -29,9 +29,10 @@ from trilane.machine import moved_of_kept
 from trilane.pipeline.memory import ByteCounter
 from trilane.pipeline.stage import UnitContext
 from trilane.stages.avatar_assets import networks_of
-from trilane.stages.config import MAX_CHANNELS, PAINTED_CHANNELS, RunConfig, network_parts
+from trilane.stages.config import PAINTED_CHANNELS, RunConfig, network_parts
 from trilane.stages.dsp.runtime import Binding, RuntimeOptions, Session, copies_slots, has_device, load_runtime, resolve
 from trilane.transport.packets import Packet
+from trilane.units import MAX_CHANNELS
 
 VERSION = "network parts 1"  # raise the number when the same network and cuts give other parts
 SHAPES = ("inputs", "outputs", "crossing_in", "crossing_out")

@@ -29,7 +29,7 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 from trilane import machine
 from trilane.arrays import U8, Shape
 from trilane.errors import BadInputError, reason
-from trilane.files import HEAD_BYTES, PICTURE, VIDEO, require_file, signature_of_head
+from trilane.files import HEAD_BYTES, PICTURE, PICTURE_SUFFIXES, VIDEO, require_file, signature_of_head
 from trilane.scene.camera.path import CameraPath
 from trilane.scene.footage import Footage, Stored, film_of, in_order
 from trilane.scene.lens import cover
@@ -43,7 +43,6 @@ from trilane.stages.gpu.video_reader import (
     video_stream,
 )
 
-PICTURES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff"})
 #: Suffixes of phone photos that Pillow does not read; FFmpeg would show only one tile of them.
 PHONE_PHOTOS = frozenset({".heic", ".heif", ".hif"})
 MAX_PIXELS = 64_000_000
@@ -150,7 +149,7 @@ def open_background(path: Path, shape: Shape, fps: float, camera: CameraPath | N
 
 def is_picture(path: Path) -> bool:
     """Return whether `path` has the suffix of a picture."""
-    return path.suffix.lower() in PICTURES | PHONE_PHOTOS
+    return path.suffix.lower() in (*PICTURE_SUFFIXES, *PHONE_PHOTOS)
 
 
 def pictures_in(folder: Path) -> list[Path]:
@@ -162,7 +161,7 @@ def pictures_in(folder: Path) -> list[Path]:
     if not names:
         near = next((sub for sub in sorted(folder.iterdir()) if sub.is_dir() and _names_in(sub)), None)
         remedy = f"did you mean {near}?" if near else ""
-        raise BadInputError(folder, "no pictures", f"files that end in {', '.join(sorted(PICTURES))}", remedy)
+        raise BadInputError(folder, "no pictures", f"files that end in {', '.join(sorted(PICTURE_SUFFIXES))}", remedy)
     pictures = [folder / name for name in in_order(names)]
     for path in pictures:
         require_file(path, "a picture")  # refuses a pipe with such a name, which could block for ever
@@ -172,7 +171,7 @@ def pictures_in(folder: Path) -> list[Path]:
 def _names_in(folder: Path) -> list[str]:
     """Return the names of the pictures in `folder`. Raises BadInputError if it cannot be read."""
     try:
-        return [path.name for path in folder.iterdir() if path.suffix.lower() in PICTURES]
+        return [path.name for path in folder.iterdir() if path.suffix.lower() in PICTURE_SUFFIXES]
     except OSError as error:
         raise BadInputError(folder, f"no readable folder ({reason(error)})", "a folder of pictures") from None
 

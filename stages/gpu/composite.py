@@ -56,6 +56,7 @@ from trilane.stages.gpu.opengl import (
     upload,
 )
 from trilane.transport.packets import Packet
+from trilane.units import ROOM
 
 #: Inputs of a frame's picture: number of the avatars' picture, number of the background's picture, view, projection.
 Drawing = tuple[int, int, bytes, bytes]
@@ -188,9 +189,6 @@ def hud_picture(lines: list[str], font: Any) -> NDArray[np.uint8]:
     image = Image.new("RGBA", SIZE, SHEET)
     ImageDraw.Draw(image).multiline_text((8, 3), "\n".join(lines), INK, font, spacing=3)
     return np.asarray(image)
-
-
-ROOM = "room"
 
 
 class CompositeStage:

@@ -27,7 +27,7 @@ from trilane.errors import BadInputError, TrilaneError
 from trilane.pipeline.stage import UnitContext
 from trilane.scene.crop import Rect, crop_projection
 from trilane.stages.avatar_assets import bodies_drawn, distinct, levels_of, quantisation_of, texture_of
-from trilane.stages.config import MAX_CHANNELS, Quantisation, RunConfig, network_parts, posed_vertices
+from trilane.stages.config import Quantisation, RunConfig, network_parts, posed_vertices
 from trilane.stages.gpu import opengl
 from trilane.stages.gpu.opengl import (
     CONTEXT,
@@ -42,6 +42,7 @@ from trilane.stages.gpu.opengl import (
 )
 from trilane.stages.gpu.skinned_mesh import BodyPose, Mesh, MeshDraw, PosedMesh, SkinnedMesh, avatar_mesh
 from trilane.transport.packets import Packet
+from trilane.units import CHANNELS, MAX_CHANNELS, either
 
 #: (minifying filter, largest anisotropy) of the neural texture, by the scene's word; a driver may limit the anisotropy.
 FILTERS = {
@@ -117,7 +118,6 @@ def check_texture(texture: Floats, channels: int) -> None:
         raise BadInputError("neural texture", f"a value of {largest}", f"numbers within FP16's ±{FP16_MAX:.0f}")
 
 
-CHANNELS = (4, 8, 12, 16)
 WORD_TYPES = {1: "uint", 2: "uvec2", 3: "uvec4", 4: "uvec4"}
 #: Number of 32-bit words in a target's pixel, by the number of words in a tensor's pixel. OpenGL does not guarantee
 #: targets of three words, so such a target has four words, and the fourth is not read back.
@@ -186,7 +186,7 @@ class PackedPass:
         if deferred and filtering != "linear":
             raise BadInputError("texture filter", filtering, "linear", "draw mesh and texture in one pass")
         if channels not in CHANNELS:
-            raise BadInputError("network input", f"{channels} channels", "4, 8, 12 or 16", "pad with zero channels")
+            raise BadInputError("network input", f"{channels} channels", either(CHANNELS), "pad with zero channels")
         self.ctx, self.channels, self.quantisation, self.deferred = ctx, channels, quantisation, deferred
         self.filtering = filtering
         self._targets: dict[Shape, Target] = {}

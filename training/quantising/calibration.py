@@ -22,13 +22,13 @@ from onnx import numpy_helper
 from onnxruntime.quantization import CalibrationDataReader, CalibrationMethod, QuantType, create_calibrator
 
 from trilane.errors import BadInputError
+from trilane.units import CALIBRATION_METHODS
 
 FINITE = "a network whose tensors are finite on the frames"
-METHODS = {
-    "minmax": (CalibrationMethod.MinMax, {}),
-    "percentile": (CalibrationMethod.Percentile, {"percentile": 99.99}),
-    "entropy": (CalibrationMethod.Entropy, {}),
-}
+#: ONNX Runtime's methods by their names in small letters; `CALIBRATION_METHODS` has some of these names.
+KINDS = {kind.name.lower(): kind for kind in CalibrationMethod}
+#: Settings of ONNX Runtime's calibrators; each reads its own.
+SETTINGS = {"percentile": 99.99}
 #: If a logit's size is at least this, its sigmoid rounds to byte 0 or 255. A wider range would only make steps coarser.
 LOGIT_LIMIT = 6.5
 #: Operators that only move bytes, so that their output has the range of their input.
@@ -49,17 +49,17 @@ def measure(path: Path, frames: Sequence[NDArray[np.float32]], method: str, oper
 
     `path`: file of the float network; a second file is written beside it.
     `frames`: inputs (H, W, C) float32. They are fed one by one, so that memory does not grow with their number.
-    `method`: a name of `METHODS`.
+    `method`: a name of `CALIBRATION_METHODS`.
     `operators`: types of the operators whose inputs and outputs are measured.
 
     Raises BadInputError for an unknown method or tensors that are not finite.
     """
-    if method not in METHODS:
-        raise BadInputError("quantise", f"method {method!r}", f"one of {', '.join(METHODS)}")
-    kind, options = METHODS[method]
+    if method not in CALIBRATION_METHODS:
+        raise BadInputError("quantise", f"method {method!r}", f"one of {', '.join(CALIBRATION_METHODS)}")
     name = onnx.load(path, load_external_data=False).graph.input[0].name
+    kind = KINDS[method]
     calibrator = create_calibrator(
-        path, list(operators), str(path.with_suffix(".augmented.onnx")), calibrate_method=kind, extra_options=options
+        path, list(operators), str(path.with_suffix(".augmented.onnx")), calibrate_method=kind, extra_options=SETTINGS
     )
     with contextlib.redirect_stdout(io.StringIO()):
         try:

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from trilane.arrays import F32
 from trilane.errors import BadInputError
 from trilane.hw_profiles.governor import figure_for
-from trilane.training.quantising.calibration import METHODS
 from trilane.training.quantising.quantise import quantise
+from trilane.units import CALIBRATION_METHODS
 from trilane.writing import write_atomically
 
 #: PSNRs that differ by at most this many dB count as equal.
@@ -34,7 +34,7 @@ ERRORS_ONLY = 3
 def calibration_table(
     model: onnx.ModelProto,
     frames: Sequence[F32],
-    methods: Sequence[str] = tuple(METHODS),
+    methods: Sequence[str] = CALIBRATION_METHODS,
     counts: Sequence[int] = COUNTS,
     held_out: int = EVALUATED,
 ) -> Iterator[dict[str, Any]]:
@@ -45,7 +45,7 @@ def calibration_table(
 
     `model`: float network with an input of (1, C, H, W).
     `frames`: inputs (H, W, C) float32.
-    `methods`: names of `METHODS`.
+    `methods`: names of `CALIBRATION_METHODS`.
     `counts`: numbers of calibration frames. A count that would reach into the last `held_out` frames is left out.
     `held_out`: number of frames, at the end of `frames`, on which the error is measured.
 
@@ -56,8 +56,8 @@ def calibration_table(
     if not possible:
         raise BadInputError("frames", f"{len(frames)} of them", f"at least {min(counts) + held_out}")
     for method in methods:
-        if method not in METHODS:
-            raise BadInputError("--method", repr(method), f"one of {', '.join(METHODS)}")
+        if method not in CALIBRATION_METHODS:
+            raise BadInputError("--method", repr(method), f"one of {', '.join(CALIBRATION_METHODS)}")
     evaluated = frames[spare:]
     run = _session(model)
     channels_first = [np.ascontiguousarray(frame.transpose(2, 0, 1)[None]) for frame in evaluated]

@@ -42,6 +42,7 @@ from trilane.training.quantising.calibration import (
     share_ranges,
     widen,
 )
+from trilane.units import CALIBRATION_METHOD
 
 MIN_FRAMES, MAX_FRAMES = 1, 1000
 
@@ -90,7 +91,7 @@ class _Calibrated:
 def quantise(
     model: onnx.ModelProto,
     frames: Sequence[F32],
-    method: str = "minmax",
+    method: str = CALIBRATION_METHOD,
     reduce_range: bool = True,
     keep_float: Sequence[str] = (),
 ) -> Quantised:
@@ -98,7 +99,7 @@ def quantise(
 
     `model`: network with one float32 input (1, C, H, W), and one output (1, 4, H, W) in 0..1 from a Sigmoid.
     `frames`: real inputs (H, W, C) float32 for the calibration; 1 to 1000 frames.
-    `method`: calibration method, a name of `METHODS`.
+    `method`: calibration method, a name of `CALIBRATION_METHODS`.
     `reduce_range`: whether weights have 7 bits instead of 8.
     `keep_float`: names of nodes that stay in float.
 
@@ -130,7 +131,7 @@ def quantise(
     return Quantised(check_network(quantised, "quantised network"), facts, constants)
 
 
-def byte_ranges(model: onnx.ModelProto, frames: Sequence[F32], method: str = "minmax") -> ByteRanges:
+def byte_ranges(model: onnx.ModelProto, frames: Sequence[F32], method: str = CALIBRATION_METHOD) -> ByteRanges:
     """Return the ranges that `quantise` gives the tensors of `model` for the same arguments.
 
     Raises BadInputError as `quantise` does.

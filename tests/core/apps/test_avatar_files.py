@@ -23,9 +23,8 @@ from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation, digests_of
 from trilane.avatars.validation import DrawnAs, accuracy_of
 from trilane.bench.lib import full_picture
 from trilane.errors import BadInputError
-from trilane.stages.run_options import METHODS, RunOptions, calibration_of
+from trilane.stages.run_options import RunOptions, calibration_of
 from trilane.training.clothing import LOOKS, look_of
-from trilane.training.quantising import calibration
 from trilane.training.quantising.quantise import quantise
 
 Command = Callable[..., tuple[str, str]]
@@ -230,10 +229,6 @@ def test_a_body_where_an_avatar_is_expected_is_answered_with_both_ways(command: 
 
 
 OWN = RunOptions(width=8, channels=4)
-
-
-def test_the_methods_are_those_of_the_quantiser() -> None:
-    assert set(METHODS) == set(calibration.METHODS)
 
 
 @pytest.mark.parametrize(

@@ -129,8 +129,8 @@ def test_the_float_network_and_its_inputs_are_written(monkeypatch, groups, tmp_p
 def test_the_network_is_calibrated_on_chosen_samples_of_one_shape(monkeypatch, groups):
     asked = []
 
-    def quantise(model, frames, method):
-        asked.append((model, frames, method))
+    def quantise(model, frames):
+        asked.append((model, frames))
         return Quantised(SimpleNamespace(name="made"), {"a": 1}, {})
 
     monkeypatch.setattr(make_bundle, "CALIBRATION_SHAPE", (64, 32))
@@ -140,8 +140,8 @@ def test_the_network_is_calibrated_on_chosen_samples_of_one_shape(monkeypatch, g
     monkeypatch.setattr(make_bundle, "reshaped", lambda network, *shape: (network.name, shape))
     made = avatar(noise(1))
     assert make_bundle.integer_network(made, groups, 9) == Quantised(("made", (256, 256)), {"a": 1}, {})
-    ((model, frames, method),) = asked
-    assert model == (made.network, (64, 32)) and method == "minmax"
+    ((model, frames),) = asked
+    assert model == (made.network, (64, 32))
     chosen = sorted(np.random.default_rng(9).permutation(7)[:4])
     image = made.textures[0].image().detach()[0].permute(1, 2, 0).numpy()
     for frame, number in zip(frames, chosen, strict=True):

@@ -16,10 +16,11 @@ from onnx import TensorProto, helper, numpy_helper
 
 from trilane.errors import BadInputError
 from trilane.training.quantising import calibration_table as table
-from trilane.training.quantising.calibration import METHODS, saturated, share_ranges, widen
+from trilane.training.quantising.calibration import saturated, share_ranges, widen
 from trilane.training.quantising.calibration_table import plot_calibrations
 from trilane.training.quantising.noise_model import _sqnr_db, layer_report
 from trilane.training.quantising.quantise import equalised, quantise
+from trilane.units import CALIBRATION_METHODS
 
 
 def run(model, feed):
@@ -82,7 +83,7 @@ def summing_network(norm):
     return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8)
 
 
-@pytest.mark.parametrize("method", METHODS)
+@pytest.mark.parametrize("method", CALIBRATION_METHODS)
 def test_every_method_calibrates(tiny_float, tiny_frames, method):
     result = quantise(tiny_float, tiny_frames, method)
     assert result.facts["method"] == method and result.facts["calibration_frames"] == len(tiny_frames)
