@@ -25,7 +25,7 @@ from trilane.avatars.manifest import sha256_of
 from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.training.capture.capture_samples import CaptureRenderer
-from trilane.training.clothing import KEY
+from trilane.training.clothing import KEY, look_named
 from trilane.training.dataset import (
     FIELDS,
     VALIDATION_SIZE,
@@ -197,6 +197,8 @@ def _subjects(
     if not settings.looks:
         raise BadInputError("CAPTURE", "none", "the folder of a capture", "or settings (--config) with a `look`")
     body = bundle_folder("default") / "body.npz"
+    for look in settings.looks:
+        look_named(look)  # an unknown look is refused before any work
     for look in settings.looks:
         alone = len(settings.looks) == 1
         own = places if alone else replace(places, out=places.out / look, work=places.work / look, name=look)

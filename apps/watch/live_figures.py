@@ -52,7 +52,7 @@ from trilane.scheduler.stats import due_ns, summary_ms
 from trilane.units import COMPUTED, MEASURED, NS_PER_MS, NS_PER_S
 
 WINDOW_NS: Final = 5_000_000_000
-WINDOW: Final = f"last {WINDOW_NS // NS_PER_S} s"
+WINDOW: Final = f"last {WINDOW_NS / NS_PER_S:g} s"
 MOST_NOTES = 5
 BYTES, LEAST = "bytes_", "least"  # prefix of a stage's metrics of bytes moved; the kind of the least bytes
 LEAST_KEY = f"stages.*.bytes.{LEAST}"

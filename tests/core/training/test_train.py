@@ -199,6 +199,13 @@ def test_one_person_is_trained(capture: Path | None, look: str | None, said: str
         train_avatar(TrainingPlaces(capture, tmp_path / "mine", tmp_path / "work", "mine"), settings(look=look), Told())
 
 
+def test_an_unknown_look_is_refused_before_any_work(log: list[Any], tmp_path: Path) -> None:
+    there = TrainingPlaces(None, tmp_path / "both", tmp_path / "work", "both")
+    with pytest.raises(BadInputError, match="look: found 'walker', expected one of default, hiker, dancer"):
+        train_avatar(there, settings(look=["default", "walker"]), Told())
+    assert log == [] and not there.work.exists()
+
+
 def test_several_looks_are_painted_by_one_network(
     log: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
