@@ -12,6 +12,7 @@ the bodies' rectangles and the tensor's crop rectangles.
 from __future__ import annotations
 
 import math
+import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -36,7 +37,7 @@ from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.pipeline.memory import Assets
 from trilane.scene.crop import Rect
-from trilane.scene.planner import FrameWork
+from trilane.scene.planner import FrameWork, pixels_of
 from trilane.scene.tensor_budget import ALL_WORK, MOST_DENSITY
 from trilane.scheduler.placement import Ranked
 from trilane.stages.avatar_assets import distinct, mesh_levels_of, networks_of, painting, shaped_body, staged_of
@@ -279,10 +280,10 @@ def explain(checked: Checked, profile: str, performance_profile: str) -> PlanExp
         "shapes": [list(shape) for shape in checked.config.buckets],
         "avatars": [_avatar(checked, number) for number in range(len(scene.avatars))],
         "phases": [
-            _phase(group, errors, costs, names, bodies) | {"why": _why(group, _tolerance(checked.config))}
+            _phase(group, errors, costs, names, bodies) | {"why": _why(group, checked.config, plan.output)}
             for group, errors in zip(groups, rows, strict=True)
         ],
-        "image": _image(checked),
+        "image": _image(checked, any(is_limited(planned, checked.config, plan.output) for planned in frames)),
         "totals": _totals(frames, costs),
         "placement": costs.placement(*_usual(frames, costs), checked.asked_cores),
         "notes": list(checked.notes),
@@ -316,15 +317,20 @@ class _Bodies:
         return left_out(DETAILS[level], self._bodies[avatar])
 
 
-def _image(checked: Checked) -> dict[str, Any]:
+def _image(checked: Checked, limited: bool) -> dict[str, Any]:
     """Return the part of the document about the size of planned tensors.
 
     Keys: `work`: pixels of a tensor, as a share of its network's own pixels. `psnr_loss_db`: PSNR that this size costs;
     None if not known. `source`: source of both. If the scene fixes the size, both are None.
+
+    `limited`: whether `most_side` limits the tensor of a frame, so that its loss was not measured.
     """
     if not checked.config.scene.plans_tensor:
         return {"work": None, "psnr_loss_db": None, "source": "the scene fixes the tensor's size"}
     work = checked.config.works[0]
+    if limited:
+        source = f"most_side = {checked.config.scene.most_side} gives avatars fewer pixels than they need"
+        return {"work": work / ALL_WORK, "psnr_loss_db": None, "source": source}
     sources = "; ".join(dict.fromkeys(loss.source for loss in checked.losses))
     return {"work": work / ALL_WORK, "psnr_loss_db": worst_loss(work, checked.losses), "source": sources}
 
@@ -397,17 +403,32 @@ def _tolerance(config: RunConfig) -> str:
     return " or ".join(f"{tolerance:g} dB" for tolerance in sorted({tolerance_db(count) for count in sharing.values()}))
 
 
-def _why(group: Sequence[PlannedFrame], tolerance: str) -> str:
+def is_limited(planned: PlannedFrame, config: RunConfig, output: Shape) -> bool:
+    """Return whether `most_side` gives the avatars of a frame fewer pixels than they get without this limit.
+
+    `output`: (height, width) of the picture.
+    """
+    if planned.plan.density is None or not planned.crops:
+        return False
+    rects, whole = list(planned.crops.values()), config.tensor_budgets[0]
+    networks = [config.networks[number] for number in planned.crops] if config.networks else []
+    own, wanted = (pixels_of(rects, networks, output, replace(whole, most=most)) for most in (whole.most, sys.maxsize))
+    return own < wanted
+
+
+def _why(group: Sequence[PlannedFrame], config: RunConfig, output: Shape) -> str:
     """Return, in words, why the tensor of a phase has its size.
 
-    `group`: frames of the phase. `tolerance`: result of `_tolerance`.
+    `group`: frames of the phase. `output`: (height, width) of the picture.
     """
     first = group[0].plan
     if first.work in WHY:
         return WHY[first.work]
     if first.density is None:
         return "the scene fixes the tensor's size"
-    if tolerance:
+    if any(is_limited(planned, config, output) for planned in group):
+        return f"as many pixels as most_side = {config.scene.most_side} allows: the avatars need more"
+    if tolerance := _tolerance(config):
         return f"the fewest pixels within {tolerance} of the best size, by the table `by_size` in the manifest"
     if _most(group) >= MOST_DENSITY:
         return f"{MOST_DENSITY:g} tensor pixels along a side of a pixel of the picture: more make no better picture"

@@ -167,6 +167,18 @@ def test_a_fixed_size_is_explained_as_such_and_its_picture_named_in_one_line(fol
     assert all(row["density"] is None for row in rows)
 
 
+def test_a_tensor_that_most_side_limits_says_so_and_claims_no_loss(tiny_bundle: Path, tmp_path: Path) -> None:
+    """A body of about 75 x 30 pixels needs more than 32 x 32; without the limit, nothing speaks of it."""
+    text = SCENE.format(bundle=tiny_bundle)
+    (tmp_path / "small.toml").write_text(text.replace('size = "auto"', 'size = "auto"\nmost_side = 32'))
+    small = json.loads(explained(tmp_path, "--json").stdout)
+    assert {row["why"] for row in small["phases"]} == {"as many pixels as most_side = 32 allows: the avatars need more"}
+    assert small["image"]["psnr_loss_db"] is None and "most_side = 32" in small["image"]["source"]
+    (tmp_path / "small.toml").write_text(text)
+    large = json.loads(explained(tmp_path, "--json").stdout)
+    assert "most_side" not in json.dumps([large["phases"], large["image"]])
+
+
 def test_the_table_names_avatars_reasons_in_order_and_how_to_read_it(checked: Checked, folder: Path) -> None:
     """The scene's notes are on stderr, as those of a run, so that nothing that was decided is silent."""
     result = explained(folder)
