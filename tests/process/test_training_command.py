@@ -32,7 +32,8 @@ def test_a_bundled_avatar_is_trained_further_by_its_settings(tmp_path: Path) -> 
     out, work, config = tmp_path / "further", tmp_path / "further-work", tmp_path / "few.toml"
     settings = read_settings(bundle_folder("hiker") / "training.toml").model_dump(by_alias=True, exclude_none=True)
     few = {"look": "hiker", "threads": 1, "samples": 8, "steps": 10, "batch": 2, "stand_off": False, "device": "cpu"}
-    config.write_text(settings_text(parsed_settings(settings | few, "a test")))
+    alone = {"batches": settings["batches"] | {"look_repeats": ()}}
+    config.write_text(settings_text(parsed_settings(settings | few | alone, "a test")))
     trained = command("avatar", "train", "--config", config, "--out", out)
     assert (trained["avatar"], trained["steps"]) == (str(out), 10)
     assert read_settings(out / "training.toml") == read_settings(config)
