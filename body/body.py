@@ -395,13 +395,11 @@ def _skin(path: Path, arrays: dict[str, NDArray[Any]]) -> tuple[int, int] | None
     skin = int(array[0]), int(array[1])
     if not (0 < skin[0] <= vertices and 0 < skin[1] <= faces):
         raise BadInputError(where, f"{skin}", f"1 to {vertices} vertices, 1 to {faces} faces")
-    (mixed, _), (joints, _) = (
-        np.nonzero(arrays["f"][: skin[1]] >= skin[0]),
-        np.nonzero(arrays["J_regressor"][:, skin[0] :]),
-    )
+    mixed = np.flatnonzero((arrays["f"][: skin[1]] >= skin[0]).any(axis=1))
     if len(mixed):
         found = f"face {mixed[0]}, a face of the skin with a garment's vertex"
         raise BadInputError(where, found, f"vertices 0 to {skin[0] - 1}")
+    joints = np.flatnonzero(arrays["J_regressor"][:, skin[0] :].any(axis=1))
     if len(joints):
         found = f"joint {joints[0]}, a joint that depends on a garment's vertex"
         raise BadInputError(where, found, "zeros there in J_regressor")

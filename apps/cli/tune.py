@@ -38,7 +38,7 @@ from trilane.apps.cli.sweep import (
     text,
     words_text,
 )
-from trilane.apps.sweep.goal_metrics import METRICS
+from trilane.apps.sweep.definition import COMMANDS, METRICS
 from trilane.errors import BadInputError, did_you_mean
 from trilane.units import HOST, either
 
@@ -147,8 +147,6 @@ def _goals(words: Sequence[str]) -> tuple[tuple[str, ...], list[str]]:
     `words`: arguments as typed. Without a goal, the goal is `fps`. Raises BadInputError if the first word is neither
     goals, nor a sweep file, nor a command.
     """
-    from trilane.apps.sweep.definition import COMMANDS
-
     first = words[0]
     goals = tuple(dict.fromkeys(first.split(",")))
     if all(goal in METRICS for goal in goals):

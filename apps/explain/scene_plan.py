@@ -264,6 +264,7 @@ def explain(checked: Checked, profile: str, performance_profile: str) -> PlanExp
         frames.append(planned)
     groups, bodies = phases(frames), _Bodies(checked)
     names = [str(spec.name) for spec in scene.avatars]
+    limited = [any(_is_limited(planned, checked.config, plan.output) for planned in group) for group in groups]
     document = {
         "scene": scene.name,
         "config": {
@@ -280,10 +281,10 @@ def explain(checked: Checked, profile: str, performance_profile: str) -> PlanExp
         "shapes": [list(shape) for shape in checked.config.buckets],
         "avatars": [_avatar(checked, number) for number in range(len(scene.avatars))],
         "phases": [
-            _phase(group, errors, costs, names, bodies) | {"why": _why(group, checked.config, plan.output)}
-            for group, errors in zip(groups, rows, strict=True)
+            _phase(group, errors, costs, names, bodies) | {"why": _why(group, checked.config, is_limited)}
+            for group, errors, is_limited in zip(groups, rows, limited, strict=True)
         ],
-        "image": _image(checked, any(is_limited(planned, checked.config, plan.output) for planned in frames)),
+        "image": _image(checked, any(limited)),
         "totals": _totals(frames, costs),
         "placement": costs.placement(*_usual(frames, costs), checked.asked_cores),
         "notes": list(checked.notes),
@@ -317,18 +318,18 @@ class _Bodies:
         return left_out(DETAILS[level], self._bodies[avatar])
 
 
-def _image(checked: Checked, limited: bool) -> dict[str, Any]:
+def _image(checked: Checked, is_limited: bool) -> dict[str, Any]:
     """Return the part of the document about the size of planned tensors.
 
     Keys: `work`: pixels of a tensor, as a share of its network's own pixels. `psnr_loss_db`: PSNR that this size costs;
     None if not known. `source`: source of both. If the scene fixes the size, both are None.
 
-    `limited`: whether `most_side` limits the tensor of a frame, so that its loss was not measured.
+    `is_limited`: whether `most_side` limits the tensor of a frame, so that its loss was not measured.
     """
     if not checked.config.scene.plans_tensor:
         return {"work": None, "psnr_loss_db": None, "source": "the scene fixes the tensor's size"}
     work = checked.config.works[0]
-    if limited:
+    if is_limited:
         source = f"most_side = {checked.config.scene.most_side} gives avatars fewer pixels than they need"
         return {"work": work / ALL_WORK, "psnr_loss_db": None, "source": source}
     sources = "; ".join(dict.fromkeys(loss.source for loss in checked.losses))
@@ -403,7 +404,7 @@ def _tolerance(config: RunConfig) -> str:
     return " or ".join(f"{tolerance:g} dB" for tolerance in sorted({tolerance_db(count) for count in sharing.values()}))
 
 
-def is_limited(planned: PlannedFrame, config: RunConfig, output: Shape) -> bool:
+def _is_limited(planned: PlannedFrame, config: RunConfig, output: Shape) -> bool:
     """Return whether `most_side` gives the avatars of a frame fewer pixels than they get without this limit.
 
     `output`: (height, width) of the picture.
@@ -416,17 +417,17 @@ def is_limited(planned: PlannedFrame, config: RunConfig, output: Shape) -> bool:
     return own < wanted
 
 
-def _why(group: Sequence[PlannedFrame], config: RunConfig, output: Shape) -> str:
+def _why(group: Sequence[PlannedFrame], config: RunConfig, is_limited: bool) -> str:
     """Return, in words, why the tensor of a phase has its size.
 
-    `group`: frames of the phase. `output`: (height, width) of the picture.
+    `group`: frames of the phase. `is_limited`: whether `most_side` limits one of them.
     """
     first = group[0].plan
     if first.work in WHY:
         return WHY[first.work]
     if first.density is None:
         return "the scene fixes the tensor's size"
-    if any(is_limited(planned, config, output) for planned in group):
+    if is_limited:
         return f"as many pixels as most_side = {config.scene.most_side} allows: the avatars need more"
     if tolerance := _tolerance(config):
         return f"the fewest pixels within {tolerance} of the best size, by the table `by_size` in the manifest"

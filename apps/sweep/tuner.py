@@ -17,8 +17,7 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 from trilane.apps.compare.overview import entry_of
-from trilane.apps.sweep.definition import Definition, Options, SweepKind, Trial, Value, trials_of
-from trilane.apps.sweep.goal_metrics import METRICS
+from trilane.apps.sweep.definition import METRICS, Definition, Options, SweepKind, Trial, Value, trials_of
 from trilane.apps.sweep.store import Record, row_of
 from trilane.errors import BadInputError, MissingPartError, did_you_mean
 

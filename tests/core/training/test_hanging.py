@@ -15,7 +15,9 @@ from scipy.sparse.csgraph import connected_components
 
 from trilane.avatars.bundle import bundle_folder
 from trilane.body.body import ShapedBody, load_body
+from trilane.errors import BadInputError
 from trilane.stages.gpu.skinned_mesh import enough_weights, is_closed
+from trilane.training import hanging
 from trilane.training.clothing import DANCER, HANGING, find_landmarks
 from trilane.training.first_texture import used_texels
 from trilane.training.hanging import LINING_M, dressed_body, largest_rectangle
@@ -43,6 +45,18 @@ def test_a_look_without_a_garment_that_hangs_keeps_the_body_s_file(tmp_path: Pat
 def test_a_file_that_is_there_is_kept(tmp_path: Path) -> None:
     (tmp_path / "body.npz").write_bytes(b"kept")
     assert dressed_body(DEFAULT_BODY, "dancer", tmp_path).read_bytes() == b"kept"
+
+
+def test_a_body_without_free_texels_is_refused_and_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Eight free texels on a side are the margins alone."""
+    used = np.ones((512, 512), bool)
+    used[:8, :] = False
+    monkeypatch.setattr(hanging, "used_texels", lambda *_: used)
+    with pytest.raises(BadInputError, match="512 x 8 free texels, expected more than 8 on each side"):
+        dressed_body(DEFAULT_BODY, "dancer", tmp_path)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_without_its_garments_the_body_is_what_it_was(dressed: ShapedBody, skin: ShapedBody) -> None:
