@@ -66,10 +66,26 @@ def stage_scene(scene: Scene, bodies: Sequence[ShapedBody], base: Path, footage:
     camera = place_camera(path, scene, movers, bodies)
     notes = [f"motion: {note}" for mover in movers for note in (*mover.motion.notes, *mover.notes)]
     shown = seen_notes(camera, scene, movers, bodies)
+    notes += [f"avatars: {note}" for note in _shared_places(scene, movers)]
     courses = (path.course,) if path.recorded else ()
     notes += [f"camera: {note}" for note in (*path.notes, *courses, *camera.notes, *shown)]
     notes += [f"background: {note}" for note in seen]
     return Staged(movers, camera, tuple(notes))
+
+
+#: Two avatars whose pelvises are nearer to each other than this, in metres, are drawn into each other.
+APART_M = 0.2
+
+
+def _shared_places(scene: Scene, movers: Sequence[Mover]) -> Iterator[str]:
+    """Yield a sentence for each avatar that stands where an avatar before it stands, at the first frame."""
+    places = [(mover.world @ [*mover.sample(0.0)[1], 1.0])[:3] for mover in movers]
+    names = [str(avatar.name) for avatar in scene.avatars]
+    for number, place in enumerate(places):
+        for other in range(number):
+            if np.linalg.norm(place - places[other]) < APART_M:
+                yield f"{names[other]} and {names[number]} stand in one place; the key `position` moves an avatar"
+                break
 
 
 Arrays = dict[str, NDArray[Any]]

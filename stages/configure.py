@@ -177,7 +177,7 @@ def configure(
     )
     notes = (*staged.notes, f"runtime: {runtime} ({reason})", f"skinning: {unit} unit ({why})")
     notes += (f"networks: {len(networks)}, each with a tensor and an inference of its own",) if painters else ()
-    notes += foreseen.notes(scene.memory_mb) if foreseen else ()
+    notes += foreseen.notes(scene.memory_mb, scene.most_side) if foreseen else ()
     notes += (sizes,) if sizes else ()
     drawn = DrawnAs(runtime, scene.size, scene.texture_filter)
     accuracy = _accuracy([(avatar, sharing[numbers[folder]]) for folder, avatar in avatars.items()], drawn)

@@ -12,8 +12,9 @@ used.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -96,6 +97,7 @@ class Foreseen:
     `frames`: numbers of the examined frames.
     `seen`: number of examined frames that show somebody.
     `left_out`: number of smaller sizes without a shape, because `memory_mb` has no room for one.
+    `limited`: number of examined frames in which the budget has fewer pixels than the avatars need.
     `changes`: for each budget, pairs of a time in seconds at which the tensor changes, and its shape from then on;
     empty if the changes are not foreseen.
     """
@@ -104,6 +106,7 @@ class Foreseen:
     frames: tuple[int, ...]
     seen: int
     left_out: int = 0
+    limited: int = 0
     changes: Changes = ()
 
     @property
@@ -118,8 +121,8 @@ class Foreseen:
             text += f"; {self.shapes.unserved} of them have no shape of their own within memory_mb and are less dense"
         return text
 
-    def notes(self, memory_mb: int) -> tuple[str, ...]:
-        """Return `note`, and sentences about sizes or a network that do not fit into `memory_mb`.
+    def notes(self, memory_mb: int, most_side: int) -> tuple[str, ...]:
+        """Return `note`, and sentences about what `memory_mb` and `most_side` leave out.
 
         The memory is computed, not measured.
         """
@@ -127,6 +130,11 @@ class Foreseen:
         if self.left_out:
             notes.append(
                 f"memory: {self.left_out} of the smaller tensor sizes have no shape within memory_mb {memory_mb}"
+            )
+        if self.limited:
+            notes.append(
+                f"tensor: most_side = {most_side} gives avatars fewer pixels than they need in {self.limited} of these "
+                "frames; the picture is worse there, by an amount that was not measured"
             )
         needed = math.ceil(self.shapes.memory_bytes / MB)
         if needed > memory_mb:
@@ -164,6 +172,7 @@ def foresee(
     seen = [(list(look.rects.values()), look.networks(painted.by)) for look in looks if look.rects]
     are_close = scene.frames <= MOST_APART * count
     per_pixel = sum(map(bytes_per_pixel, painted.networks))
+    limited = sum(is_limited(rects, by, output, budgets[0]) for rects, by in seen)
     chosen, left_out, changes = ShapeSet((), 0, 0), 0, []
     for budget in budgets:
         demands = [
@@ -185,7 +194,17 @@ def foresee(
             # Without shapes of its own, this budget's tensors change at the same times as the larger budget's.
             changes.append(changes[-1])
         chosen = joined(chosen, found)
-    return Foreseen(chosen, frames, len(seen), left_out, tuple(changes))
+    return Foreseen(chosen, frames, len(seen), left_out, limited, tuple(changes))
+
+
+def is_limited(rects: Sequence[Rect], networks: Sequence[int], output: Shape, budget: TensorBudget) -> bool:
+    """Return whether avatars get fewer pixels by `budget` than they would get without its limit.
+
+    `rects`, `networks`: rectangle and network of each avatar in view; `networks` is empty if one paints all.
+    `output`: (height, width) of the picture.
+    """
+    own, wanted = (pixels_of(rects, networks, output, replace(budget, most=m)) for m in (budget.most, sys.maxsize))
+    return own < wanted
 
 
 def _foreseen(

@@ -18,7 +18,7 @@ from pydantic import AfterValidator, Field, ValidationError
 from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_text
 from trilane.scene.schema import LISTED, Table
-from trilane.unexpected_value import UnexpectedValue, unexpected_in
+from trilane.unexpected_value import UnexpectedValue, expected_in, unexpected_in
 from trilane.units import MOST_TEXTURE_LEVELS, AvatarName
 
 # Options of a training, in tables of `training.toml`: the optimiser, the batches, and regularisation.
@@ -324,7 +324,7 @@ def _refused(details: dict[str, Any], where: str | Path) -> BadInputError:
     if (unexpected := unexpected_in(details)) is not None:
         return BadInputError.at(place, unexpected)
     if details["type"] != "extra_forbidden":
-        return BadInputError(place, repr(details["input"])[:80], details["msg"].removeprefix("Input should be "))
+        return BadInputError(place, repr(details["input"])[:80], expected_in(details))
     table = TrainingSettings.model_fields[keys[0]].annotation if len(keys) > 1 else TrainingSettings
     known = [field.alias or name for name, field in getattr(table, "model_fields", {}).items()]
     return BadInputError(place, "an unknown key", f"one of {', '.join(known)}", did_you_mean(str(keys[-1]), known))

@@ -423,9 +423,9 @@ def _modelled(rows: list[dict[str, Any]]) -> str:
 
 
 def _model(row: dict[str, Any]) -> str:
-    """Return an avatar's level of detail in words. For a coarser mesh, the number of triangles comes first."""
+    """Return an avatar's level of detail in words. For a coarser mesh, the level of the mesh comes first."""
     mesh = row["mesh"]
-    coarser = f"{mesh['triangles']} of {mesh['of']} triangles, " if mesh["level"] else ""
+    coarser = f"mesh level {mesh['level']} ({mesh['triangles']} of {mesh['of']} triangles), " if mesh["level"] else ""
     return f"{coarser}{row['modelled']}"
 
 

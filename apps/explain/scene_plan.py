@@ -12,7 +12,6 @@ the bodies' rectangles and the tensor's crop rectangles.
 from __future__ import annotations
 
 import math
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -37,13 +36,14 @@ from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.pipeline.memory import Assets
 from trilane.scene.crop import Rect
-from trilane.scene.planner import FrameWork, pixels_of
+from trilane.scene.planner import FrameWork
 from trilane.scene.tensor_budget import ALL_WORK, MOST_DENSITY
 from trilane.scheduler.placement import Ranked
 from trilane.stages.avatar_assets import distinct, mesh_levels_of, networks_of, painting, shaped_body, staged_of
 from trilane.stages.config import RunConfig, pose_dtype, posed_vertices, posed_vertices_bytes
 from trilane.stages.configure import Checked
 from trilane.stages.cpu.pose import FramePlan, PoseStage
+from trilane.stages.foresee import is_limited
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 from trilane.transport.slots import DEFAULT_EDGE
 from trilane.units import COMPUTED, HOST, MEASURED, NS_PER_MS, UNITS, UnitName
@@ -411,10 +411,8 @@ def _is_limited(planned: PlannedFrame, config: RunConfig, output: Shape) -> bool
     """
     if planned.plan.density is None or not planned.crops:
         return False
-    rects, whole = list(planned.crops.values()), config.tensor_budgets[0]
     networks = [config.networks[number] for number in planned.crops] if config.networks else []
-    own, wanted = (pixels_of(rects, networks, output, replace(whole, most=most)) for most in (whole.most, sys.maxsize))
-    return own < wanted
+    return is_limited(list(planned.crops.values()), networks, output, config.tensor_budgets[0])
 
 
 def _why(group: Sequence[PlannedFrame], config: RunConfig, is_limited: bool) -> str:

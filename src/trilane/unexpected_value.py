@@ -25,6 +25,28 @@ class UnexpectedValue(ValueError):  # noqa: N818 - the value is at fault, as in 
         return f"found {self.found}, expected {self.expected}" + (f"; {self.remedy}" if self.remedy else "")
 
 
+INPUT_SHOULD = "Input should be "
+#: Expected value in words, by the type of a pydantic error; only where pydantic's own text is not fit for people.
+EXPECTED = {
+    "too_short": "at least {min_length} of them",
+    "too_long": "at most {max_length} of them",
+    "model_type": "a table",
+    "tuple_type": "a list",
+    "string_type": "text in quotes",
+    "float_type": "a number, without quotes",
+    "bool_type": "true or false, without quotes",
+    "int_type": "a whole number, without quotes or decimal point",
+    "string_too_short": "at least one character",
+    "string_pattern_mismatch": "letters, digits, spaces, dots, hyphens and underscores",
+}
+
+
+def expected_in(details: Mapping[str, Any]) -> str:
+    """Return what a value should be, in words. `details`: one of the `errors()` of a pydantic ValidationError."""
+    known = EXPECTED.get(details["type"])
+    return known.format(**details.get("ctx", {})) if known else str(details["msg"]).removeprefix(INPUT_SHOULD)
+
+
 def unexpected_in(details: Mapping[str, Any]) -> UnexpectedValue | None:
     """Return the UnexpectedValue that a validator raised; None for an error of another kind.
 

@@ -241,13 +241,27 @@ def test_an_array_that_is_missing_is_named(body: ShapedBody) -> None:
 
 
 def test_notes_of_a_staged_scene_say_what_they_are_of(body: ShapedBody) -> None:
-    specs = (AvatarSpec(motion="builtin:t-pose"), AvatarSpec(motion="builtin:idle"))
+    specs = (AvatarSpec(motion="builtin:t-pose"), AvatarSpec(motion="builtin:idle", position=(0.8, 0.0, 0.0)))
     staged = stage_scene(Scene(avatars=specs), [body, body], Path("/"))
     motions = [f"motion: {note}" for mover in staged.movers for note in (*mover.motion.notes, *mover.notes)]
     *notes, seen = staged.notes
     assert notes == [*motions, *(f"camera: {note}" for note in staged.camera.path.notes)]
     assert seen.startswith("camera: whole body in the picture in 100% of the 300 frames, ")
     assert len(motions) >= 4 and staged.notes[0] == "motion: built in: the T pose"
+
+
+def test_avatars_in_one_place_are_told_of_once(body: ShapedBody) -> None:
+    """The second stands in the first one, the third in both, the fourth beside them."""
+    places = [(0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.1, 0.0, 0.0), (0.5, 0.0, 0.0)]
+    specs = tuple(
+        AvatarSpec(name=name, motion="builtin:t-pose", position=place)
+        for name, place in zip("abcd", places, strict=True)
+    )
+    notes = stage_scene(Scene(avatars=specs), [body] * 4, Path("/")).notes
+    assert [note.partition(";")[0] for note in notes if note.startswith("avatars: ")] == [
+        "avatars: a and b stand in one place",
+        "avatars: a and c stand in one place",
+    ]
 
 
 @pytest.mark.parametrize("wrap", Wrap)

@@ -12,6 +12,7 @@ from trilane.arrays import shape_buckets
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import reshaped
 from trilane.pipeline.description import UnitSettings
+from trilane.scene.crop import Rect
 from trilane.scene.planner import (
     Demand,
     LookAhead,
@@ -131,13 +132,28 @@ def test_smaller_sizes_never_pass_the_memory_of_the_scene(
     assert [prod(shape) for shape in found.shapes.shapes] == ([third, first] if room else [first])
     assert found.shapes.memory_bytes <= MB and found.left_out == (1 if room else 2)
     sizes = f"memory: {found.left_out} of the smaller tensor sizes have no shape within memory_mb 1"
-    assert found.notes(1) == (found.note, sizes)
+    assert found.notes(1, 512) == (found.note, sizes)
+
+
+@pytest.mark.parametrize(("most", "limited"), [(128 * 128, 0), (128 * 128 - 1, 5), (32 * 32, 5)])
+def test_frames_with_fewer_pixels_than_an_avatar_needs_are_counted(
+    avatar: AvatarData, monkeypatch: pytest.MonkeyPatch, most: int, limited: int
+) -> None:
+    """Five of eight frames show one avatar, for which 128 x 128 pixels are enough."""
+    small = Rect(-0.1, -0.1, 0.1, 0.1)
+    monkeypatch.setattr("trilane.stages.foresee.foreseen_rects", lambda *_: [{0: small}] * 5 + [{}] * 3)
+    scene = Scene(size="auto", frames=8, most_side=96)
+    budget = TensorBudget(own=128 * 128, most=most)
+    found = foresee(scene, staged(scene, avatar), [avatar.shaped], Painted([avatar.network]), [budget])
+    assert found.limited == limited
+    said = [note for note in found.notes(512, 96) if "most_side = 96" in note]
+    assert len(said) == (limited > 0) and all("in 5 of these frames" in note for note in said)
 
 
 def test_a_network_that_takes_more_than_the_limit_is_told_of() -> None:
     found = Foreseen(ShapeSet(((64, 96),), 2_000_001, 0), (0,), 1)
-    assert found.notes(3) == (found.note,)
-    assert found.notes(2) == (
+    assert found.notes(3, 512) == (found.note,)
+    assert found.notes(2, 512) == (
         found.note,
         "memory: the network may take 3 MB, more than memory_mb 2: one is always ready",
     )
