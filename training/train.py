@@ -153,10 +153,12 @@ def train_avatar(places: TrainingPlaces, asked: TrainingSettings, listener: List
     state = first_state(avatar, settings, vgg)
     losses = {"before": _loss_before(state, places, groups)}
     _train(state, people, groups, places, settings, listener)
-    losses["after"] = probe_loss(state, groups)
     state.average.cpu()
     if settings.bytes_from < 1 and not settings.keep_network:
         keep_rounded_weights(state.average, groups, settings.seed)
+    state.average.to(state.device)
+    losses["after"] = probe_loss(state, groups)  # of the weights that are written: they were trained to be rounded
+    state.average.cpu()
     save_network(state.average, places.work / NETWORK)
     files = write_float_network(places.work, state.average, groups, settings.seed)
     network = kept_network(settings.start) if settings.keep_network else None

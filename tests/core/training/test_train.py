@@ -156,6 +156,23 @@ def test_an_ended_training_goes_on_and_makes_the_same_avatar(
         train_avatar(places(tmp_path), settings(seed=2), Told())
 
 
+def test_the_loss_after_a_training_is_of_the_weights_that_are_written(
+    log: list[Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Weights that are trained with rounding get another loss by rounding, and only the rounded ones are used."""
+    judged: list[bytes] = []
+    probe = command.probe_loss
+
+    def judge(state: Any, groups: Any) -> float:
+        judged.append(weights_of(state.average))
+        return probe(state, groups)
+
+    monkeypatch.setattr(command, "probe_loss", judge)
+    train_avatar(places(tmp_path), settings(freeze_norms_at=0.0, bytes_from=0.2), Told())
+    written = next(words[2][0] for words in log if isinstance(words, tuple) and words[0] == tmp_path / "mine")
+    assert judged[0] != judged[1] == written
+
+
 @pytest.mark.usefixtures("log")
 @pytest.mark.parametrize(
     ("changed", "said"),
