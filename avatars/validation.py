@@ -185,7 +185,7 @@ DIGITS = 2
 #: A tensor is large enough for a body if it loses at most this much of the PSNR at the best measured size, in dB: for
 #: an avatar with a network of its own, and for avatars that share a network. These share a tensor too. Each adds to the
 #: background between them, so that a tenth of a dB costs more pixels.
-TOLERANCE_DB, SHARED_TOLERANCE_DB = 0.05, 0.3
+TOLERANCE_DB, SHARED_TOLERANCE_DB = 0.04, 0.3
 #: Work of the smaller tensors whose loss is told: 3/4 and 1/2 of the sides.
 WORKS = (563, 250)
 

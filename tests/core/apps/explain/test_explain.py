@@ -143,7 +143,7 @@ def test_a_phase_says_what_is_modelled_and_its_error(document: Any) -> None:
         assert avatar["modelled"] in [detail.name for detail in DETAILS[:-1]]
         assert 0 <= avatar["measured_px"] <= avatar["bound_px"] <= 2.0
         assert row["why"] == (
-            "the fewest pixels within 0.05 dB of the best size, by the table `by_size` in the manifest"
+            "the fewest pixels within 0.04 dB of the best size, by the table `by_size` in the manifest"
             if is_measured
             else "2.25 tensor pixels along a side of a pixel of the picture: more make no better picture"
             if row["density"][1] == MOST_DENSITY
