@@ -29,7 +29,7 @@ from trilane.arrays import BUCKET_STEP, MAX_SIDE, checked_size
 from trilane.body.joints import JOINT_INDEX
 from trilane.errors import BadInputError, did_you_mean
 from trilane.files import read_text
-from trilane.unexpected_value import UnexpectedValue, expected_in, unexpected_in
+from trilane.unexpected_value import EXPECTED, UnexpectedValue, expected_in, unexpected_in
 from trilane.units import AVATARS, AVATARS_HELP, ROOM
 
 MAX_DEPTH_RATIO = 1e6  # largest ratio of far to near clip plane; beyond it a depth buffer of 24 bits is too coarse
@@ -390,6 +390,11 @@ class Scene(Table):
 ENDING = ".toml"
 SCENES = Path(__file__).parent / "scenes"
 LONGEST_FOUND = 80
+#: Expected value in words, by the type of a pydantic error. The only texts with a pattern are names.
+WORDS = EXPECTED | {
+    "string_too_short": "at least one character",
+    "string_pattern_mismatch": "letters, digits, spaces, dots, hyphens and underscores",
+}
 #: Types of pydantic errors for numbers that are out of range or not a multiple of a step.
 IN_STEPS = ("multiple_of", "greater_than_equal", "less_than_equal")
 #: Reason why a key cannot have its value, where the range alone does not explain it.
@@ -412,7 +417,7 @@ def bad_input(where: str | Path, error: ValidationError) -> BadInputError:
         return BadInputError.at(place, unexpected)
     value = repr(first["input"])
     short = value if len(value) <= LONGEST_FOUND else value[:LONGEST_FOUND] + "..."
-    return BadInputError(place, short, _steps(first) or expected_in(first), _remedy(first))
+    return BadInputError(place, short, _steps(first) or expected_in(first, WORDS), _remedy(first))
 
 
 def _steps(first: Mapping[str, Any]) -> str:

@@ -41,7 +41,7 @@ class Staged:
     """A staged scene.
 
     `movers`: one per avatar of the scene, in order. `camera`: camera at its place. `notes`: what was decided about
-    motions, floor and camera, for people.
+    motions, places, floor and camera, for people.
     """
 
     movers: tuple[Mover, ...]
@@ -66,20 +66,21 @@ def stage_scene(scene: Scene, bodies: Sequence[ShapedBody], base: Path, footage:
     camera = place_camera(path, scene, movers, bodies)
     notes = [f"motion: {note}" for mover in movers for note in (*mover.motion.notes, *mover.notes)]
     shown = seen_notes(camera, scene, movers, bodies)
-    notes += [f"avatars: {note}" for note in _shared_places(scene, movers)]
+    notes += [f"avatars: {note}" for note in _shared_places(scene, movers, bodies)]
     courses = (path.course,) if path.recorded else ()
     notes += [f"camera: {note}" for note in (*path.notes, *courses, *camera.notes, *shown)]
     notes += [f"background: {note}" for note in seen]
     return Staged(movers, camera, tuple(notes))
 
 
-#: Two avatars whose pelvises are nearer to each other than this, in metres, are drawn into each other.
+#: Two avatars whose pelvises are nearer to each other than this along the floor, in metres, are drawn into each other.
 APART_M = 0.2
 
 
-def _shared_places(scene: Scene, movers: Sequence[Mover]) -> Iterator[str]:
+def _shared_places(scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> Iterator[str]:
     """Yield a sentence for each avatar that stands where an avatar before it stands, at the first frame."""
-    places = [(mover.world @ [*mover.sample(0.0)[1], 1.0])[:3] for mover in movers]
+    pelvises = [body.joints[0] + mover.sample(0.0)[1] for mover, body in zip(movers, bodies, strict=True)]
+    places = [(mover.world @ [*pelvis, 1.0])[[0, 2]] for mover, pelvis in zip(movers, pelvises, strict=True)]
     names = [str(avatar.name) for avatar in scene.avatars]
     for number, place in enumerate(places):
         for other in range(number):

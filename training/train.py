@@ -157,7 +157,7 @@ def train_avatar(places: TrainingPlaces, asked: TrainingSettings, listener: List
     if settings.bytes_from < 1 and not settings.keep_network:
         keep_rounded_weights(state.average, groups, settings.seed)
     state.average.to(state.device)
-    losses["after"] = probe_loss(state, groups)  # of the weights that are written: they were trained to be rounded
+    losses["after"] = probe_loss(state, groups)  # of the weights that are written
     state.average.cpu()
     save_network(state.average, places.work / NETWORK)
     files = write_float_network(places.work, state.average, groups, settings.seed)

@@ -36,14 +36,15 @@ EXPECTED = {
     "float_type": "a number, without quotes",
     "bool_type": "true or false, without quotes",
     "int_type": "a whole number, without quotes or decimal point",
-    "string_too_short": "at least one character",
-    "string_pattern_mismatch": "letters, digits, spaces, dots, hyphens and underscores",
 }
 
 
-def expected_in(details: Mapping[str, Any]) -> str:
-    """Return what a value should be, in words. `details`: one of the `errors()` of a pydantic ValidationError."""
-    known = EXPECTED.get(details["type"])
+def expected_in(details: Mapping[str, Any], words: Mapping[str, str] = EXPECTED) -> str:
+    """Return what a value should be, in words.
+
+    `details`: one of the `errors()` of a pydantic ValidationError. `words`: expected value by the type of the error.
+    """
+    known = words.get(details["type"])
     return known.format(**details.get("ctx", {})) if known else str(details["msg"]).removeprefix(INPUT_SHOULD)
 
 

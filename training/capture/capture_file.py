@@ -22,7 +22,7 @@ from trilane.errors import BadInputError, did_you_mean, reason
 from trilane.files import read_text
 from trilane.scene.lens import Lens
 from trilane.scene.schema import LISTED, Finite, Table
-from trilane.unexpected_value import UnexpectedValue
+from trilane.unexpected_value import UnexpectedValue, expected_in
 
 # The faults of a capture are listed together, so that a person can fix all of them before the next try.
 #
@@ -176,7 +176,7 @@ def _fault(details: dict[str, Any]) -> Fault:
         table = CameraTable if details["loc"][0] == "camera" else CaptureFile
         known = [field.alias or name for name, field in table.model_fields.items()]
         return Fault(where, "an unknown key", f"one of {', '.join(known)}", did_you_mean(details["loc"][-1], known))
-    return Fault(where, repr(details["input"])[:80], details["msg"].removeprefix("Input should be "))
+    return Fault(where, repr(details["input"])[:80], expected_in(details))
 
 
 # Pictures of a capture: a folder of files, or a video.

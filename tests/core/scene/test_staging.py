@@ -251,16 +251,18 @@ def test_notes_of_a_staged_scene_say_what_they_are_of(body: ShapedBody) -> None:
 
 
 def test_avatars_in_one_place_are_told_of_once(body: ShapedBody) -> None:
-    """The second stands in the first one, the third in both, the fourth beside them."""
-    places = [(0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.1, 0.0, 0.0), (0.5, 0.0, 0.0)]
+    """The second stands in the first one, the third in both, the fourth beside them; the third body begins higher."""
+    places = [(0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.19, 0.0, 0.0), (0.4, 0.0, 0.0)]
+    higher = dataclasses.replace(body, joints=body.joints + [0.0, 0.8, 0.0])
     specs = tuple(
         AvatarSpec(name=name, motion="builtin:t-pose", position=place)
         for name, place in zip("abcd", places, strict=True)
     )
-    notes = stage_scene(Scene(avatars=specs), [body] * 4, Path("/")).notes
-    assert [note.partition(";")[0] for note in notes if note.startswith("avatars: ")] == [
-        "avatars: a and b stand in one place",
-        "avatars: a and c stand in one place",
+    notes = stage_scene(Scene(avatars=specs), [body, body, higher, body], Path("/")).notes
+    remedy = "the key `position` moves an avatar"
+    assert [note for note in notes if note.startswith("avatars: ")] == [
+        f"avatars: a and b stand in one place; {remedy}",
+        f"avatars: a and c stand in one place; {remedy}",
     ]
 
 

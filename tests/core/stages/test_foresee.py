@@ -144,10 +144,11 @@ def test_frames_with_fewer_pixels_than_an_avatar_needs_are_counted(
     monkeypatch.setattr("trilane.stages.foresee.foreseen_rects", lambda *_: [{0: small}] * 5 + [{}] * 3)
     scene = Scene(size="auto", frames=8, most_side=96)
     budget = TensorBudget(own=128 * 128, most=most)
-    found = foresee(scene, staged(scene, avatar), [avatar.shaped], Painted([avatar.network]), [budget])
+    budgets = [budget, budget.scaled(250)]
+    found = foresee(scene, staged(scene, avatar), [avatar.shaped], Painted([avatar.network]), budgets)
     assert found.limited == limited
     said = [note for note in found.notes(512, 96) if "most_side = 96" in note]
-    assert len(said) == (limited > 0) and all("in 5 of these frames" in note for note in said)
+    assert len(said) == (limited > 0) and all("in 5 of 8 frames looked at" in note for note in said)
 
 
 def test_a_network_that_takes_more_than_the_limit_is_told_of() -> None:

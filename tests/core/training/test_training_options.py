@@ -183,6 +183,7 @@ def test_options_are_written_and_read_again() -> None:
             "optimiser.king: found an unknown key, expected one of kind, momentum.*'kind'",
         ),
         ({"batches": {"sample_share": 0}}, "batches.sample_share: found 0, expected greater than 0"),
+        ({"vgg": "abc"}, r"vgg: found 'abc', expected String should match pattern '\^\[0-9a-f\]\{64\}\$'"),
         ({"batches": {"repeats": 3}}, "batches.repeats: found 3, expected a list"),
         ({"norm": "layer"}, "norm: found 'layer', expected 'batch', 'instance', 'group' or 'none'"),
         (
