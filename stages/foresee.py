@@ -133,8 +133,8 @@ class Foreseen:
             )
         if self.limited:
             notes.append(
-                f"tensor: in {self.limited} of {len(self.frames)} frames looked at, most_side = {most_side} gives avatars "
-                "fewer pixels than they need; what the picture loses is not measured"
+                f"tensor: in {self.limited} of {len(self.frames)} frames looked at, most_side = {most_side} gives "
+                "avatars fewer pixels than they need; what the picture loses is not measured"
             )
         needed = math.ceil(self.shapes.memory_bytes / MB)
         if needed > memory_mb:

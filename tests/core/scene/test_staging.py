@@ -253,7 +253,7 @@ def test_notes_of_a_staged_scene_say_what_they_are_of(body: ShapedBody) -> None:
 def test_avatars_in_one_place_are_told_of_once(body: ShapedBody) -> None:
     """The second stands in the first one, the third in both, the fourth beside them; the third body begins higher."""
     places = [(0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.19, 0.0, 0.0), (0.4, 0.0, 0.0)]
-    higher = dataclasses.replace(body, joints=body.joints + [0.0, 0.8, 0.0])
+    higher = dataclasses.replace(body, joints=body.joints + np.array([0.0, 0.8, 0.0]))
     specs = tuple(
         AvatarSpec(name=name, motion="builtin:t-pose", position=place)
         for name, place in zip("abcd", places, strict=True)
