@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from trilane.apps.cli.sweep import of_file
+from trilane.apps.compare.pages import MOST_STILLS
 from trilane.apps.sweep.definition import trials_of
 from trilane.bench.lib.cast import Cast
 from trilane.stages.configure import configure
@@ -32,7 +33,7 @@ def test_the_page_is_small_and_asks_for_nothing() -> None:
     page = (RESULTS / "report.html").read_text(encoding="utf-8")
     assert len(page.encode()) < MOST_BYTES
     sources = re.findall(r"""<[^>]*\s(?:src|href)=["']([^"']{1,16})""", page)
-    assert len(sources) == 8 and all(source.startswith("data:image/jpeg") for source in sources)
+    assert len(sources) == MOST_STILLS and all(source.startswith("data:image/jpeg") for source in sources)
 
 
 def test_the_sweep_of_networks_has_60_trials_by_six_axes() -> None:
