@@ -17,6 +17,7 @@ from typing import Any
 from websockets.sync import client as websockets
 
 PATIENCE_S = 60.0
+SETTLED_S = 1.0
 
 
 class Page:
@@ -70,16 +71,16 @@ class Page:
     def settle(self) -> int:
         """How many frames are presented once none is in flight, by figures that come after this call.
 
-        Two figures in turn have to agree: a slow source has moments without a frame in flight while it goes on, and a
-        pause is told before the scheduler has heard of it.
+        The number has to stay for a second: a slow source has moments without a frame in flight while it goes on, a
+        pause is told before the scheduler has heard of it, and older figures may wait in the socket.
         """
-        seen = -1
-        while True:
+        seen, since = -1, time.monotonic()
+        while time.monotonic() - since < SETTLED_S:
             self.told.pop("figures", None)
             self.until(lambda: self.told.get("figures", {}).get("frames", {}).get("in_flight") == 0, "frames in flight")
-            if self.presented == seen:
-                return seen
-            seen = self.presented
+            if self.presented != seen:
+                seen, since = self.presented, time.monotonic()
+        return seen
 
     @property
     def presented(self) -> int:
