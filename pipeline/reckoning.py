@@ -28,6 +28,7 @@ from typing import Any, Final, NamedTuple
 
 from trilane.pipeline.critical_path import Budget, Part, Paths, Sharing, Taken
 from trilane.pipeline.journal import Begun, Record, config_of
+from trilane.pipeline.run_metrics import Bound
 from trilane.pipeline.timeline import ExplainedJob, Timeline
 from trilane.pipeline.unit_history import OVERHEAD
 from trilane.scheduler.events import NEVER, Graph, Settings
@@ -306,9 +307,10 @@ class Reckoning:
         self._unit_of = {stage.name: stage.unit for stage in graph.stages}
 
     @property
-    def bound(self) -> Mapping[str, Any] | None:
-        """The key `bound` of a report, from the path so far and without replays; None until 63 frames are presented."""
-        return _bound(self._budget, self._unit_of, None).get("bound")
+    def bound(self) -> Bound | None:
+        """The bound of the run, from the path so far and without replays; None until 63 frames are presented."""
+        found = _bound(self._budget, self._unit_of, None)["bound"]
+        return found and Bound.model_validate(found)
 
     def add(self, explained: ExplainedJob) -> None:
         """Take a job into all figures of the run; call this in the order of the jobs' ends."""

@@ -9,8 +9,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final, Literal, Self
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
+from trilane.errors import BadInputError
 from trilane.pipeline.description import Model
 
 #: Keys that only older reports have: isolated times of stages, a second computation of the shares in `units`, and
@@ -485,3 +486,16 @@ def metrics_of(ledger_report: Mapping[str, Any]) -> RunMetrics:
     `ledger_report`: keys of `Ledger.report()`, and further keys of report.json.
     """
     return RunMetrics.model_validate(ledger_report)
+
+
+def metrics_in(report: Mapping[str, Any], where: str) -> RunMetrics:
+    """Return the figures in the last record of a journal. Raises BadInputError for figures of a wrong form.
+
+    `report`: report of the record. `where`: journal and record, as errors name them.
+    """
+    try:
+        return metrics_of(report)
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise BadInputError(f"{where}: {key}", first["msg"].lower(), "the figures of a run") from None

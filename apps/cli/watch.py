@@ -206,7 +206,7 @@ def screen(look: RunLook, width: int) -> Group:
     figures = look.figures
     lines = [f"note at {note.t_ms / 1000:.1f} s: {note.text}" for note in figures.notes]
     below = "\n".join([*lines, *errors(figures), _sources(figures), too_few_note().strip()])
-    verdict = verdict_text(figures.verdict["lines"], width) if figures.verdict else Text(NO_VERDICT)
+    verdict = verdict_text(figures.verdict.lines(), width) if figures.verdict else Text(NO_VERDICT)
     return Group(
         Text(_title(look)),
         verdict,
@@ -242,7 +242,7 @@ def line(look: RunLook) -> str:
 
 
 def _passed(figures: MomentFigures) -> str:
-    return "" if figures.verdict is None else str(figures.verdict["lines"][0][0])
+    return "" if figures.verdict is None else figures.verdict.lines()[0][0]
 
 
 def heading(look: RunLook) -> str:
@@ -411,11 +411,10 @@ def _short_bound(figures: MomentFigures) -> str:
 
     Without a known cost, the text has the unit's share of the critical path.
     """
-    unit = (figures.bound or {}).get("unit")
-    if not unit:
+    if figures.bound is None:
         return ""
-    cost = unit.get("cost")
-    return f"bound {unit['name']} " + (f"{unit['share']:.0%}" if cost is None else f"+{cost:.0%}")
+    unit = figures.bound.unit
+    return f"bound {unit.name} " + (f"{unit.share:.0%}" if unit.cost is None else f"+{unit.cost:.0%}")
 
 
 def _short_error(figures: MomentFigures) -> str:

@@ -33,7 +33,7 @@ from trilane.files import require_file
 from trilane.pipeline.journal import NAME as JOURNAL
 from trilane.pipeline.journal import read_journal
 from trilane.pipeline.reckoning import places_of, reckoned
-from trilane.pipeline.run_metrics import RunMetrics
+from trilane.pipeline.run_metrics import metrics_in
 from trilane.units import HOST_CLOCK
 
 EXPECTED: Final = (
@@ -243,12 +243,7 @@ def _at_the_end(frames: RunFrames, path: Path) -> dict[str, Any]:
     if frames.ended is None:
         begun, records = frames.begun, read_journal(path)
         return dict(reckoned(begun.graph, begun.settings, places_of(begun), records).figures)
-    try:
-        return RunMetrics.model_validate(from_json(to_json(dict(frames.ended.report)))).as_json()
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise BadInputError(f"{path}, last record: {key}", first["msg"].lower(), "the figures of a run") from None
+    return metrics_in(from_json(to_json(dict(frames.ended.report))), f"{path}, last record").as_json()
 
 
 def _counts(frames: RunFrames) -> dict[str, Any]:

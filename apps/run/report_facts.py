@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from trilane.apps.run.report import SCHEMA, Report, Resolution, TensorSize
-from trilane.apps.run.verdict import judged
-from trilane.apps.run.verdict_facts import facts_of
+from trilane.apps.run.verdict_facts import verdict_of
 from trilane.avatars.validation import SizeLoss
 from trilane.machine import here
 from trilane.pipeline.result import RunResult
@@ -101,8 +100,7 @@ def report_of(
         "baseline": baseline and _compared(baseline.report),
         **facts,
     }
-    verdict = judged(facts_of(Report.model_validate(document).as_json()))
-    document["verdict"] = verdict.as_json()
+    document["verdict"] = verdict_of(Report.model_validate(document)).as_json()
     return Report.model_validate(document | {"sources": sources_of(document)})
 
 

@@ -191,7 +191,7 @@ class Facts:
     frame_ms: float | None = None
     slow: tuple[str, float] | None = None
     latency_ms: float | None = None
-    alone: tuple[float, float] | None = None
+    alone: tuple[float, float | None] | None = None
     bound: NamedBound | None = None
     idle: Mapping[str, tuple[float, Mapping[str, float]]] | None = None
     image: str = UNKNOWN
@@ -372,17 +372,18 @@ def _idle_of(unit: str, share: float, causes: Mapping[str, float]) -> str:
     return f"{unit} {_percent(share)}{why}"
 
 
-def slow_percentile(times: Mapping[str, Any]) -> tuple[str, float] | None:
+def slow_percentile(times: Mapping[str, float | None]) -> tuple[str, float] | None:
     """Return (name, value in ms) of the highest percentile that has enough samples, such as ("p99", 12.5).
 
     If no percentile has enough samples, return the maximum, named `max`; None if the maximum is unknown.
     `times`: percentiles, `max` and `samples` of a frame time or a latency, as in the report.
     """
-    samples = times.get("samples")
+    samples, most = times["samples"], times["max"]
     for name, least in reversed(NEEDED.items()):
-        if times.get(name) is not None and (samples is None or samples >= least):
-            return name, times[name]
-    return ("max", times["max"]) if times.get("max") is not None else None
+        value = times[name]
+        if value is not None and (samples is None or samples >= least):
+            return name, value
+    return None if most is None else ("max", most)
 
 
 def _apart(one: float, other: float) -> tuple[str, str]:

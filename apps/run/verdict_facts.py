@@ -1,7 +1,7 @@
 """Makes the facts of a verdict from a report, from the figures of a live run, or from a prediction.
 
-Rule: the functions are pure. All three sources have the keys of docs/report.md, as far as their values are known. The
-verdict leaves out unknown values. A report and a live run name their bound, and the verdict has the same bound.
+Rule: the functions are pure. The verdict leaves out unknown values. A report and a live run name their bound, and the
+verdict has the same bound.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from math import inf
 from typing import TYPE_CHECKING, Any, Final
 
 from trilane.apps.explain.reasons import SHORTER
+from trilane.apps.run.report import Check, Report
 from trilane.apps.run.verdict import (
     COMPUTED,
     DISPLAY,
@@ -31,11 +32,12 @@ from trilane.apps.run.verdict import (
 )
 from trilane.hw_profiles.rates import wanted_drops
 from trilane.hw_profiles.schema import SHARE_TEXT
+from trilane.pipeline.run_metrics import Bound, PolicyMetrics, RunMetrics, StageTimes
 from trilane.scheduler.policy import POLICIES, works_on_one_frame
 from trilane.units import NO_FIGURES, TARGET_FPS
 
 if TYPE_CHECKING:
-    from trilane.apps.run.report import Report
+    from trilane.apps.watch.figures import MomentFigures, StageFigures
 
 #: Ratio of latency to the latency of a frame alone. Above this ratio, the verdict proposes late latching.
 MUCH_LATER: Final = 2.0
@@ -53,104 +55,124 @@ def verdict_of(report: Report, folder: str = "") -> Verdict:
     `report`: report of the run. `folder`: path of the run folder, which appears in commands that the verdict proposes;
     "" if unknown.
     """
-    return judged(facts_of(report.as_json(), folder))
+    return judged(facts_of(report, report.config, report.accuracy, folder))
 
 
-def facts_of(document: Mapping[str, Any], folder: str = "", *, goes_on: bool = False) -> Facts:
-    """Return the facts on which the verdict of a run rests.
+def facts_of(
+    run: RunMetrics, config: Mapping[str, Any], accuracy: Mapping[str, Mapping[str, Any]], folder: str = ""
+) -> Facts:
+    """Return the facts on which the verdict of a run that has ended rests.
 
-    `document`: mapping with the known keys of report.json. `folder`: see `verdict_of`.
-    `goes_on`: whether the run has not ended yet; in that case, `document` has the figures so far.
+    `run`: figures of the run; a `Report` also has its failure, baseline, check and pace. `config`, `accuracy`: blocks
+    of report.json. `folder`: see `verdict_of`.
     """
-    frames, times, latency = (document.get(key) or {} for key in ("frames", "frame_time_ms", "latency_ms"))
-    has_times = frames.get("presented", 0) > 1
-    target, is_paced = target_fps(document), _is_paced(document)
-    fps = document.get("fps") if has_times else None
-    rate = Rate(fps, document.get("fps_low"), document.get("fps_high")) if fps else None
-    bound = bound_of(document)
-    baseline = document.get("baseline")
-    trust = NOT_YET if goes_on else trust_of(document)
+    report = run if isinstance(run, Report) else None
+    slow_motion = report.pace.slow_motion if report and report.pace else 1.0
+    target, is_paced = _target_fps(config) / slow_motion, _is_paced(config, run.policy)
+    # A run in slow motion that is not paced counts its deadline misses at another rate than the target.
+    has_lateness = run.frames.presented > 1 and (is_paced or slow_motion == 1)
+    dropped, lost = run.frames.dropped, run.frames.lost
+    bound = _named_bound(run.bound, run.stages, run.frame_time_ms.mean)
+    baseline = report and report.baseline
     return Facts(
-        rate,
+        Rate(run.fps, run.fps_low, run.fps_high) if run.fps else None,
         target,
-        _lateness(document, is_paced=is_paced) if has_times else None,
-        trust,
+        _lateness(run.frames.presented, run.deadline_misses, dropped, lost, is_paced=is_paced)
+        if has_lateness
+        else None,
+        trust_of(run.model_dump(include={"clock", "other_programs", "processor", "temperature_c"})),
         is_held_to_rate=is_paced,
-        failure=document.get("failure") or "",
-        frame_ms=times.get("mean") if has_times else None,
-        slow=slow_percentile(times),
-        latency_ms=latency.get("mean"),
-        alone=(baseline["fps"], baseline["latency_ms"]["mean"]) if baseline and baseline["fps"] else None,
+        failure=(report and report.failure) or "",
+        frame_ms=run.frame_time_ms.mean,
+        slow=slow_percentile(dict(run.frame_time_ms)),
+        latency_ms=run.latency_ms.mean,
+        alone=(baseline.fps, baseline.latency_ms.mean) if baseline and baseline.fps else None,
         bound=bound,
-        idle={unit: (1 - row["busy"], _causes(row["idle"])) for unit, row in document.get("units", {}).items()},
-        image=_image(document),
-        tries=() if goes_on else tuple(_tries(document, bound, target, folder)),
-        source=SO_FAR if goes_on else "",
+        idle={unit: (1 - row.busy, _causes(dict(row.idle))) for unit, row in run.units.items()},
+        image=_checked(report.check) if report and report.check else _image(config, accuracy),
+        tries=tuple(_tries(run, config, baseline, bound, target, folder)),
     )
 
 
-def target_fps(document: Mapping[str, Any]) -> float:
-    """Return the rate that a run must hold, in frames a second.
+def facts_so_far(figures: MomentFigures, late: int, config: Mapping[str, Any], policy: str) -> Facts:
+    """Return the facts on which the verdict of a run that goes on rests.
 
-    The rate comes from `--fps`, the scene or the pipeline file; if none of them has a rate, TARGET_FPS counts. In slow
-    motion, the rate is divided by the factor of the slow motion. `document`: mapping with the known keys of
-    report.json.
+    `figures`: figures so far. `late`: number of late frames so far. `config`: block `config` of report.json, as far as
+    it is known. `policy`: policy of the run.
     """
-    config = document.get("config") or {}
-    fps = float((config.get("scene") or {}).get("fps") or TARGET_FPS)
-    return fps / float((document.get("pace") or {}).get("slow_motion", 1.0))
+    frames, times, is_paced = figures.frames, figures.frame_time_ms, _is_paced(config, policy)
+    dropped = {f"{drop.edge}:{drop.cause}": drop.frames for drop in frames.dropped}
+    return Facts(
+        Rate(figures.run_fps) if figures.run_fps else None,
+        _target_fps(config),
+        _lateness(frames.presented, late, dropped, sum(frames.lost.values()), is_paced=is_paced),
+        NOT_YET,
+        is_held_to_rate=is_paced,
+        frame_ms=times["mean"],
+        slow=slow_percentile(times),
+        latency_ms=figures.latency_ms["mean"],
+        bound=_named_bound(figures.bound, figures.stages, times["mean"]),
+        idle={name: (1 - unit.run.busy, _causes(unit.run.idle)) for name, unit in figures.units.items()},
+        image=_image(config, figures.accuracy),
+        source=SO_FAR,
+    )
 
 
-def _is_paced(document: Mapping[str, Any]) -> bool:
+def _target_fps(config: Mapping[str, Any]) -> float:
+    """Return the rate that a run must hold, in frames a second, without a slow motion.
+
+    The rate comes from `--fps`, the scene or the pipeline file; if none of them has a rate, TARGET_FPS counts.
+    `config`: block `config` of report.json, as far as it is known.
+    """
+    return float(config.get("scene", {}).get("fps") or TARGET_FPS)
+
+
+def _is_paced(config: Mapping[str, Any], policy: str) -> bool:
     """Return whether a fixed rate or random arrivals released the frames.
 
-    In other runs, the pipeline takes a frame as soon as it can. `document`: mapping with the keys of report.json.
+    In other runs, the pipeline takes a frame as soon as it can. `config`: see `_target_fps`. `policy`: policy of the
+    run.
     """
-    run = ((document.get("config") or {}).get("pipeline") or {}).get("run") or {}
-    policy = POLICIES.get(document.get("policy", ""))
-    return bool(run.get("fps") or run.get("arrivals") or (policy and policy.paced))
+    run = config.get("pipeline", {}).get("run", {})
+    return bool(run.get("fps") or run.get("arrivals") or (policy in POLICIES and POLICIES[policy].paced))
 
 
-def _lateness(document: Mapping[str, Any], *, is_paced: bool) -> LateFrames | None:
-    """Return how many frames were not in time; None for a run in slow motion that is not paced.
+def _lateness(presented: int, late: int, dropped: Mapping[str, int], lost: int, *, is_paced: bool) -> LateFrames:
+    """Return how many frames were not in time.
 
-    A run in slow motion that is not paced counts its deadline misses at another rate than the target.
-    `document`: mapping with the keys of report.json. `is_paced`: result of `_is_paced`.
+    `presented`, `late`, `lost`: numbers of frames. `dropped`: numbers of dropped frames by `edge:cause`. `is_paced`:
+    result of `_is_paced`.
     """
-    frames, late = document["frames"], document["deadline_misses"]
-    dropped = wanted_drops(frames["dropped"])
+    left_out = wanted_drops(dropped)
     if is_paced:
-        lost = frames.get("lost", 0)  # a prediction loses none
-        return LateFrames(frames["presented"] + dropped + lost, late, dropped, lost)
-    if (document.get("pace") or {}).get("slow_motion", 1.0) != 1.0:
-        return None
-    return LateFrames(frames["presented"] - 1, late, 0, frames["lost"], dropped)
+        return LateFrames(presented + left_out + lost, late, left_out, lost)
+    return LateFrames(presented - 1, late, 0, lost, left_out)
 
 
-def bound_of(document: Mapping[str, Any]) -> NamedBound | None:
-    """Return the bound that a report names, with each stage's ms on the critical path; None if no bound is named.
+def _named_bound(
+    bound: Bound | None, stages: Mapping[str, StageTimes | StageFigures], frame_ms: float | None
+) -> NamedBound | None:
+    """Return `bound` with each stage's ms on the critical path; None without a bound.
 
-    `document`: mapping with the known keys of report.json.
+    `stages`: figures of all stages, by name. `frame_ms`: mean frame time, ms; None or 0 if unknown.
     """
-    bound = document.get("bound")
-    if not bound:
+    if bound is None:
         return None
-    unit, stage = bound["unit"], bound.get("stage")
-    of_unit = frozenset(name for name, row in document.get("stages", {}).items() if row["unit"] == unit["name"])
-    shares = bound.get("stages") or ({stage["name"]: stage["share"]} if stage else {})
-    frame_ms = (document.get("frame_time_ms") or {}).get("mean")
-    first = [stage["name"]] if stage else []
+    unit, stage = bound.unit, bound.stage
+    of_unit = frozenset(name for name, row in stages.items() if row.unit == unit.name)
+    shares = bound.stages or ({stage.name: stage.share} if stage else {})
+    first = [stage.name] if stage else []
     others = [name for name in sorted(of_unit, key=lambda each: -shares.get(each, 0.0)) if name not in first]
     named = [*first, *(name for name in others if shares.get(name, 0.0) >= LEAST_NAMED)]
-    path = ((bound.get("path") or {}).get("unit") or {}).get("name", "")
+    path = bound.path.unit.name if bound.path else ""
     return NamedBound(
-        unit["name"],
+        unit.name,
         {name: shares[name] * frame_ms if frame_ms and name in shares else None for name in named},
-        unit.get("share", 0.0),
-        unit.get("cost"),
-        unit.get("rivals") or (),
+        unit.share,
+        unit.cost,
+        unit.rivals or (),
         of_unit,
-        "" if path == unit["name"] else path,
+        "" if path == unit.name else path,
     )
 
 
@@ -158,25 +180,24 @@ def _causes(idle: Mapping[str, float | None]) -> dict[str, float]:
     return {cause: share for cause, share in idle.items() if share}
 
 
-def _image(document: Mapping[str, Any]) -> str:
-    """Return a text on the image error of a run.
+def _checked(check: Check) -> str:
+    against = check.against.partition(":")[0]
+    worst = f"worst {check.worst_psnr_db:.1f} of {check.frames} frames of this run"
+    return f"{check.psnr_db:.1f} dB against {against}, {worst}"
 
-    If the run's frames were checked, the text has their error. If they were not, the text has the error from the
-    validation of the worst avatar, or says that the error is unknown. `document`: mapping with the known keys of
-    report.json.
+
+def _image(config: Mapping[str, Any], accuracy: Mapping[str, Mapping[str, Any]]) -> str:
+    """Return a text on the image error of a run whose frames were not checked.
+
+    The text has the error from the validation of the worst avatar, or says that the error is unknown. `config`,
+    `accuracy`: blocks of report.json.
     """
-    avatars = document.get("accuracy") or {}
-    if check := document.get("check"):
-        against = str(check["against"]).partition(":")[0]
-        worst = check["worst_psnr_db"]
-        return f"{check['psnr_db']:.1f} dB against {against}, worst {worst:.1f} of {check['frames']} frames of this run"
-    if not avatars:
-        is_own = "pipeline" in (document.get("config") or {})
-        return NO_TRUTH if is_own else UNKNOWN
-    for facts in avatars.values():
+    if not accuracy:
+        return NO_TRUTH if "pipeline" in config else UNKNOWN
+    for facts in accuracy.values():
         if facts.get("source", NO_FIGURES) == NO_FIGURES:
             return f"{UNKNOWN}: {facts.get('why', 'the avatar has no validation')}; this run: --check 4"
-    error, worst = min(map(_validated, avatars.values()))
+    error, worst = min(map(_validated, accuracy.values()))
     seen = "" if worst is None else f", worst view {worst:.1f}"
     return f"{error:.1f} dB{seen} (validation); this run: --check 4"
 
@@ -192,40 +213,46 @@ def _validated(facts: Mapping[str, Any]) -> tuple[float, float | None]:
     return known, (facts.get("worst") or {}).get("psnr_db")
 
 
-def _tries(document: Mapping[str, Any], bound: NamedBound | None, target: float, folder: str) -> Iterator[str]:
+def _tries(
+    run: RunMetrics,
+    config: Mapping[str, Any],
+    baseline: PolicyMetrics | None,
+    bound: NamedBound | None,
+    target: float,
+    folder: str,
+) -> Iterator[str]:
     """Yield proposals that follow from the run's figures, the most useful first.
 
-    `document`: mapping with the known keys of report.json. `bound`: result of `bound_of`. `target`: rate to hold, in
-    frames a second. `folder`: see `verdict_of`.
+    `run`, `config`, `folder`: see `facts_of`. `baseline`: figures with one frame at a time. `bound`: bound of the run.
+    `target`: rate to hold, in frames a second.
     """
-    others = document.get("other_programs")
-    if others is not None and others > MOST_OTHERS:
-        yield f"end other programs ({percent(others)}) and run again"
-    left = 1 - target / document["fps"] if document.get("fps") else 0.0
-    if left < 0 or _is_paced(document):
-        yield from _shorter(document, bound)
-    latency_ms, baseline = (document.get("latency_ms") or {}).get("mean") or 0.0, document.get("baseline")
-    if left >= 0 and baseline and latency_ms > MUCH_LATER * (baseline["latency_ms"]["mean"] or 0.0) > 0:
+    if run.other_programs is not None and run.other_programs > MOST_OTHERS:
+        yield f"end other programs ({percent(run.other_programs)}) and run again"
+    left = 1 - target / run.fps if run.fps else 0.0
+    if left < 0 or _is_paced(config, run.policy):
+        yield from _shorter(run, config, bound)
+    latency_ms = run.latency_ms.mean or 0.0
+    if left >= 0 and baseline and latency_ms > MUCH_LATER * (baseline.latency_ms.mean or 0.0) > 0:
         yield "--latch 3 for newer poses: a frame alone takes less than half of the latency"
-    if left >= MUCH_LEFT and "pipeline" not in (document.get("config") or {}):
+    if left >= MUCH_LEFT and "pipeline" not in config:
         yield f"a larger --picture: {100 * left:.0f} % of each frame's time is left"
     yield f"trilane explain {folder or 'RUN'}"
 
 
-def _shorter(document: Mapping[str, Any], bound: NamedBound | None) -> Iterator[str]:
+def _shorter(run: RunMetrics, config: Mapping[str, Any], bound: NamedBound | None) -> Iterator[str]:
     """Yield proposals to shorten the frame time.
 
     For a run with one frame at a time, the first proposal is a policy under which the units work at once. If a unit
     bounds the run, and not, for example, the rate, another proposal concerns the stage that bounds.
-    `document`: mapping with the known keys of report.json. `bound`: result of `bound_of`.
+    `run`, `config`, `bound`: see `_tries`.
     """
-    if works_on_one_frame(document.get("policy", "")) and len(document["units"]) > 1:
+    if works_on_one_frame(run.policy) and len(run.units) > 1:
         yield "--policy pipelined: the units then work at once"
-    if bound is None or bound.unit not in document["units"] or not bound.stages:
+    if bound is None or bound.unit not in run.units or not bound.stages:
         return  # no unit bounds the run, but other programs, the rate or the policy
     stage = next(iter(bound.stages))
-    if pipeline := (document.get("config") or {}).get("pipeline"):
-        units = [unit for unit in document["units"] if unit != document["stages"][stage]["unit"]]
+    if pipeline := config.get("pipeline"):
+        units = [unit for unit in run.units if unit != run.stages[stage].unit]
         if units:
             yield f"trilane predict {pipeline['file']} --set stages.{stage}.unit={units[0]}"
         return
@@ -270,7 +297,11 @@ def _predicted_lateness(answer: Mapping[str, Any]) -> LateFrames | None:
     Random times and other pipelines can make frames late although the mean frame time is short enough.
     `answer`: see `predicted_verdict`.
     """
-    return _lateness(answer, is_paced=True) if "frames" in answer and "rate" in answer else None
+    if "frames" not in answer or "rate" not in answer:
+        return None
+    frames = answer["frames"]
+    lost = frames.get("lost", 0)  # a prediction loses none
+    return _lateness(frames["presented"], answer["deadline_misses"], frames["dropped"], lost, is_paced=True)
 
 
 def _needed(answer: Mapping[str, Any]) -> dict[str, Any]:

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from trilane.apps.run.verdict import Verdict
+from trilane.pipeline.run_metrics import Bound
 from trilane.units import NS_PER_S
 
 #: Upper bounds in seconds: dense for rates from 200 to 10 frames a second, sparse outside.
@@ -159,9 +161,8 @@ class MomentFigures:
     `temperature_c`: last temperatures by place. `duty`: last duties by unit, from 0 to 1.
     `memory_bytes`: last memory of each process, by unit; `scheduler` is the scheduler's process.
     `notes`: the last few messages.
-    `bound`: what bounds the run so far, as in report.json; None before 63 frames, and if it is not computed.
-    `verdict`: verdict on the run so far, with the keys of report.json and `lines` for people; None before the second
-    presented frame.
+    `bound`: what bounds the run so far; None before 63 frames, and if it is not computed.
+    `verdict`: verdict on the run so far; None before the second presented frame.
     `frame_times`, `latencies`: histograms of the whole run.
     `began_at`: UTC, ISO 8601; "" if the journal has no such time.
     `accuracy`: error by avatar, as in report.json; empty if the journal has no errors.
@@ -186,8 +187,8 @@ class MomentFigures:
     duty: Mapping[str, float]
     memory_bytes: Mapping[str, float]
     notes: tuple[Note, ...]
-    bound: Mapping[str, Any] | None
-    verdict: Mapping[str, Any] | None
+    bound: Bound | None
+    verdict: Verdict | None
     frame_times: Histogram
     latencies: Histogram
     began_at: str
@@ -195,8 +196,12 @@ class MomentFigures:
     sources: Mapping[str, str]
 
     def as_json(self) -> dict[str, Any]:
-        """Return the figures as nested mappings with the names of the fields, ready for JSON."""
-        return asdict(self)
+        """Return the figures as nested mappings with the names of the fields, ready for JSON.
+
+        `bound` and `verdict` are as in report.json; `verdict` also has `lines` for people.
+        """
+        told = {"bound": self.bound and self.bound.as_json(), "verdict": self.verdict and self.verdict.shown()}
+        return asdict(replace(self, bound=None, verdict=None)) | told
 
 
 class TimeHistogram:

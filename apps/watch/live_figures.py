@@ -10,13 +10,13 @@ from __future__ import annotations
 
 from collections import Counter, deque
 from collections.abc import Callable, Generator, Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from trilane.apps.run.report import read_report
-from trilane.apps.run.verdict import judged
-from trilane.apps.run.verdict_facts import facts_of, verdict_of
+from trilane.apps.run.verdict import Verdict, judged
+from trilane.apps.run.verdict_facts import facts_of, facts_so_far, verdict_of
 from trilane.apps.watch.figures import (
     DropCount,
     FrameFigures,
@@ -44,6 +44,7 @@ from trilane.pipeline.journal import (
     target_period_ns,
 )
 from trilane.pipeline.reckoning import Reckoning, places_of
+from trilane.pipeline.run_metrics import RunMetrics, metrics_in
 from trilane.pipeline.timeline import EndedJob, ExplainedJob, Presented, Timeline
 from trilane.pipeline.unit_history import BUSY, JOIN, OVERHEAD, PREEMPTED
 from trilane.scheduler.events import NEVER, Finish, JobDone, Start
@@ -89,13 +90,11 @@ class LiveFigures:
         self._timeline = line = Timeline(begun.graph, begun.settings, waits=finds_bound)
         self._reckoning = Reckoning(begun.graph, begun.settings, places_of(begun), line) if finds_bound else None
         self._begun = begun
-        self._bound: Mapping[str, Any] | None = None
-        self._report: Mapping[str, Any] | None = None
+        self._report: RunMetrics | None = None
         self._late, self._target_ns = 0, target_period_ns(begun)
         self._first_ns: int | None = None
         self._last_ns = 0
         self._finished_ns = NEVER
-        self._is_over = False
         self._times: dict[str, _UnitTime] = {}
         self._jobs, self._restarts = Counter[str](), Counter[str]()
         self._stages = {stage.name: _StageBook() for stage in begun.graph.stages}
@@ -124,7 +123,7 @@ class LiveFigures:
     @property
     def is_over(self) -> bool:
         """Return whether the last record of the run was added."""
-        return self._is_over
+        return self._report is not None
 
     def add(self, record: Record) -> None:
         """Add the next record of the journal after `begun`."""
@@ -152,15 +151,15 @@ class LiveFigures:
         window_s = min(now_ns - start_ns, WINDOW_NS) / NS_PER_S
         recent = [each for each in self._recent if each.end_ns > now_ns - WINDOW_NS]
         clock = str(self._facts.get("clock", ""))
-        state = state or (RunState.FINISHED if self._is_over else RunState.GOES_ON)
-        goes_on = state is RunState.GOES_ON and not self._is_over
+        state = state or (RunState.FINISHED if self.is_over else RunState.GOES_ON)
+        goes_on = state is RunState.GOES_ON and not self.is_over
         run_fps = self._run_fps()
         figures = MomentFigures(
             t_ms=self._since_first_ms(now_ns),
             window_s=window_s,
             run_s=(now_ns - start_ns) / NS_PER_S,
             clock=clock,
-            is_over=self._is_over,
+            is_over=self.is_over,
             state=state.value,
             fps=run_fps if state is RunState.FINISHED else len(recent) / window_s if window_s else 0.0,
             run_fps=run_fps,
@@ -173,36 +172,22 @@ class LiveFigures:
             duty=self._values(DUTY),
             memory_bytes=self._values(MEMORY),
             notes=tuple(self._notes),
-            bound=self._bound or (self._reckoning.bound if self._reckoning is not None else None),
+            bound=(self._report and self._report.bound) or (self._reckoning.bound if self._reckoning else None),
             verdict=None,
             frame_times=self._frame_times.now(),
             latencies=self._latencies.now(),
             began_at=str(self._facts.get("began_at", "")),
-            accuracy=dict(self._facts.get("accuracy") or {}),
+            accuracy=self._facts.get("accuracy", {}),
             sources=self._sources(clock),
         )
         return replace(figures, verdict=self._verdict(figures) if self._timeline.presented > 1 else None)
 
-    def _verdict(self, figures: MomentFigures) -> dict[str, Any]:
+    def _verdict(self, figures: MomentFigures) -> Verdict:
         """Return the verdict on the run so far. For a run that is over, the figures in its last record decide."""
-        document = self._report or {
-            "clock": figures.clock,
-            "policy": self._settings.policy,
-            "frames": {
-                "presented": figures.frames.presented,
-                "lost": sum(figures.frames.lost.values()),
-                "dropped": {f"{drop.edge}:{drop.cause}": drop.frames for drop in figures.frames.dropped},
-            },
-            "fps": figures.run_fps,
-            "deadline_misses": self._late,
-            "frame_time_ms": figures.frame_time_ms,
-            "latency_ms": figures.latency_ms,
-            "bound": figures.bound,
-            "stages": {stage.name: {"unit": stage.unit} for stage in self._graph.stages},
-            "units": {name: asdict(unit.run) for name, unit in figures.units.items()},
-        }
-        known = {"config": config_of(self._begun), "accuracy": figures.accuracy}
-        return judged(facts_of({**document, **known}, goes_on=self._report is None)).shown()
+        config = config_of(self._begun)
+        if self._report is not None:
+            return judged(facts_of(self._report, config, figures.accuracy))
+        return judged(facts_so_far(figures, self._late, config, self._settings.policy))
 
     # records
 
@@ -252,7 +237,7 @@ class LiveFigures:
 
     def _add_end(self, ended: Ended) -> None:
         self._last_ns = max(self._last_ns, ended.now_ns)
-        self._is_over, self._bound, self._report = True, ended.report.get("bound"), ended.report
+        self._report = metrics_in(ended.report, "the journal, last record")
 
     # figures
 
@@ -302,7 +287,7 @@ class LiveFigures:
             f"{TEMPERATURE}{SENSOR}": MEASURED,
             "duty": COMPUTED,
         }
-        accuracy = self._facts.get("accuracy") or {}
+        accuracy = self._facts.get("accuracy", {})
         return sources | {f"accuracy.{name}": facts["source"] for name, facts in accuracy.items() if "source" in facts}
 
 
@@ -348,7 +333,7 @@ def _as_reported(figures: MomentFigures, folder: Path) -> MomentFigures:
     """
     if not (folder / "report.json").is_file():
         return figures
-    return replace(figures, verdict=verdict_of(read_report(folder), str(folder)).shown())
+    return replace(figures, verdict=verdict_of(read_report(folder), str(folder)))
 
 
 class _Span(NamedTuple):

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from trilane.pipeline.run_metrics import RunMetrics
+
 SHOWN = {
     "source": "from the avatar's validation of 2026-01-02",
     "runtime": "ort",
@@ -98,3 +100,8 @@ def make_report(**changes: Any) -> dict[str, Any]:
         "checksum": None,
         **changes,
     }
+
+
+def make_metrics(**changes: Any) -> dict[str, Any]:
+    """What the last record of a journal has, with `changes`."""
+    return {key: value for key, value in make_report(**changes).items() if key in RunMetrics.model_fields}

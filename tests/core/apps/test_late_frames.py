@@ -50,7 +50,7 @@ def test_ledger_live_figures_and_trace_count_the_same_frames(case: str) -> None:
         figures.add(record)
     verdict = figures.now().verdict
     assert verdict is not None
-    assert f" {misses} of " in verdict["lines"][0][1]
+    assert f" {misses} of " in verdict.lines()[0][1]
     write_trace(records, file := io.BytesIO())
     actual = read_trace(file.getvalue()).of("Actual frames")
     assert sum(one.name.startswith("late") for one in actual) == misses

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from support.run_report import make_report
+from support.run_report import make_metrics, make_report
 from support.told_journal import told_journal
 from trilane.apps.cli import watch as cli_watch
 from trilane.apps.cli.watch import line, screen
@@ -34,7 +34,7 @@ BEGUN, RECORDS = told_journal()
 END: tuple[Record, ...] = (
     Stepped(1070 * MS, (UnitDied("v"),), (Start("v"),)),
     Counted(1070 * MS, {"died:v": 1}, {}),
-    Ended(1090 * MS, {}),
+    Ended(1090 * MS, make_metrics(bound=None)),
 )
 FIGURES = LiveFigures(BEGUN)
 for record in (*RECORDS, *END):
@@ -69,8 +69,8 @@ def test_the_screen(check_printed: Check) -> None:
 
 def test_the_verdict_stands_first_and_in_the_line() -> None:
     """The bound of the verdict is that of the line: dsp, with 82 % of the path."""
-    verdict = verdict_of(Report.model_validate(make_report()), "runs/walk").shown()
-    figures = replace(FIGURES.now(), bound=make_report()["bound"], verdict=verdict)
+    report = Report.model_validate(make_report())
+    figures = replace(FIGURES.now(), bound=report.bound, verdict=verdict_of(report, "runs/walk"))
     for state in (RunState.GOES_ON, RunState.KILLED):
         console, look = Console(file=io.StringIO(), width=120), RunLook("walk", state, figures)
         console.print(screen(look, 120))
@@ -154,7 +154,7 @@ def test_a_run_that_is_killed_while_it_is_looked_at_says_so_and_ends(
 def test_a_finished_run_has_the_rate_of_its_report(command: Command) -> None:
     """Two frames, 20 ms apart, in a run of 90 ms: 50 a second, and not the 22 of its whole length."""
     second = Stepped(1080 * MS, (JobDone("v", 3, 1050 * MS, 1060 * MS, 0),), ())
-    written("runs/walk", BEGUN, *RECORDS, second, Ended(1090 * MS, {}))
+    written("runs/walk", BEGUN, *RECORDS, second, Ended(1090 * MS, make_metrics()))
     out = command("watch", "walk")[0]
     assert "finished; fps between the first frame and the last, p50" in out
     assert "; 50.0 fps; " in out

@@ -242,7 +242,7 @@ def test_the_bound_is_the_same_wherever_it_is_said(scene: str, policy: str, held
     view = FinishedView(folder)
     states = [message for message in view.greeting() if message["type"] == "state"]
     view.close()
-    shown = (explained["verdict"], look.figures.verdict, states[0]["verdict"], load_run(folder).verdict.as_json())
+    shown = (explained["verdict"], look.as_json()["verdict"], states[0]["verdict"], load_run(folder).verdict.as_json())
     assert [dict(each or {})["bound"] for each in shown] == [bound] * 4
     assert {json.dumps(each["lines"][2]) for each in shown[:3] if each} == {
         json.dumps(list(load_run(folder).verdict.lines()[2]))

@@ -167,7 +167,7 @@ def test_what_bounds_the_run_is_known_after_some_frames_and_at_the_end_it_is_the
     graph, times = chain((("a", "u"), ("b", "v")), "double", "b"), {"a": 5 * MS, "b": 15 * MS}
     run = simulate(graph, Settings(100), lambda stage, *_: times[stage], keep=True)
     assert run.recording is not None
-    told = {"bound": {"unit": {"name": "told"}, "stage": None}}
+    told = {**run.report, "bound": {"unit": {"name": "told", "share": 0.5}, "stage": None}}
     begun, *records = journal_of(run.recording, run.jobs, {}, told)
     assert isinstance(begun, Begun)
     live, finished, presented = LiveFigures(begun), LiveFigures(begun, finds_bound=False), 0
@@ -179,11 +179,12 @@ def test_what_bounds_the_run_is_known_after_some_frames_and_at_the_end_it_is_the
         assert (live.now().bound is None) == (presented <= 62)
     bound = live.now().bound
     assert bound is not None
-    assert (bound["unit"]["name"], bound["stage"]["name"]) == ("v", "b")
-    assert bound["unit"]["share"] == bound["stage"]["share"] == 1
+    assert bound.stage is not None
+    assert (bound.unit.name, bound.stage.name) == ("v", "b")
+    assert bound.unit.share == bound.stage.share == 1
     for figures in (live, finished):
         figures.add(records[-1])
-        assert figures.now().bound == told["bound"]
+        assert figures.now().as_json()["bound"] == told["bound"]
 
 
 BYPASS = Graph(
@@ -231,8 +232,9 @@ def test_at_every_step_frames_are_where_the_scheduler_has_them(case: str) -> Non
             figures.add(record)
         if core.outcome is None:
             assert_frames(figures.now(), core)
-    figures.add(Ended(driver.core.now_ns + S, {}))  # what a run measures after its last frame is no time of its units
-    now, report = figures.now(), core.report(clock="virtual")
+    report = core.report(clock="virtual")
+    figures.add(Ended(driver.core.now_ns + S, report))  # what is measured after the last frame is no time of the units
+    now = figures.now()
     assert_shares(now, report)
     frames = report["frames"]
     assert (now.frames.presented, now.frames.lost) == (frames["presented"], frames["lost_by_cause"])

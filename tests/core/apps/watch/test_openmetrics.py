@@ -13,6 +13,7 @@ import pytest
 
 pytest.importorskip("prometheus_client", reason="the extra dashboard is not installed")
 
+from support.run_report import make_metrics
 from trilane.apps.watch.followed_run import RunState
 from trilane.apps.watch.live_figures import LiveFigures
 from trilane.apps.watch.metrics import COUNTERS, GAUGES, HISTOGRAMS, SOURCE
@@ -52,7 +53,7 @@ def run(frames: int, frame_ms: int = 20) -> LiveFigures:
         figures.add(Accounted(t + 15 * MS, "v", STARVED))
     figures.add(Counted(0, {"died:v": 2}, {"a->b:stale": 3, "source->a:late": 4}))
     figures.add(Sampled(0, {"temperature_c.sensor": 61.5, "duty.v": 0.25, "memory_bytes.v": 5e6}))
-    figures.add(Ended(frames * frame_ms * MS, {}))
+    figures.add(Ended(frames * frame_ms * MS, make_metrics()))
     return figures
 
 
