@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
+from trilane.apps.run.report import PaceComparison
 from trilane.avatars.bundle import load_bundle
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan, application_graph, stage_times_ms
@@ -82,30 +82,29 @@ def release_fps(pace: Pace, scene_fps: float) -> float:
 
 def compare(
     pace: Pace, policy: str, frames: int, jobs: Sequence[JobRecord], *, edge: str = DEFAULT_EDGE, fps: float = 30.0
-) -> dict[str, Any]:
-    """Compare a run at a chip's pace with the same run in virtual time, and return the block `pace` of report.json.
+) -> PaceComparison:
+    """Compare a run at a chip's pace with the same run in virtual time.
 
     `pace`, `policy`, `frames`, `edge`: pace, policy, number of frames and edge of the run. `jobs`: jobs of the run.
-    `fps`: rate of the scene, in frames a second. The keys of the result are the fields of
-    `trilane.apps.run.report.PaceComparison`.
+    `fps`: rate of the scene, in frames a second.
     """
     late = [job for job in jobs if job.end_ns - job.begin_ns > pace.stage_ns[job.stage] + SLACK_NS]
     late_frames = sorted({job.frame for job in late})
     settings = run_settings(policy, frames, round(1e9 / release_fps(pace, fps)))
     virtual = _virtual_ms(pace, settings, edge, _skipping(jobs))
     measured = _measured_ms(jobs, late_frames)
-    return {
-        "profile": pace.profile,
-        "performance_profile": pace.performance_profile,
-        "slow_motion": pace.slow_motion,
-        "stage_ms": {stage: ns / 1e6 for stage, ns in pace.stage_ns.items()},
-        "host_slower": dict(Counter(job.stage for job in late)),
-        "late_frames": late_frames,
-        "virtual_ms": virtual,
-        "measured_ms": measured,
-        "compared_share": _share(jobs, late_frames),
-        "ratio": None if measured is None else measured / virtual,
-    }
+    return PaceComparison(
+        profile=pace.profile,
+        performance_profile=pace.performance_profile,
+        slow_motion=pace.slow_motion,
+        stage_ms={stage: ns / 1e6 for stage, ns in pace.stage_ns.items()},
+        host_slower=dict(Counter(job.stage for job in late)),
+        late_frames=tuple(late_frames),
+        virtual_ms=virtual,
+        measured_ms=measured,
+        compared_share=_share(jobs, late_frames),
+        ratio=None if measured is None else measured / virtual,
+    )
 
 
 def _skipping(jobs: Sequence[JobRecord]) -> set[int]:

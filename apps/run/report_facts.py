@@ -13,12 +13,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-from trilane.apps.run.report import SCHEMA, Report, Resolution, TensorSize
+from trilane.apps.run.report import SCHEMA, Report, Resolution, TensorSize, VerdictFacts
 from trilane.apps.run.verdict_facts import verdict_of
 from trilane.avatars.validation import SizeLoss
 from trilane.machine import here
 from trilane.pipeline.result import RunResult
-from trilane.pipeline.run_metrics import PolicyMetrics, RunMetrics
+from trilane.pipeline.run_metrics import Caps, PolicyMetrics, RunMetrics, Temperature
 from trilane.scene.tensor_budget import ALL_WORK
 from trilane.stages.config import RunConfig
 from trilane.units import COMPARED, COMPUTED, MEASURED
@@ -83,14 +83,13 @@ def report_of(
     `facts`: values of further keys of the report, by key: `video` and `checksum`, and any of the optional keys.
     """
     metrics = result.report
-    sensor = {"sensor": here.sensor_c()}
     document = {
         **metrics.as_json(),
         "schema": SCHEMA,
         "machine": machine,
         "config": config,
-        "caps": metrics.caps.as_json() if metrics.caps else {"how": NO_CAP},
-        "temperature_c": (metrics.temperature_c.as_json() if metrics.temperature_c else {}) | sensor,
+        "caps": metrics.caps or Caps(how=NO_CAP),
+        "temperature_c": (metrics.temperature_c or Temperature()).model_copy(update={"sensor": here.sensor_c()}),
         "pids": result.pids,
         "startup_ms": result.startup_ms,
         "figures": result.metrics,
@@ -100,8 +99,10 @@ def report_of(
         "baseline": baseline and _compared(baseline.report),
         **facts,
     }
-    document["verdict"] = verdict_of(Report.model_validate(document)).as_json()
-    return Report.model_validate(document | {"sources": sources_of(document)})
+    report = Report.model_validate(document)
+    verdict = VerdictFacts.model_validate(verdict_of(report).as_json())
+    report = report.model_copy(update={"verdict": verdict})
+    return report.model_copy(update={"sources": sources_of(report.as_json())})
 
 
 def _compared(metrics: RunMetrics) -> PolicyMetrics:
@@ -109,7 +110,7 @@ def _compared(metrics: RunMetrics) -> PolicyMetrics:
 
 
 def sources_of(document: Mapping[str, Any]) -> dict[str, str]:
-    """Return the source of each figure in a report, by dotted key. `document`: content of the report."""
+    """Return the source of each figure in a report, by dotted key. `document`: report as JSON."""
     sources = {key: source for key, source in SOURCES.items() if _holds(document, key.split("."))}
     return sources | _of_bytes(document["stages"]) | dict(_of_accuracy(document.get("accuracy", {})))
 
@@ -202,29 +203,24 @@ def config_facts(config: RunConfig, policy: str, edge: str) -> dict[str, Any]:
     return {**config.model_dump(mode="json", exclude={"out_dir", "window", "kept"}), "policy": policy, "edge": edge}
 
 
-def resolution_of(
-    rungs: Mapping[int, int], switches: int, config: RunConfig, losses: Sequence[SizeLoss]
-) -> dict[str, Any]:
-    """Return the block `resolution` of the report.
+def resolution_of(rungs: Mapping[int, int], switches: int, config: RunConfig, losses: Sequence[SizeLoss]) -> Resolution:
+    """Return the sizes of a run's tensors, with the loss of PSNR in each.
 
     `rungs`: number of presented frames by rung; each rung has one tensor size. `switches`: number of presented frames
     whose rung differs from that of the previous frame. `config`: configuration of the run. `losses`: loss of PSNR by
     tensor size, for each avatar of the scene.
     """
-    sizes = [
-        {
-            "work": work / ALL_WORK,
-            "most_pixels": budget.most_of(1),
-            "frames": rungs.get(rung, 0),
-            "psnr_loss_db": worst_loss(work, losses),
-        }
+    sizes = tuple(
+        TensorSize(
+            work=work / ALL_WORK,
+            most_pixels=budget.most_of(1),
+            frames=rungs.get(rung, 0),
+            psnr_loss_db=worst_loss(work, losses),
+        )
         for rung, (work, budget) in enumerate(zip(config.works, config.tensor_budgets, strict=True))
-    ]
-    return {
-        "sizes": sizes,
-        "switches": switches,
-        "loss_source": "; ".join(dict.fromkeys(loss.source for loss in losses)),
-    }
+    )
+    sources = dict.fromkeys(loss.source for loss in losses)
+    return Resolution(sizes=sizes, switches=switches, loss_source="; ".join(sources))
 
 
 def worst_loss(work: int, losses: Sequence[SizeLoss]) -> float | None:

@@ -146,7 +146,7 @@ def test_a_run_at_a_pace_has_the_frame_time_of_virtual_time(run: Run) -> None:
     result = run(doubles(pace_ns=stage_ns), 10)
     found = compare(Pace("chip", "any", 1.0, stage_ns), "pipelined", 10, result.jobs)
     assert result.presented == 10
-    assert found["virtual_ms"] == 100
+    assert found.virtual_ms == 100
     infer = [job.begin_ns for job in result.jobs if job.stage == "infer"]
     assert 100e6 <= min(after - before for before, after in pairwise(infer)) < 125e6
     assert result.report.frame_time_ms.mean >= 0.95 * 100

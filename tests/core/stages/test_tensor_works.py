@@ -13,7 +13,6 @@ import pytest
 from pydantic import ValidationError
 
 from support.small_inputs import validated
-from trilane.apps.run.report import Resolution
 from trilane.apps.run.report_facts import resolution_note, resolution_of
 from trilane.avatars.bundle import load_bundle, write_manifest
 from trilane.avatars.manifest import BySize
@@ -128,22 +127,22 @@ def config(works: tuple[int, ...]) -> RunConfig:
 
 def test_frames_are_counted_by_size_with_what_it_costs() -> None:
     found = resolution_of({0: 3, 1: 3, 2: 1}, 4, config(ALL), [LOSS, LOSS])
-    assert [(size["work"], size["most_pixels"], size["frames"], size["psnr_loss_db"]) for size in found["sizes"]] == [
+    assert [(size.work, size.most_pixels, size.frames, size.psnr_loss_db) for size in found.sizes] == [
         (1.0, 102_400, 3, 0.0),  # 65,536 times 25 / 16
         (0.563, 57_651, 3, 1.0),
         (0.25, 25_600, 1, 3.0),
     ]
-    assert (found["switches"], found["loss_source"]) == (4, "from somewhere")
-    note = resolution_note(Resolution.model_validate(found))
+    assert (found.switches, found.loss_source) == (4, "from somewhere")
+    note = resolution_note(found)
     assert note == (
         "resolution: to be in time 4 of 7 presented frames had smaller tensors: 3 of at most 57651 pixels an avatar, "
         "1.0 dB worse, 1 of at most 25600 pixels an avatar, 3.0 dB worse; 4 switches (error: from somewhere)"
     )
     unknown = resolution_of({1: 1}, 0, config(ALL), [LOSS, UNKNOWN])
-    assert [size["psnr_loss_db"] for size in unknown["sizes"]] == [None] * 3
-    assert "pixels an avatar; 0 switches" in resolution_note(Resolution.model_validate(unknown))
-    assert resolution_note(Resolution.model_validate(resolution_of({0: 2}, 0, config(ALL), [LOSS]))) == ""
-    assert json.dumps(found) and math.isfinite(found["sizes"][2]["psnr_loss_db"])
+    assert [size.psnr_loss_db for size in unknown.sizes] == [None] * 3
+    assert "pixels an avatar; 0 switches" in resolution_note(unknown)
+    assert resolution_note(resolution_of({0: 2}, 0, config(ALL), [LOSS])) == ""
+    assert json.dumps(found.as_json()) and math.isfinite(found.sizes[2].psnr_loss_db)
 
 
 #: PSNR by tensor, for bodies of 64², 128² and 256² pixels.

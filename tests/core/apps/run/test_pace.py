@@ -41,17 +41,17 @@ def jobs(late: int | None = None, frames: int = 40) -> list[JobRecord]:
 
 def test_a_run_in_time_has_the_virtual_frame_time() -> None:
     comparison = compare(PACE, "pipelined", 40, jobs())
-    assert comparison["ratio"] == pytest.approx(1.0)
-    assert comparison["virtual_ms"] == 9.0
-    assert (comparison["host_slower"], comparison["late_frames"], comparison["compared_share"]) == ({}, [], 1.0)
+    assert comparison.ratio == pytest.approx(1.0)
+    assert comparison.virtual_ms == 9.0
+    assert (comparison.host_slower, comparison.late_frames, comparison.compared_share) == ({}, (), 1.0)
 
 
 def test_a_late_job_is_counted_and_its_neighbours_are_not_compared() -> None:
     comparison = compare(PACE, "pipelined", 40, jobs(late=20))
-    assert comparison["host_slower"] == {"infer": 1}
-    assert comparison["late_frames"] == [20]
-    assert comparison["ratio"] == pytest.approx(1.0)
-    assert 0.7 < comparison["compared_share"] < 1
+    assert comparison.host_slower == {"infer": 1}
+    assert comparison.late_frames == (20,)
+    assert comparison.ratio == pytest.approx(1.0)
+    assert 0.7 < comparison.compared_share < 1
 
 
 @pytest.mark.parametrize("policy", ["latest", "deadline"])
@@ -61,14 +61,14 @@ def test_a_policy_with_a_rate_has_the_scenes_slowed_down_as_the_chip_is(policy: 
     assert release_fps(slow, 40.0) == pytest.approx(40 / 3)
     assert sum(STAGE_NS.values()) < 75_000_000
     for edge in ("single", "triple"):
-        assert compare(slow, policy, 20, jobs(), edge=edge, fps=40.0)["virtual_ms"] == pytest.approx(75)
+        assert compare(slow, policy, 20, jobs(), edge=edge, fps=40.0).virtual_ms == pytest.approx(75)
 
 
 def test_the_edge_counts_in_virtual_time_too() -> None:
     """With one slot between them, raster, infer and composite take turns; with two the slowest unit decides."""
     turns = sum(STAGE_NS[stage] for stage in ("raster", "infer", "composite"))
-    assert compare(PACE, "pipelined", 40, jobs(), edge="single")["virtual_ms"] == pytest.approx(turns / 1e6)
-    assert compare(PACE, "pipelined", 40, jobs(), edge="double")["virtual_ms"] < turns / 1e6
+    assert compare(PACE, "pipelined", 40, jobs(), edge="single").virtual_ms == pytest.approx(turns / 1e6)
+    assert compare(PACE, "pipelined", 40, jobs(), edge="double").virtual_ms < turns / 1e6
 
 
 def test_each_key_of_the_comparison_by_hand() -> None:
@@ -86,7 +86,7 @@ def test_each_key_of_the_comparison_by_hand() -> None:
         for job in held
     ]
     pace = Pace("chip", "burst", 2.5, STAGE_NS)
-    assert compare(pace, "pipelined", 40, late) == {
+    assert compare(pace, "pipelined", 40, late).as_json() == {
         "profile": "chip",
         "performance_profile": "burst",
         "slow_motion": 2.5,
@@ -99,20 +99,20 @@ def test_each_key_of_the_comparison_by_hand() -> None:
         "ratio": 1.0,
     }
     just = [job._replace(begin_ns=job.begin_ns - SLACK_NS) if job.frame == 20 else job for job in held]
-    assert compare(pace, "pipelined", 40, just)["late_frames"] == []
+    assert compare(pace, "pipelined", 40, just).late_frames == ()
 
 
 def test_one_frame_has_no_interval() -> None:
     """Nor any share: 0 of none are compared."""
     first = [job for job in jobs() if job.frame == 0]
     comparison = compare(PACE, "pipelined", 40, first)
-    assert (comparison["measured_ms"], comparison["compared_share"], comparison["virtual_ms"]) == (None, 0.0, 9.0)
+    assert (comparison.measured_ms, comparison.compared_share, comparison.virtual_ms) == (None, 0.0, 9.0)
 
 
 def test_the_policy_decides_the_virtual_frame_time() -> None:
     """One frame at a time takes 1 + 4 + 9 + 3 + 1 ms."""
-    assert compare(PACE, "sequential", 40, jobs())["virtual_ms"] == 18.0
-    assert compare(PACE, "sequential", 40, jobs())["ratio"] == 0.5
+    assert compare(PACE, "sequential", 40, jobs()).virtual_ms == 18.0
+    assert compare(PACE, "sequential", 40, jobs()).ratio == 0.5
 
 
 @pytest.mark.parametrize(("slow_motion", "said"), [(0, "0"), (-1.5, "-1.5"), (1001, "1001"), (float("nan"), "nan")])
@@ -127,8 +127,8 @@ def test_slow_motion_is_refused_word_by_word(slow_motion: float, said: str) -> N
 def test_nothing_is_compared_when_every_frame_is_late() -> None:
     slow = [job._replace(end_ns=job.end_ns + 2 * SLACK_NS) for job in jobs()]
     comparison = compare(PACE, "pipelined", 40, slow)
-    assert (comparison["measured_ms"], comparison["ratio"], comparison["compared_share"]) == (None, None, 0.0)
-    assert len(comparison["late_frames"]) == 40
+    assert (comparison.measured_ms, comparison.ratio, comparison.compared_share) == (None, None, 0.0)
+    assert len(comparison.late_frames) == 40
 
 
 def test_a_chips_times_grow_with_the_tensor_and_the_slow_motion() -> None:
