@@ -24,7 +24,7 @@ from trilane.pipeline.memory import BYTES, Assets, add_bytes
 from trilane.pipeline.realtime_clock import ClockGovernor, RealtimeClock, add_accounts
 from trilane.pipeline.rehearsal import Chain, on_rungs
 from trilane.pipeline.result import JournalFile, RunLog, RunRecord, RunResult, recorded
-from trilane.pipeline.run_metrics import ProcessorState, RunMetrics, metrics_of
+from trilane.pipeline.run_metrics import ProcessorState, RunMetrics
 from trilane.pipeline.surroundings import (
     beside_units,
     check_cores,
@@ -183,7 +183,7 @@ def run_pipeline(
         report.update(record.reckoned(pipeline.places()).figures)
         add_accounts(report, pipeline, clock.cpu, log)
         add_bytes(report, clock.metrics)
-        metrics = metrics_of(report)
+        metrics = RunMetrics.model_validate(report)
         record.end(metrics.as_json())
         if record.failure is not None:
             log.fail(str(record.failure))

@@ -480,21 +480,13 @@ class RunMetrics(PolicyMetrics):
     temperature_c: Temperature | None = None
 
 
-def metrics_of(ledger_report: Mapping[str, Any]) -> RunMetrics:
-    """Return the figures of a run. Raises ValueError for a wrong key or value.
-
-    `ledger_report`: keys of `Ledger.report()`, and further keys of report.json.
-    """
-    return RunMetrics.model_validate(ledger_report)
-
-
 def metrics_in(report: Mapping[str, Any], where: str) -> RunMetrics:
     """Return the figures in the last record of a journal. Raises BadInputError for figures of a wrong form.
 
     `report`: report of the record. `where`: journal and record, as errors name them.
     """
     try:
-        return metrics_of(report)
+        return RunMetrics.model_validate(report)
     except ValidationError as error:
         first = error.errors()[0]
         key = ".".join(str(part) for part in first["loc"])

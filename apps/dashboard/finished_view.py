@@ -28,16 +28,18 @@ from trilane.apps.dashboard.view import (
     Client,
     ControlSaid,
     Message,
-    RunMeter,
     Seek,
     TimelineRows,
     described,
+    figures_said,
     jpeg_of,
+    metrics_text,
     note,
     shown,
     slices,
 )
 from trilane.apps.watch.followed_run import CUT_OFF, FollowedRun, RunState
+from trilane.apps.watch.live_figures import LiveFigures
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, Begun, Ended, Record, Stepped, journal_in, read_journal
 from trilane.pipeline.unit_history import UNEXPLAINED
@@ -146,7 +148,7 @@ class _FinishedRun:
         self.end_ms = 0.0
         self.jobs, self.idle, self.presented, self.figures = map(TimeTable, (JOB, IDLE, PRESENTED, FIGURES))
         self._written = _TextStore()
-        self._timeline, self._meter = TimelineRows(begun), RunMeter(begun, finds_bound=facts.bound is None)
+        self._timeline, self._live = TimelineRows(begun), LiveFigures(begun, finds_bound=facts.bound is None)
         read = begun.graph.streams
         self._ends = {place for place, stage in enumerate(begun.graph.stages) if stage.name not in read}
         self._due_ms = 0.0
@@ -157,7 +159,7 @@ class _FinishedRun:
     def add(self, record: Record) -> None:
         """Add the next record of the journal after `begun`."""
         self._timeline.add(record)
-        self._meter.add(record)
+        self._live.add(record)
         self._is_whole = isinstance(record, Ended)
         if isinstance(record, Stepped):
             self._keep()
@@ -169,7 +171,7 @@ class _FinishedRun:
         self._timeline.end()
         self._keep()
         self._keep_figures()
-        self.end_ms, self.metrics = self._timeline.now_ms, self._meter.metrics(state=state)
+        self.end_ms, self.metrics = self._timeline.now_ms, metrics_text(self._live.now(state=state))
         if not self._is_whole:
             self.notes.append((self.end_ms, CUT_OFF))
         for table in (self.jobs, self.idle, self.presented, self.figures):
@@ -221,7 +223,7 @@ class _FinishedRun:
         self.notes = [*self.notes, *notes][-MOST_NOTES:]
 
     def _keep_figures(self) -> None:
-        offset, size = self._written.add(json.dumps(self._meter.message()).encode())
+        offset, size = self._written.add(json.dumps(figures_said(self._live.now())).encode())
         self.figures.add((offset, size, self._timeline.now_ms, self._timeline.now_ms))
         self._due_ms = self._timeline.now_ms + FIGURES_EVERY_MS
 

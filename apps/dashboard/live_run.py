@@ -32,7 +32,7 @@ from trilane.apps.dashboard.run_facts import (
     controls_of_file,
     controls_of_run,
     facts_of_checked,
-    facts_of_file,
+    facts_of_config,
 )
 from trilane.apps.run.asked_run import early_processes, prepare, run_prepared
 from trilane.apps.run.run_job import ENDLESS, Hooks, Prepared, RunOutcome, Watched
@@ -313,7 +313,7 @@ class FileWatch:
         sides = (output["height"], output["width"]) if output else NO_PICTURE
         height, width = (max(side // 2 * 2, 2) for side in sides)  # as the video has them
         link = self._link = self._make(height, width, self.do)
-        said = facts_of_file(run_name(folder), config, facts["machine"])
+        said = facts_of_config(run_name(folder), config, facts["machine"], {})
         controls = controls_of_file(list(pipeline.units))
         link.send(RunBegins(str(folder), asdict(said), [asdict(control) for control in controls]))
         link.send(StateIs(RUNNING, ""))

@@ -40,16 +40,18 @@ from trilane.apps.dashboard.view import (
     IdleRow,
     JobRow,
     Message,
-    RunMeter,
     Seek,
     TimelineRows,
     described,
+    figures_said,
     jpeg_of,
+    metrics_text,
     note,
     shown,
     slices,
 )
 from trilane.apps.watch.followed_run import FollowedRun, run_name
+from trilane.apps.watch.live_figures import LiveFigures
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import Begun, Record
 from trilane.transport.live_window import LiveWindow, ShownPicture, Steering
@@ -139,20 +141,20 @@ class _Course:
 
     `begun`: first record of its journal.
 
-    `timeline`, `meter`: rows and figures so far. `jobs`, `idle`, `notes`: the newest rows and notes, for clients that
+    `timeline`, `figures`: rows and figures so far. `jobs`, `idle`, `notes`: the newest rows and notes, for clients that
     join later.
     """
 
     def __init__(self, begun: Begun) -> None:
         self.begun = begun
-        self.timeline, self.meter = TimelineRows(begun), RunMeter(begun)
+        self.timeline, self.figures = TimelineRows(begun), LiveFigures(begun)
         self.jobs: deque[JobRow] = deque(maxlen=MOST_JOBS)
         self.idle: deque[IdleRow] = deque(maxlen=MOST_IDLE)
         self.notes: deque[Message] = deque(maxlen=MOST_NOTES)
 
     def add(self, record: Record) -> None:
         self.timeline.add(record)
-        self.meter.add(record)
+        self.figures.add(record)
 
     def fresh(self) -> Iterable[Message]:
         """Return messages with the jobs, idle slices and notes since the last call, and store these rows."""
@@ -209,7 +211,7 @@ class LiveView:
         if course is not None:
             yield slices(list(course.jobs), list(course.idle))
             yield from course.notes
-            yield course.meter.message(self._now_ns())
+            yield figures_said(course.figures.now(self._now_ns()))
 
     async def news(self, *, is_watched: bool) -> Iterable[Message]:
         await self._read_on()
@@ -225,7 +227,7 @@ class LiveView:
             told += self._course.fresh()
             if time.monotonic() >= self._figures_s:
                 self._figures_s = time.monotonic() + FIGURES_S
-                told.append(self._course.meter.message(self._now_ns()))
+                told.append(figures_said(self._course.figures.now(self._now_ns())))
         return told
 
     async def picture(self, client: Client) -> bytes | None:
@@ -284,7 +286,7 @@ class LiveView:
         return [{"type": "refused", "control": "seek", "why": GOES_ON}]
 
     def metrics(self) -> str:
-        return "" if self._course is None else self._course.meter.metrics(self._now_ns())
+        return "" if self._course is None else metrics_text(self._course.figures.now(self._now_ns()))
 
     @property
     def trace(self) -> Path | None:
@@ -333,7 +335,7 @@ class LiveView:
     @property
     def _is_starting(self) -> bool:
         """Return whether the run is going on but has presented no frame yet."""
-        return self._state == RUNNING and (self._course is None or not self._course.meter.has_frames)
+        return self._state == RUNNING and (self._course is None or not self._course.figures.has_frames)
 
     def _values(self, facts: RunFacts) -> dict[str, Any]:
         """Return the present value of each control that has a value, by the control's name."""

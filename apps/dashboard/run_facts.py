@@ -7,7 +7,7 @@ of a control are stated only in its `Control`.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -126,42 +126,24 @@ def facts_of_checked(name: str, checked: Checked, options: RunOptions, machine: 
     from trilane.apps.run.report_facts import config_facts
 
     config = checked.config
-    scene = config.scene
     said = config_facts(config, options.policy, options.edge)
-    return RunFacts(
-        name,
-        scene.name,
-        "host",
-        _machine_line(machine),
-        scene.fps,
-        (scene.output.width, scene.output.height),
-        config_in_force(said, dict(options)),
-        {"tensor_shapes": [list(shape) for shape in config.buckets], "notes": list(checked.notes)},
-        checked.placement,
-        checked.accuracy,
-    )
+    plan = {"tensor_shapes": [list(shape) for shape in config.buckets], "notes": list(checked.notes)}
+    facts = facts_of_config(name, said, machine, dict(options))
+    return replace(facts, plan=plan, placement=checked.placement, accuracy=checked.accuracy)
 
 
-def facts_of_file(name: str, config: Mapping[str, Any], machine: Mapping[str, Any]) -> RunFacts:
-    """Return the facts of a pipeline file's run that begins.
+def facts_of_config(
+    name: str, config: Mapping[str, Any], machine: Mapping[str, Any], options: Mapping[str, Any]
+) -> RunFacts:
+    """Return the facts of a run that begins, without those of its avatars.
 
     `name`: name of the run folder.
     `config`, `machine`: blocks of report.json.
+    `options`: as in `config_in_force`.
     """
-    scene = config["scene"]
-    output = _output(scene)
-    return RunFacts(
-        name,
-        scene["name"],
-        "host",
-        _machine_line(machine),
-        scene["fps"],
-        output,
-        config_in_force(config, {}),
-        {},
-        None,
-        {},
-    )
+    scene, values = config["scene"], config_in_force(config, options)
+    line, output = _machine_line(machine), _output(scene)
+    return RunFacts(name, scene["name"], "host", line, scene["fps"], output, values, {}, None, {})
 
 
 def facts_of_report(name: str, report: Report) -> RunFacts:
@@ -173,21 +155,14 @@ def facts_of_report(name: str, report: Report) -> RunFacts:
     from trilane.apps.run.verdict_facts import verdict_of
 
     document = report.as_json()
-    scene = document["config"]["scene"]
-    caps = document["caps"]
-    return RunFacts(
-        name,
-        scene["name"],
-        report.clock,
-        _machine_line(document["machine"]),
-        scene["fps"],
-        _output(scene),
-        config_in_force(document["config"], {**(document.get("options") or {}), **caps}),
-        {**document.get("plan", {}), "notes": document.get("notes", [])},
-        document.get("placement"),
-        document.get("accuracy", {}),
-        {key: document.get(key) for key in BOUND} if report.bound is not None else None,
-        verdict_of(report, name).shown(),
+    return replace(
+        facts_of_config(name, report.config, document["machine"], {**document.get("options", {}), **document["caps"]}),
+        clock=report.clock,
+        plan={**document.get("plan", {}), "notes": list(report.notes)},
+        placement=document.get("placement"),
+        accuracy=report.accuracy,
+        bound={key: document.get(key) for key in BOUND} if report.bound is not None else None,
+        verdict=verdict_of(report, name).shown(),
     )
 
 

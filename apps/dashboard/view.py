@@ -24,8 +24,7 @@ from typing import Annotated, Any, Final, Literal, Protocol
 
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from trilane.apps.watch.followed_run import RunState
-from trilane.apps.watch.live_figures import LiveFigures
+from trilane.apps.watch.figures import MomentFigures
 from trilane.pipeline.journal import Begun, Record, Stepped, Worked
 from trilane.pipeline.journal import Said as SaidRecord
 from trilane.pipeline.timeline import Timeline
@@ -352,37 +351,16 @@ def note(t_ms: float, text: str) -> dict[str, Any]:
     return {"type": "note", "t_ms": t_ms, "text": text}
 
 
-class RunMeter:
-    """Computes the figures of a run so far, from the journal's records.
+def figures_said(figures: MomentFigures) -> dict[str, Any]:
+    """Return the message `figures` with the figures of a run at one moment."""
+    return {"type": "figures", **figures.as_json()}
 
-    `begun`: first record of the journal.
-    `finds_bound`: as in `LiveFigures`.
-    """
 
-    def __init__(self, begun: Begun, *, finds_bound: bool = True) -> None:
-        self._figures = LiveFigures(begun, finds_bound=finds_bound)
+def metrics_text(figures: MomentFigures) -> str:
+    """Return the figures of a run in OpenMetrics, without the end mark."""
+    from trilane.apps.watch.metrics import openmetrics  # this module needs a package of the extra `dashboard`
 
-    def add(self, record: Record) -> None:
-        """Add the next record of the journal after `begun`."""
-        self._figures.add(record)
-
-    def message(self, now_ns: int | None = None) -> dict[str, Any]:
-        """Return the message `figures` with the figures at a time of the run's clock.
-
-        `now_ns`: the time; None for the time of the last record.
-        """
-        return {"type": "figures", **self._figures.now(now_ns).as_json()}
-
-    @property
-    def has_frames(self) -> bool:
-        """Return whether the run has presented a frame."""
-        return self._figures.has_frames
-
-    def metrics(self, now_ns: int | None = None, state: RunState | None = None) -> str:
-        """Return the figures in OpenMetrics, without the end mark. `now_ns`, `state`: as in `LiveFigures.now`."""
-        from trilane.apps.watch.metrics import openmetrics  # this module needs a package of the extra `dashboard`
-
-        return openmetrics(self._figures.now(now_ns, state)).decode().removesuffix(END)
+    return openmetrics(figures).decode().removesuffix(END)
 
 
 def jpeg_of(image: Any) -> bytes:

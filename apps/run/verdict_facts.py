@@ -89,7 +89,7 @@ def facts_of(
         alone=(baseline.fps, baseline.latency_ms.mean) if baseline and baseline.fps else None,
         bound=bound,
         idle={unit: (1 - row.busy, _causes(dict(row.idle))) for unit, row in run.units.items()},
-        image=_checked(report.check) if report and report.check else _image(config, accuracy),
+        image=_image(config, accuracy, report and report.check),
         tries=tuple(_tries(run, config, baseline, bound, target, folder)),
     )
 
@@ -180,18 +180,15 @@ def _causes(idle: Mapping[str, float | None]) -> dict[str, float]:
     return {cause: share for cause, share in idle.items() if share}
 
 
-def _checked(check: Check) -> str:
-    against = check.against.partition(":")[0]
-    worst = f"worst {check.worst_psnr_db:.1f} of {check.frames} frames of this run"
-    return f"{check.psnr_db:.1f} dB against {against}, {worst}"
+def _image(config: Mapping[str, Any], accuracy: Mapping[str, Mapping[str, Any]], check: Check | None = None) -> str:
+    """Return a text on the image error of a run.
 
-
-def _image(config: Mapping[str, Any], accuracy: Mapping[str, Mapping[str, Any]]) -> str:
-    """Return a text on the image error of a run whose frames were not checked.
-
-    The text has the error from the validation of the worst avatar, or says that the error is unknown. `config`,
-    `accuracy`: blocks of report.json.
+    If the run's frames were checked, the text has their error. If they were not, the text has the error from the
+    validation of the worst avatar, or says that the error is unknown. `config`, `accuracy`: blocks of report.json.
     """
+    if check:
+        against, worst = check.against.partition(":")[0], check.worst_psnr_db
+        return f"{check.psnr_db:.1f} dB against {against}, worst {worst:.1f} of {check.frames} frames of this run"
     if not accuracy:
         return NO_TRUTH if "pipeline" in config else UNKNOWN
     for facts in accuracy.values():
