@@ -9,7 +9,7 @@ frames of each tensor size comes from the run. The image error of a tensor size 
 from __future__ import annotations
 
 import subprocess
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -102,31 +102,23 @@ def report_of(
     report = Report.model_validate(document)
     verdict = VerdictFacts.model_validate(verdict_of(report).as_json())
     report = report.model_copy(update={"verdict": verdict})
-    return report.model_copy(update={"sources": sources_of(report.as_json())})
+    return report.model_copy(update={"sources": sources_of(report)})
 
 
 def _compared(metrics: RunMetrics) -> PolicyMetrics:
     return PolicyMetrics.model_validate({key: getattr(metrics, key) for key in PolicyMetrics.model_fields})
 
 
-def sources_of(document: Mapping[str, Any]) -> dict[str, str]:
-    """Return the source of each figure in a report, by dotted key. `document`: report as JSON."""
-    sources = {key: source for key, source in SOURCES.items() if _holds(document, key.split("."))}
-    return sources | _of_bytes(document["stages"]) | dict(_of_accuracy(document.get("accuracy", {})))
+def sources_of(report: Report) -> dict[str, str]:
+    """Return the source of each figure in a report, by dotted key.
 
-
-def _of_bytes(stages: Mapping[str, Any]) -> dict[str, str]:
-    """Return the sources of `least` and `ratio` by dotted key, for each stage whose bytes were counted.
-
-    These two figures need own sources, because they are not measured. `stages`: block `stages` of the report.
+    The figures `least` and `ratio` of a stage's bytes need own sources, because they are not measured.
     """
-    counting = [f"stages.{name}.bytes" for name, row in stages.items() if row.get("bytes")]
-    return {f"{key}.{figure}": SOURCES[f"bytes.{figure}"] for key in counting for figure in ("least", "ratio")}
-
-
-def _of_accuracy(accuracy: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    for name, facts in accuracy.items():
-        yield f"accuracy.{name}", facts["source"]
+    document = report.as_json()
+    sources = {key: source for key, source in SOURCES.items() if _holds(document, key.split("."))}
+    counting = [f"stages.{name}.bytes" for name, times in report.stages.items() if times.bytes]
+    sources |= {f"{key}.{figure}": SOURCES[f"bytes.{figure}"] for key in counting for figure in ("least", "ratio")}
+    return sources | {f"accuracy.{name}": facts["source"] for name, facts in report.accuracy.items()}
 
 
 def _holds(document: Any, path: list[str]) -> bool:

@@ -152,7 +152,7 @@ def run_to_folder(
         )
         with Interrupts() as late:  # from here on a signal waits until the folder is whole
             baseline, stopped = job.run_baseline(folder.work) if _is_complete(result) else (None, False)
-            facts = {
+            facts: dict[str, Any] = {
                 "made": made,
                 "options": options.as_json(),
                 "accuracy": dict(checked.accuracy),

@@ -70,16 +70,14 @@ def facts_of(
     slow_motion = report.pace.slow_motion if report and report.pace else 1.0
     target, is_paced = _target_fps(config) / slow_motion, _is_paced(config, run.policy)
     # A run in slow motion that is not paced counts its deadline misses at another rate than the target.
-    has_lateness = run.frames.presented > 1 and (is_paced or slow_motion == 1)
-    dropped, lost = run.frames.dropped, run.frames.lost
+    frames, has_lateness = run.frames, run.frames.presented > 1 and (is_paced or slow_motion == 1)
+    lateness = _lateness(frames.presented, run.deadline_misses, frames.dropped, frames.lost, is_paced=is_paced)
     bound = _named_bound(run.bound, run.stages, run.frame_time_ms.mean)
     baseline = report and report.baseline
     return Facts(
         Rate(run.fps, run.fps_low, run.fps_high) if run.fps else None,
         target,
-        _lateness(run.frames.presented, run.deadline_misses, dropped, lost, is_paced=is_paced)
-        if has_lateness
-        else None,
+        lateness if has_lateness else None,
         trust_of(run.model_dump(include={"clock", "other_programs", "processor", "temperature_c"})),
         is_held_to_rate=is_paced,
         failure=(report and report.failure) or "",
@@ -89,7 +87,7 @@ def facts_of(
         alone=(baseline.fps, baseline.latency_ms.mean) if baseline and baseline.fps else None,
         bound=bound,
         idle={unit: (1 - row.busy, _causes(dict(row.idle))) for unit, row in run.units.items()},
-        image=_image(config, accuracy, report and report.check),
+        image=_image(config, accuracy, report.check if report else None),
         tries=tuple(_tries(run, config, baseline, bound, target, folder)),
     )
 
@@ -187,8 +185,8 @@ def _image(config: Mapping[str, Any], accuracy: Mapping[str, Mapping[str, Any]],
     validation of the worst avatar, or says that the error is unknown. `config`, `accuracy`: blocks of report.json.
     """
     if check:
-        against, worst = check.against.partition(":")[0], check.worst_psnr_db
-        return f"{check.psnr_db:.1f} dB against {against}, worst {worst:.1f} of {check.frames} frames of this run"
+        against, least = check.against.partition(":")[0], check.worst_psnr_db
+        return f"{check.psnr_db:.1f} dB against {against}, worst {least:.1f} of {check.frames} frames of this run"
     if not accuracy:
         return NO_TRUTH if "pipeline" in config else UNKNOWN
     for facts in accuracy.values():

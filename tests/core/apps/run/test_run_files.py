@@ -257,9 +257,11 @@ def figures_in(value: Any, above: tuple[str, ...] = ()) -> Iterator[tuple[str, .
 
 
 def test_every_figure_of_a_report_has_a_source() -> None:
-    paced = {"virtual_ms": 1.0, "ratio": 1.0, "measured_ms": 1.0}
+    times = {"stage_ms": {"infer": 1.0}, "virtual_ms": 1.0, "ratio": 1.0, "measured_ms": 1.0, "compared_share": 1.0}
+    chip = {"profile": "chip", "performance_profile": "burst", "slow_motion": 1.0}
+    paced = {**chip, **times, "host_slower": {}, "late_frames": []}
     document = make_report(video={"frames": 3, "seconds": 0.1}, pace=paced, temperature_c={"sensor": 50.0})
-    sources = sources_of(document)
+    sources = sources_of(Report.model_validate(document))
     for path in figures_in(document):
         if path[0] not in NO_FIGURES_UNDER:
             assert any(".".join(path[:count]) in sources for count in range(1, len(path) + 1)), path
