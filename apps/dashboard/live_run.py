@@ -228,16 +228,16 @@ class Director:
         controls.stop()
 
 
-def choices_of(config: Mapping[str, Any]) -> dict[str, tuple[str, ...]]:
+def choices_of(config: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
     """Return the valid values of each control in OF_A_NEW_RUN, by the control's name.
 
     `config`: present value of each control, which is always valid.
     """
-    found = {"runtime": installed(), "avatar": (*AVATARS, *_neighbours(str(config["avatar"])))}
+    found = {"runtime": installed(), "avatar": (*AVATARS, *_neighbours(config["avatar"]))}
     choices = {}
     for name in OF_A_NEW_RUN:
         offered = option_of(RunOptions.model_fields[name]).offered or ()
-        choices[name] = tuple(dict.fromkeys([*offered, *found.get(name, ()), str(config[name])]))
+        choices[name] = tuple(dict.fromkeys([*offered, *found.get(name, ()), config[name]]))
     return choices
 
 

@@ -52,7 +52,7 @@ class RunFacts:
     machine: str
     fps: float
     output: tuple[int, int]
-    config: Mapping[str, Any]
+    config: Mapping[str, str]
     plan: Mapping[str, Any]
     placement: Mapping[str, Any] | None
     accuracy: Mapping[str, Any]
@@ -87,7 +87,7 @@ class RunFacts:
         return {"type": "state", "is": state, "why": why, "config": self.config, **facts}
 
 
-def config_in_force(config: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, Any]:
+def config_in_force(config: Mapping[str, Any], options: Mapping[str, Any]) -> dict[str, str]:
     """Return the present value of each control in OF_A_NEW_RUN, by name, spelt as in its choices.
 
     For a pipeline file, return only `policy` and `edge`.

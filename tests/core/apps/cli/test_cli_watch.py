@@ -194,12 +194,14 @@ def test_an_interrupt_ends_it_without_a_word(command: Command, monkeypatch: pyte
     [
         (["walk", "--json", "--openmetrics"], "options: found --json and --openmetrics, expected one of them"),
         (["empty"], "runs/empty: found a journal without a record, expected a run folder with a journal"),
+        (["cut"], "the journal, last record: frames: found field required, expected the figures of a run"),
         (["wolk"], "wolk: found no such run"),
         (["--interval", "0"], "--interval"),
     ],
 )
 def test_what_cannot_be_shown_is_refused(command: Command, arguments: list[str], said: str) -> None:
     written("runs/empty")
+    written("runs/cut", BEGUN, Ended(1090 * MS, {}))
     assert said in " ".join(command("watch", *arguments, code=2)[1].split())
 
 
