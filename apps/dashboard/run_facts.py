@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from trilane.options import NOTHING, option_of
-from trilane.pipeline.journal import Begun
+from trilane.pipeline.journal import Begun, config_of
 from trilane.stages.run_options import RunOptions
 
 if TYPE_CHECKING:
@@ -171,7 +171,7 @@ def _output(scene: Mapping[str, Any]) -> tuple[int, int]:
 
     `scene`: block `scene` of `config` in report.json.
     """
-    output = scene.get("output") or {}
+    output = scene.get("output", {})
     return output.get("width", 640), output.get("height", 480)
 
 
@@ -186,7 +186,7 @@ def facts_of_folder(folder: Path, begun: Begun) -> RunFacts:
 
         return facts_of_report(folder.name, read_report(folder))
     facts = begun.facts
-    scene = (facts.get("config") or {}).get("scene") or {}
+    scene = config_of(begun).get("scene", {})
     machine = facts.get("machine")
     return RunFacts(
         folder.name,
@@ -198,7 +198,7 @@ def facts_of_folder(folder: Path, begun: Begun) -> RunFacts:
         {"policy": begun.settings.policy},
         {},
         None,
-        facts.get("accuracy") or {},
+        facts.get("accuracy", {}),
     )
 
 
