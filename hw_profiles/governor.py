@@ -421,7 +421,7 @@ def last_fifth(moments: Sequence[Moment]) -> Sequence[Moment]:
     return moments[-max(1, len(moments) // 5) :]
 
 
-def ends_of(moments: Sequence[Moment]) -> dict[str, float]:
+def ends_of(moments: Sequence[Moment]) -> dict[str, Any]:
     """Return frames a second: `fps_start` at the first moment, `fps_settled` over the last fifth of the moments."""
     last = last_fifth(moments)
     return {"fps_start": 1e3 / moments[0].frame_ms, "fps_settled": 1e3 / (sum(m.frame_ms for m in last) / len(last))}

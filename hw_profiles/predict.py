@@ -97,6 +97,9 @@ def predict(
         times = FrameInterval(times.ms)
     per_unit = {u: sum(ms for s, ms in now.stages_ms.items() if now.unit_of[s] == u) for u in UNITS}
     error = relative_error(job, profile.units[plan.unit]) if known else None
+    at_all_times = dict.fromkeys(("fps_start", "fps_settled"), 1e3 / now.frame_ms)
+    ends: dict[str, Any] = ends_of(moments) if moments else at_all_times
+    placement: dict[str, Any] = {} if placed is None else {"placement": placed.facts}
     return ApplicationPrediction(
         schema=1,
         clock="virtual",
@@ -117,7 +120,7 @@ def predict(
         ),
         latency_ms=MeanTime(mean=now.latency_ms),
         fps=1e3 / frame,
-        **(ends_of(moments) if moments else dict.fromkeys(("fps_start", "fps_settled"), 1e3 / now.frame_ms)),
+        **ends,
         display_capped=now.capped,
         stages={
             s: PredictedStage(unit=now.unit_of[s], service_ms=MeanTime(mean=ms)) for s, ms in now.stages_ms.items()
@@ -134,7 +137,7 @@ def predict(
         **answers(profile, load_of(profile, plan), corners, wanted, _shown_times(profile, wanted.fps, times)),
         expected_error=error,
         confidence=None if error is None else max(0.0, 1 - error),
-        **({} if placed is None else {"placement": placed.facts}),
+        **placement,
         notes=tuple(_notes(profile, plan, placed)),
     )
 
@@ -144,7 +147,7 @@ def _shown_times(profile: Profile, fps: float | None, times: FrameInterval) -> F
     display = profile.application.display_ms.or_else(0)
     if not fps or display * fps <= 1e3:
         return times
-    return FrameInterval(*(None if ms is None else max(ms, display) for ms in times))
+    return FrameInterval(max(times.ms, display), *(None if ms is None else max(ms, display) for ms in times[1:]))
 
 
 def predicted_run(
@@ -250,9 +253,9 @@ def _on_one_core(profile: Profile, one: UnitName, other: UnitName) -> bool:
 
 
 def _config(plan: Plan, performance_profile: str, minutes: float, governor: str) -> PredictedConfig:
-    network, variant = plan.network, plan.variant
+    network, variant, facts = plan.network, plan.variant, dict[str, Any](plan.network.facts)
     return PredictedConfig(
-        **network.facts,
+        **facts,
         size=f"{network.height}x{network.width}",
         channels=network.channels,
         layout=network.layout,
@@ -268,7 +271,7 @@ def _config(plan: Plan, performance_profile: str, minutes: float, governor: str)
     )
 
 
-def _frame_times(profile: Profile, mean_ms: float, frames: Sequence[float]) -> dict[str, float]:
+def _frame_times(profile: Profile, mean_ms: float, frames: Sequence[float]) -> dict[str, Any]:
     ordered = sorted(frames)
     shown = {f"p{p}": ordered[min(len(ordered) - 1, len(ordered) * p // 100)] for p in (50, 90, 95, 99)}
     low, high = ema_range_ms(profile, mean_ms)
@@ -347,7 +350,7 @@ def least_ms(profile: Profile, plan: Plan) -> float:
     return max(profile.application.display_ms.or_else(0), 1e3 / fps if fps else 0.0)
 
 
-def around_frame(frame_ms: float, times: FrameInterval, least: float) -> dict[str, float | None]:
+def around_frame(frame_ms: float, times: FrameInterval, least: float) -> dict[str, Any]:
     """Return the 80 % interval of a mean frame time, as `low` and `high`; None if unknown.
 
     `frame_ms`: mean frame time.

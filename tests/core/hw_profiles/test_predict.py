@@ -190,7 +190,7 @@ def test_every_alternative_is_what_predict_says_of_the_same_policy_and_edge() ->
     profile = load_profile("snapdragon-888")
     for row in what_if(profile, NETWORK, "dsp", SUSTAINED)[:-2]:  # the last two have batches and a share of the GPU
         alone = predict(profile, Plan(NETWORK, "dsp", Variant(row["policy"], row["edge"], fps=MOST_FPS)), SUSTAINED)
-        means = {"frame_ms": alone["frame_time_ms"]["mean"], "latency_ms": alone["latency_ms"]["mean"]}
+        means = {"frame_ms": alone.frame_time_ms.mean, "latency_ms": alone.latency_ms.mean}
         assert {key: row[key] for key in means} == pytest.approx(means), row["name"]
 
 
