@@ -89,13 +89,7 @@ def holding(fps: float, times: FrameInterval, dropped: int = 0, late: int = 0, f
         words = "does not hold, nor would it at the fast end of the interval"
     sentence = _sentence(fps, times, {"dropped": dropped, "late": late}, frames)
     return HeldRate(
-        fps=fps,
-        holds=reserve >= 0,
-        words=words,
-        sentence=sentence,
-        reserve=reserve,
-        reserve_low=low,
-        reserve_high=high,
+        fps=fps, holds=reserve >= 0, words=words, sentence=sentence, reserve=reserve, reserve_low=low, reserve_high=high
     )
 
 

@@ -10,17 +10,7 @@ from collections.abc import Mapping
 from math import inf
 from typing import Any, Final
 
-from trilane.apps.run.verdict import (
-    COMPUTED,
-    DISPLAY,
-    Facts,
-    LateFrames,
-    NamedBound,
-    Rate,
-    Trust,
-    Verdict,
-    judged,
-)
+from trilane.apps.run.verdict import COMPUTED, DISPLAY, Facts, LateFrames, NamedBound, Rate, Trust, Verdict, judged
 from trilane.apps.run.verdict_facts import NO_TRUTH
 from trilane.hw_profiles.prediction import ApplicationPrediction, NetworkPrediction
 from trilane.hw_profiles.rates import FrameInterval, HeldRate, wanted_drops
@@ -31,7 +21,6 @@ from trilane.units import TARGET_FPS
 ROUNDED: Final = 1e-6
 NO_PICTURES: Final = "trilane quality measures it here: a prediction has no pictures"
 OVER_MINUTES: Final = "--minutes 30: what heat leaves of it"
-PIPELINE: Final = "pipeline"
 
 
 def document_of(prediction: ApplicationPrediction | NetworkPrediction) -> dict[str, Any]:
@@ -96,7 +85,7 @@ def pipeline_verdict(row: Mapping[str, Any], of_run: Trust | None = None, *, is_
         lateness=late if rate else None,
         latency_ms=latency["mean"] if latency["samples"] else None,
         idle={unit: (1 - one["busy"], one["idle"]) for unit, one in row["units"].items()},
-        image=NO_TRUTH if row.get("kind", PIPELINE) == PIPELINE else NO_PICTURES,
+        image=NO_TRUTH if row.get("kind") in (None, "pipeline") else NO_PICTURES,
     )
 
 
