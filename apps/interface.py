@@ -24,10 +24,12 @@ from trilane.apps.explain.explained_run import COLUMNS, explain_run, figure_name
 from trilane.apps.old_names import in_new_name
 from trilane.apps.predict.predict_options import OF_A_PIPELINE_ALONE, PredictOptions
 from trilane.apps.run.asked_run import run_asked
+from trilane.apps.run.predicted_verdict import document_of, predicted_verdict
 from trilane.apps.run.report import Report, read_report
 from trilane.apps.run.verdict import Verdict
-from trilane.apps.run.verdict_facts import predicted_verdict, verdict_of
+from trilane.apps.run.verdict_facts import verdict_of
 from trilane.errors import BadInputError, MissingPartError, TrilaneError, did_you_mean
+from trilane.hw_profiles.prediction import ApplicationPrediction, NetworkPrediction
 from trilane.hw_profiles.schema import SHARE_TEXT
 from trilane.options import EMPTY_PATH, Options
 from trilane.pipeline.journal import Record, Stepped
@@ -246,7 +248,7 @@ run.__signature__ = _signature(run, RunOptions, RunOptions.model_fields, DEFAULT
 class Prediction:
     """A prediction of an application or a network on a chip; every figure is computed.
 
-    `document`: document of `trilane predict --json`.
+    `answer`: prediction as a typed record.
     `profile`: name of the hardware profile.
     `what`: the avatar, the network file or the published network.
     `frame_ms`: mean frame time.
@@ -255,7 +257,7 @@ class Prediction:
     `power_w`: power of the whole device.
     """
 
-    document: Mapping[str, Any]
+    answer: ApplicationPrediction | NetworkPrediction
     profile: str
     what: str
     frame_ms: float
@@ -263,6 +265,11 @@ class Prediction:
     high_ms: float | None
     latency_ms: float | None
     power_w: float
+
+    @cached_property
+    def document(self) -> Mapping[str, Any]:
+        """The document of `trilane predict --json`."""
+        return document_of(self.answer)
 
     @property
     def fps(self) -> float:
@@ -272,7 +279,7 @@ class Prediction:
     @property
     def is_display_capped(self) -> bool:
         """Return whether the frame rate is limited by the display or by the requested rate, and not by the chip."""
-        return bool(self.document.get("display_capped", False))
+        return isinstance(self.answer, ApplicationPrediction) and self.answer.display_capped
 
     @property
     def units(self) -> Mapping[str, Any]:
@@ -289,7 +296,7 @@ class Prediction:
     @cached_property
     def verdict(self) -> Verdict:
         """The verdict: whether the chip holds the rate, what bounds the frame time, how sure that is, what to try."""
-        return predicted_verdict(self.document)
+        return predicted_verdict(self.answer)
 
     def _repr_html_(self) -> str:
         busy = ", ".join(f"{unit} {row['busy']:.0%}" for unit, row in self.units.items())
@@ -331,15 +338,13 @@ def predict(
         answers = asked.predict_networks(chip, wanted, say)
         if len(answers) != 1:
             raise BadInputError("network", f"{len(answers)} networks", "one")
-        times = (answers[0]["network_ms"], answers[0]["low_ms"], answers[0]["high_ms"])
-        return Prediction(answers[0], chip.name, str(wanted.network[0]), *times, None, answers[0]["power"]["w"])
+        what, alone = str(wanted.network[0]), answers[0]
+        return Prediction(alone, chip.name, what, *alone.frame, None, alone.power.w)
     chip, plan = asked.application_of(chip, wanted, say)
     answer = asked.answer_of(chip, plan, wanted)
-    frame = answer["frame_time_ms"]
     published = f"{wanted.encoder}, {wanted.size}" if wanted.is_published else wanted.avatar or DEFAULT
     what = str(wanted.network[0]) if wanted.network else published
-    times = (frame["mean"], frame["low"], frame["high"])
-    return Prediction(answer, chip.name, what, *times, answer["latency_ms"]["mean"], answer["power_w"])
+    return Prediction(answer, chip.name, what, *answer.frame, answer.latency_ms.mean, answer.power_w)
 
 
 predict.__signature__ = _signature(predict, PredictOptions, PREDICTED)  # type: ignore[attr-defined]

@@ -22,7 +22,9 @@ from typing import Any, Protocol
 
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.application import Plan, steady
+from trilane.hw_profiles.prediction import Throttling
 from trilane.hw_profiles.schema import CORNERS, Corners, Profile, corners_of
+from trilane.pipeline.run_metrics import Temperature
 from trilane.scheduler.events import SetDuty
 from trilane.scheduler.state import FULL_DUTY
 from trilane.units import MAX_MINUTES, PERFORMANCE_PROFILES, UNITS, UnitName
@@ -419,7 +421,7 @@ def last_fifth(moments: Sequence[Moment]) -> Sequence[Moment]:
     return moments[-max(1, len(moments) // 5) :]
 
 
-def ends_of(moments: Sequence[Moment]) -> dict[str, float]:
+def ends_of(moments: Sequence[Moment]) -> dict[str, Any]:
     """Return frames a second: `fps_start` at the first moment, `fps_settled` over the last fifth of the moments."""
     last = last_fifth(moments)
     return {"fps_start": 1e3 / moments[0].frame_ms, "fps_settled": 1e3 / (sum(m.frame_ms for m in last) / len(last))}
@@ -430,36 +432,29 @@ def settled_corners(moments: Sequence[Moment]) -> Corners:
     return Counter(moment.corners for moment in last_fifth(moments)).most_common(1)[0][0]
 
 
-def temperatures_of(moments: Sequence[Moment]) -> dict[str, float]:
-    """Return temperatures in degrees Celsius; empty without moments.
-
-    `device_end` and `device_max` are the last and the highest temperature of the device's body, `junction_max` is the
-    highest of any junction.
-    """
+def temperatures_of(moments: Sequence[Moment]) -> Temperature:
+    """Return the temperatures of the device's body and of the hottest junction; without moments, no field is set."""
     if not moments:
-        return {}
-    return {
-        "device_end": moments[-1].device_c,
-        "device_max": max(m.device_c for m in moments),
-        "junction_max": max(m.junction_c for m in moments),
-    }
+        return Temperature()
+    device_max, junction_max = max(m.device_c for m in moments), max(m.junction_c for m in moments)
+    return Temperature(device_end=moments[-1].device_c, device_max=device_max, junction_max=junction_max)
 
 
-def caps_of(moments: Sequence[Moment]) -> dict[str, Any]:
-    """Return `throttled_share`, the share of the time in which a unit was throttled, and `first_throttled_s`.
-
-    `first_throttled_s` is the time in seconds of the first throttled moment; None without one.
-    """
+def caps_of(moments: Sequence[Moment]) -> Throttling:
+    """Return how long units were throttled."""
     throttled_s = [m.t_s for m in moments if m.throttled]
-    return {
-        "throttled_share": len(throttled_s) / len(moments) if moments else 0.0,
-        "first_throttled_s": throttled_s[0] if throttled_s else None,
-    }
+    share = len(throttled_s) / len(moments) if moments else 0.0
+    return Throttling(throttled_share=share, first_throttled_s=throttled_s[0] if throttled_s else None)
 
 
 def timeline_of(moments: Sequence[Moment]) -> list[dict[str, Any]]:
     """Return every n-th moment as JSON values, with n such that about MOST_SHOWN moments remain."""
     return [_shown(m) for m in moments[:: max(1, len(moments) // MOST_SHOWN)]]
+
+
+def over_minutes(moments: Sequence[Moment]) -> dict[str, Any]:
+    """Return the fields of a prediction that describe its course over minutes."""
+    return {"temperature_c": temperatures_of(moments), "caps": caps_of(moments), "timeline": timeline_of(moments)}
 
 
 def _shown(moment: Moment) -> dict[str, Any]:

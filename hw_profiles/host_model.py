@@ -17,7 +17,6 @@ from typing import Any, NamedTuple
 from trilane.hw_profiles.application import Plan, stage_times_ms
 from trilane.hw_profiles.host import predictions, rule_placement, unit_rows
 from trilane.hw_profiles.network_work import Network, Work
-from trilane.hw_profiles.rates import without_interval
 from trilane.hw_profiles.reference_networks import CHANNELS_PER_PASS
 from trilane.hw_profiles.schema import Corners, Measured, Profile, Quantity, Unit
 from trilane.hw_profiles.unit_times import time_on
@@ -35,7 +34,7 @@ from trilane.scheduler.placement import (
     shared_cores,
 )
 from trilane.scheduler.placement import UnitWork as FrameWork
-from trilane.units import BEFORE_INFER, NS_PER_MS, UNITS, UnitName
+from trilane.units import BEFORE_INFER, HOST, NS_PER_MS, UNITS, UnitName
 
 NETWORK: UnitName = "dsp"
 SEQUENTIAL = "sequential"
@@ -45,22 +44,6 @@ PEAKS = ("peak_int8_tmac_s", "peak_fp16_tmac_s", "peak_fp32_tmac_s")
 #: from measured frame times, with each network left out in turn, from `trilane bench predict`
 #: (docs/decisions/this-machine.md).
 MODEL_ERROR = 0.108
-#: Keys of a prediction that are intervals of times, or errors from which intervals follow.
-OF_TIMES = frozenset(
-    [
-        "low",
-        "high",
-        "low_ms",
-        "high_ms",
-        "reserve_low",
-        "reserve_high",
-        "confidence",
-        "expected_error",
-        "expected_error_gpu",
-        "expected_error_dsp",
-    ]
-)
-OF_POWER = frozenset(["low_w", "high_w", "low_fps", "high_fps"])
 UNMEASURED = "of this machine are cores, clock and instructions; its speeds are assumed, so there is no interval"
 
 
@@ -216,19 +199,6 @@ def _measured(value: float, source: str) -> Quantity:
     return Quantity(value=value, kind="measured", source=source)
 
 
-def with_known_intervals(profile: Profile, unit: UnitName, answer: dict[str, Any]) -> dict[str, Any]:
-    """Return `answer`, a prediction for `unit` of this machine, with None for intervals of unmeasured times."""
-    if profile.units[unit].measured is not None:
-        return _without(answer, OF_POWER)
-    known = _without(answer, OF_POWER | OF_TIMES)
-    if rate := known.get("rate"):
-        known["rate"] = without_interval(rate)
-    return known
-
-
-def _without(found: dict[str, Any], keys: frozenset[str]) -> dict[str, Any]:
-    """Return `found` with None as the value of each of `keys`, also in the mappings inside it."""
-    return {
-        key: None if key in keys else _without(value, keys) if isinstance(value, dict) else value
-        for key, value in found.items()
-    }
+def is_known(profile: Profile, unit: UnitName) -> bool:
+    """Return whether times on `unit` have a known error: only this machine has units that nobody measured."""
+    return profile.name != HOST or profile.units[unit].measured is not None

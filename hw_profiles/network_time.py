@@ -14,23 +14,16 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from trilane.arrays import F64
 from trilane.errors import BadInputError
-from trilane.hw_profiles.governor import (
-    Moment,
-    caps_of,
-    ends_of,
-    settled_corners,
-    temperatures_of,
-    timeline_of,
-    warm_up,
-)
+from trilane.hw_profiles.governor import ends_of, over_minutes, settled_corners, warm_up
 from trilane.hw_profiles.graph_file import GraphFile, NumberFormat
-from trilane.hw_profiles.host_model import UNMEASURED, with_known_intervals
+from trilane.hw_profiles.host_model import UNMEASURED, is_known
 from trilane.hw_profiles.network_work import Operator, Work
 from trilane.hw_profiles.operators import COMPILED, NAMES, EngineLayer
+from trilane.hw_profiles.prediction import NetworkPrediction, OperatorRow, UnruledRow
 from trilane.hw_profiles.rates import NOTHING, FrameInterval, FrameLoad, Wanted, answers, device_power
 from trilane.hw_profiles.schema import SIGMAS, Corners, EngineRuntime, Profile, Unit, corners_of, interval_around
 from trilane.hw_profiles.unit_times import (
@@ -49,7 +42,7 @@ from trilane.hw_profiles.unit_times import (
     stated_error,
     time_on,
 )
-from trilane.units import BURST, HOST, UNITS, UnitName
+from trilane.units import BURST, UNITS, UnitName
 
 #: Least relative error of the time with which the term that causes it is named.
 NAMED_FROM = 0.05
@@ -263,8 +256,8 @@ def predict_network(
     minutes: float = 0.0,
     governor: str | None = None,
     wanted: Wanted = NOTHING,
-) -> dict[str, Any]:
-    """Return the prediction of one network on one unit, as JSON values.
+) -> NetworkPrediction:
+    """Return the prediction of one network on one unit.
 
     `profile`: hardware profile of the chip, with the unit in the network's precision.
     `graph`: graph of the network, from a file.
@@ -293,84 +286,53 @@ def predict_network(
 
     moments = warm_up(profile, running, performance_profile, minutes, governor) if minutes else []
     at_last = settled_corners(moments) if moments else corners
-    answer = {
-        "file": str(graph.path),
-        "unit": unit,
-        "numbers": graph.numbers,
-        "precision": profile.units[unit].precision,
-        "engine_runtime": profile.units[unit].engine_runtime if profile.units[unit].engine else None,
-        "parameters_m": work.weights / 1e6,
-        "gmac": work.macs / 1e9,
-        **_times(time, around),
-        "operators": operator_rows(work, time),
-        "without_rule": without_rule(work),
-        "power": device_power(profile, running(at_last).busy, at_last, {unit: spread_of(around)}),
-        **answers(
-            profile,
-            FrameLoad(lambda at: {unit: ms_at(at)}, ms_at),
-            corners,
-            wanted,
-            FrameInterval(time.total_ms, *around[:2]),
-        ),
-        **(_over_minutes(moments) if moments else {}),
-    }
-    if profile.name != HOST:
-        return answer
-    why = answer["why"] if profile.units[unit].measured is not None else [UNMEASURED, *answer["why"][1:]]
-    return with_known_intervals(profile, unit, {**answer, "why": why})
+    is_sure = is_known(profile, unit)
+    times = FrameInterval(time.total_ms, *(around[:2] if is_sure else ()))
+    why = [*around.why, *([INSIDE] if any(o.op_type in COMPILED for o in time.operators) else [])]
+    return NetworkPrediction(
+        file=str(graph.path),
+        unit=unit,
+        numbers=graph.numbers,
+        precision=profile.units[unit].precision,
+        engine_runtime=profile.units[unit].engine_runtime if profile.units[unit].engine else None,
+        parameters_m=work.weights / 1e6,
+        gmac=work.macs / 1e9,
+        network_ms=time.total_ms,
+        low_ms=times.low_ms,
+        high_ms=times.high_ms,
+        why=tuple(why if is_sure else [UNMEASURED, *why[1:]]),
+        fps=1e3 / time.total_ms,
+        job_ms=time.job_ms,
+        operators=operator_rows(work, time),
+        without_rule=without_rule(work),
+        power=device_power(profile, running(at_last).busy, at_last, {unit: spread_of(around)}),
+        **answers(profile, FrameLoad(lambda at: {unit: ms_at(at)}, ms_at), corners, wanted, times),
+        **({**ends_of(moments), **over_minutes(moments)} if moments else {}),
+    )
 
 
-def _times(time: NetworkTime, around: Interval) -> dict[str, Any]:
-    return {
-        "network_ms": time.total_ms,
-        "low_ms": around.low_ms,
-        "high_ms": around.high_ms,
-        "why": [*around.why, *([INSIDE] if any(o.op_type in COMPILED for o in time.operators) else [])],
-        "fps": 1e3 / time.total_ms,
-        "job_ms": time.job_ms,
-    }
-
-
-def operator_rows(work: Work, time: NetworkTime) -> list[dict[str, Any]]:
+def operator_rows(work: Work, time: NetworkTime) -> tuple[OperatorRow, ...]:
     """Return a row for each operator, in the order of the file.
 
-    Its keys are `name`, `op_type`, `ms`, `share` of the network's time, `bound`, `macs` and `elements`. An operator
-    that the unit's runtime folds into another one has no row.
+    An operator that the unit's runtime folds into another one has no row.
     """
     counts = {operator.name: (operator.macs, operator.moved) for operator in work.operators}
-    total_ms = time.total_ms
-    return [
-        {
-            "name": one.name,
-            "op_type": one.op_type,
-            "ms": one.ms,
-            "share": one.ms / total_ms,
-            "bound": one.bound,
-            "macs": counts.get(one.name, (0, 0))[0],
-            "elements": counts.get(one.name, (0, 0))[1],
-        }
-        for one in time.operators
-    ]
+    total_ms, rows = time.total_ms, []
+    for one in time.operators:
+        macs, elements = counts.get(one.name, (0, 0))
+        rows.append(OperatorRow(**one._asdict(), share=one.ms / total_ms, macs=macs, elements=elements))
+    return tuple(rows)
 
 
-def without_rule(work: Work) -> list[dict[str, Any]]:
-    """Return a row for each operator type without a rule: `op_type`, `count`, `share_of_elements` that it moves."""
+def without_rule(work: Work) -> tuple[UnruledRow, ...]:
+    """Return a row for each operator type without a rule, the type that moves most elements first."""
     moved = Counter[str]()
     for operator in work.operators:
         if not operator.ruled:
             moved[operator.op_type] += operator.moved
     counts = Counter(operator.op_type for operator in work.operators if not operator.ruled)
     total = sum(operator.moved for operator in work.operators)
-    return [
-        {"op_type": op_type, "count": counts[op_type], "share_of_elements": elements / total}
+    return tuple(
+        UnruledRow(op_type=op_type, count=counts[op_type], share_of_elements=elements / total)
         for op_type, elements in moved.most_common()
-    ]
-
-
-def _over_minutes(moments: list[Moment]) -> dict[str, Any]:
-    return {
-        **ends_of(moments),
-        "temperature_c": temperatures_of(moments),
-        "caps": caps_of(moments),
-        "timeline": timeline_of(moments),
-    }
+    )

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import GraphFile
-from trilane.hw_profiles.host_model import MODEL_ERROR, UNMEASURED
+from trilane.hw_profiles.host_model import MODEL_ERROR, UNMEASURED, is_known
 from trilane.hw_profiles.network_time import interval, price
-from trilane.hw_profiles.rates import FrameInterval, holding, wanted_drops, without_interval
+from trilane.hw_profiles.rates import FrameInterval, holding, wanted_drops
 from trilane.hw_profiles.schema import Corners, Profile, interval_around
 from trilane.pipeline.file_graph import (
     edge_rules,
@@ -101,7 +101,7 @@ def network_price(chip: Profile, graph: GraphFile, unit: UnitName, corners: Corn
     time = price(chip, graph.work, unit, corners)
     around = interval(chip, graph.work, time)
     source = f"{chip.name}, {unit} in {chip.units[unit].precision}"
-    if chip.name == HOST and chip.units[unit].measured is None:
+    if not is_known(chip, unit):
         return StagePrice(StageTime(mean=time.total_ms), source, why=(UNMEASURED,), is_modelled=True)
     mean = StageTime(mean=time.total_ms)
     return StagePrice(mean, source, around.low_ms, around.high_ms, around.why, is_modelled=True)
@@ -282,16 +282,8 @@ def predict_file(
         rate = holding(
             file.run.fps, needs, wanted_drops(counts["dropped"]), report["deadline_misses"], counts["requested"]
         )
-        answer["rate"] = {**rate, "sentence": rate["sentence"] + _share(file)}
-    return answer if all(each.low_ms is not None for each in prices.values()) else _without_intervals(answer)
-
-
-def _without_intervals(answer: dict[str, Any]) -> dict[str, Any]:
-    """Return the prediction `answer` with None for its intervals, because the error of a stage is not known."""
-    for key in ("needs_ms", "frame_time_ms", "latency_ms"):
-        answer[key] = {**answer[key], "low": None, "high": None}
-    if rate := answer.get("rate"):
-        answer["rate"] = without_interval(rate)
+        share = "" if needs.low_ms is None else _share(file)
+        answer["rate"] = {**rate.as_json(), "sentence": rate.sentence + share}
     return answer
 
 
@@ -312,7 +304,10 @@ def _row(stage: StagePrice) -> dict[str, Any]:
 
 
 def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], seed: int) -> FrameInterval:
-    """Return the frame time, with its interval, if the source is always ready. `seed`: seed of the simulated runs."""
+    """Return the frame time, with its interval, if the source is always ready.
+
+    The interval is unknown if the error of a stage is unknown. `seed`: seed of the simulated runs.
+    """
     (graph, settings), skips = always_fed(file), skips_of(file, seed)
 
     def needs_ms(end: Ends) -> float:
@@ -323,6 +318,8 @@ def _needs(file: PipelineFile, prices: Mapping[str, StagePrice], seed: int) -> F
         run = simulate(graph, settings, Drawn(prices, seed, factors), skips=skips, inputs=stop)
         return max(bound_ms, steady_ms(run, stop_ns, repeats_after(file)))
 
+    if any(each.low_ms is None for each in prices.values()):
+        return FrameInterval(needs_ms("expected"))
     return over_ends(needs_ms, _is_unsure(prices))
 
 
@@ -399,11 +396,13 @@ def _intervals(
     report: Mapping[str, Any],
     needs: FrameInterval,
     seed: int,
-) -> tuple[dict[str, float], dict[str, float]]:
+) -> tuple[dict[str, float | None], dict[str, float | None]]:
     """Return (interval of the mean frame time, interval of the mean latency), from short simulated runs at both ends.
 
     If no frame is dropped, the interval of the frame time comes from `needs` and the period of the source.
     """
+    if needs.low_ms is None or needs.high_ms is None:
+        return {"low": None, "high": None}, {"low": None, "high": None}
     frame_ms, latency_ms = report["frame_time_ms"]["mean"], report["latency_ms"]["mean"]
     if not _is_unsure(prices):
         return {"low": frame_ms, "high": frame_ms}, {"low": latency_ms, "high": latency_ms}
@@ -415,7 +414,7 @@ def _intervals(
         for end in ENDS
     }
 
-    def around_mean(key: str, mean: float) -> dict[str, float]:
+    def around_mean(key: str, mean: float) -> dict[str, float | None]:
         """Return the interval around `mean`, with the relative width that the three short runs give for `key`."""
         usual = runs["expected"][key]["mean"]
         _, low, high = over_ends(lambda end: mean * runs[end][key]["mean"] / usual if usual else mean)
@@ -424,5 +423,5 @@ def _intervals(
     if frames["dropped"]:
         return around_mean("frame_time_ms", frame_ms), around_mean("latency_ms", latency_ms)
     least = source_ns(file) / NS_PER_MS
-    by_bound = {"low": max(least, needs.low_ms), "high": max(least, needs.high_ms)}
+    by_bound: dict[str, float | None] = {"low": max(least, needs.low_ms), "high": max(least, needs.high_ms)}
     return by_bound, around_mean("latency_ms", latency_ms)

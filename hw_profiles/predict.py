@@ -23,23 +23,25 @@ from trilane.hw_profiles.application import (
     stage_times_ms,
     steady,
 )
-from trilane.hw_profiles.governor import (
-    caps_of,
-    ends_of,
-    over_time,
-    settled_corners,
-    temperatures_of,
-    timeline_of,
-    unit_power_w,
-)
+from trilane.hw_profiles.governor import ends_of, over_minutes, over_time, settled_corners, unit_power_w
 from trilane.hw_profiles.host import described, host_cores, usable_cores
-from trilane.hw_profiles.host_model import UNMEASURED, Placed, on_cores, place_units, with_known_intervals
+from trilane.hw_profiles.host_model import UNMEASURED, Placed, is_known, on_cores, place_units
 from trilane.hw_profiles.network_time import Interval, interval, price, spread_of
 from trilane.hw_profiles.network_work import Network
-from trilane.hw_profiles.rates import NOTHING, FrameInterval, FrameLoad, Wanted, answers, device_power
+from trilane.hw_profiles.prediction import (
+    ApplicationPrediction,
+    ChipName,
+    MeanTime,
+    PredictedConfig,
+    PredictedNetwork,
+    PredictedStage,
+    PredictedTimes,
+    PredictedUnit,
+)
+from trilane.hw_profiles.rates import NOTHING, DevicePower, FrameInterval, FrameLoad, Wanted, answers, device_power
 from trilane.hw_profiles.reference_networks import ConfigurationRow, reference_network
 from trilane.hw_profiles.schema import Corners, Profile, corners_of
-from trilane.hw_profiles.unit_times import JobTime, relative_error
+from trilane.hw_profiles.unit_times import relative_error
 from trilane.scheduler.placement import Ranked
 from trilane.scheduler.policy import POLICIES
 from trilane.scheduler.stats import energy_score
@@ -71,8 +73,8 @@ def predict(
     minutes: float = 0.0,
     governor: str | None = None,
     wanted: Wanted = NOTHING,
-) -> dict[str, Any]:
-    """Return the prediction of one configuration, as JSON values with the keys of report.json and further keys.
+) -> ApplicationPrediction:
+    """Return the prediction of one configuration.
 
     `profile`: hardware profile of the chip.
     `plan`: application that runs on it.
@@ -88,44 +90,64 @@ def predict(
     moments = over_time(profile, plan, performance_profile, minutes, governor) if minutes else []
     frame = _mean([m.frame_ms for m in moments]) if moments else now.frame_ms
     power = _mean([m.power_w for m in moments]) if moments else _settled_power_w(profile, now, corners)
-    job = isolated_job_time(profile, plan.network, plan.unit, corners)
-    around = interval(profile, plan.network.work, price(profile, plan.network.work, plan.unit, corners))
+    work, job = plan.network.work, isolated_job_time(profile, plan.network, plan.unit, corners)
+    around, known = interval(profile, work, price(profile, work, plan.unit, corners)), is_known(profile, plan.unit)
     times = unheld_times(profile, plan, corners, around, job.total_ms)
-    answer = {
-        "schema": 1,
-        "clock": "virtual",
-        "machine": {"profile": profile.name, "title": profile.title},
-        "config": _config(plan, performance_profile, minutes, governor or profile.thermal.governor),
-        "network": {**_network(plan, job), "low_ms": around.low_ms, "high_ms": around.high_ms, "why": list(around.why)},
-        "frame_time_ms": {
+    if not known:
+        times = FrameInterval(times.ms)
+    per_unit = {u: sum(ms for s, ms in now.stages_ms.items() if now.unit_of[s] == u) for u in UNITS}
+    error = relative_error(job, profile.units[plan.unit]) if known else None
+    at_all_times = dict.fromkeys(("fps_start", "fps_settled"), 1e3 / now.frame_ms)
+    ends: dict[str, Any] = ends_of(moments) if moments else at_all_times
+    placement: dict[str, Any] = {} if placed is None else {"placement": placed.facts}
+    return ApplicationPrediction(
+        schema=1,
+        clock="virtual",
+        machine=ChipName(profile=profile.name, title=profile.title),
+        config=_config(plan, performance_profile, minutes, governor or profile.thermal.governor),
+        network=PredictedNetwork(
+            parameters_m=work.weights / 1e6,
+            gmac=work.macs / 1e9,
+            alone_ms=job.total_ms,
+            parts_ms=dict(job.parts),
+            low_ms=around.low_ms if known else None,
+            high_ms=around.high_ms if known else None,
+            why=around.why,
+        ),
+        frame_time_ms=PredictedTimes(
             **_frame_times(profile, frame, [m.frame_ms for m in moments] or [frame]),
             **around_frame(frame, times, least_ms(profile, plan)),
+        ),
+        latency_ms=MeanTime(mean=now.latency_ms),
+        fps=1e3 / frame,
+        **ends,
+        display_capped=now.capped,
+        stages={
+            s: PredictedStage(unit=now.unit_of[s], service_ms=MeanTime(mean=ms)) for s, ms in now.stages_ms.items()
         },
-        "latency_ms": {"mean": now.latency_ms},
-        "fps": 1e3 / frame,
-        **(ends_of(moments) if moments else dict.fromkeys(("fps_start", "fps_settled"), 1e3 / now.frame_ms)),
-        **_settled(plan, now),
-        "power_w": power,
-        "base_power_w": profile.thermal.base_power_w.or_else(0),
-        "base_power_kind": profile.thermal.base_power_w.kind,
-        "power": power_of(profile, plan, settled_corners(moments) if moments else corners, around),
-        "energy_mj_per_frame": power * frame,
-        "xrbench": {"energy": energy_score(power * frame)},
-        "temperature_c": temperatures_of(moments),
-        "caps": caps_of(moments),
-        "timeline": timeline_of(moments),
+        units={u: PredictedUnit(busy=now.busy[u], idle=dict(now.idle[u])) for u in UNITS},
+        efficiency=max(per_unit.values()) / plan.variant.batch / now.frame_ms,
+        power_w=power,
+        base_power_w=profile.thermal.base_power_w.or_else(0),
+        base_power_kind=profile.thermal.base_power_w.kind,
+        power=power_of(profile, plan, settled_corners(moments) if moments else corners, around),
+        energy_mj_per_frame=power * frame,
+        xrbench={"energy": energy_score(power * frame)},
+        **over_minutes(moments),
         **answers(profile, load_of(profile, plan), corners, wanted, _shown_times(profile, wanted.fps, times)),
-        **_expected_error(profile, plan, job),
-        **({} if placed is None else {"placement": placed.facts}),
-        "notes": _notes(profile, plan, placed),
-    }
-    return with_known_intervals(profile, plan.unit, answer) if profile.name == HOST else answer
+        expected_error=error,
+        confidence=None if error is None else max(0.0, 1 - error),
+        **placement,
+        notes=tuple(_notes(profile, plan, placed)),
+    )
 
 
 def _shown_times(profile: Profile, fps: float | None, times: FrameInterval) -> FrameInterval:
     """Return `times`, raised to the display's interval if the display cannot show `fps` frames a second."""
     display = profile.application.display_ms.or_else(0)
-    return times if not fps or display * fps <= 1e3 else FrameInterval(*(max(ms, display) for ms in times))
+    if not fps or display * fps <= 1e3:
+        return times
+    return FrameInterval(max(times.ms, display), *(None if ms is None else max(ms, display) for ms in times[1:]))
 
 
 def predicted_run(
@@ -230,51 +252,26 @@ def _on_one_core(profile: Profile, one: UnitName, other: UnitName) -> bool:
     return bool(profile.units[one].core) and profile.units[one].core == profile.units[other].core
 
 
-def _expected_error(profile: Profile, plan: Plan, job: JobTime) -> dict[str, float]:
-    error = relative_error(job, profile.units[plan.unit])
-    return {"expected_error": error, "confidence": max(0.0, 1 - error)}
+def _config(plan: Plan, performance_profile: str, minutes: float, governor: str) -> PredictedConfig:
+    network, variant, facts = plan.network, plan.variant, dict[str, Any](plan.network.facts)
+    return PredictedConfig(
+        **facts,
+        size=f"{network.height}x{network.width}",
+        channels=network.channels,
+        layout=network.layout,
+        unit=plan.unit,
+        policy=variant.policy,
+        edge=variant.edge,
+        batch=variant.batch,
+        fps=plan.most_fps or variant.fps,
+        gpu_share=plan.gpu_share,
+        performance_profile=performance_profile,
+        minutes=minutes,
+        governor=governor,
+    )
 
 
-def _network(plan: Plan, job: JobTime) -> dict[str, Any]:
-    work = plan.network.work
-    return {
-        "parameters_m": work.weights / 1e6,
-        "gmac": work.macs / 1e9,
-        "alone_ms": job.total_ms,
-        "parts_ms": dict(job.parts),
-    }
-
-
-def _settled(plan: Plan, now: Steady) -> dict[str, Any]:
-    per_unit = {u: sum(ms for s, ms in now.stages_ms.items() if now.unit_of[s] == u) for u in UNITS}
-    return {
-        "display_capped": now.capped,
-        "stages": {s: {"unit": now.unit_of[s], "service_ms": {"mean": ms}} for s, ms in now.stages_ms.items()},
-        "units": {u: {"busy": now.busy[u], "idle": dict(now.idle[u])} for u in UNITS},
-        "efficiency": max(per_unit.values()) / plan.variant.batch / now.frame_ms,
-    }
-
-
-def _config(plan: Plan, performance_profile: str, minutes: float, governor: str) -> dict[str, Any]:
-    network, variant = plan.network, plan.variant
-    return {
-        **network.facts,
-        "size": f"{network.height}x{network.width}",
-        "channels": network.channels,
-        "layout": network.layout,
-        "unit": plan.unit,
-        "policy": variant.policy,
-        "edge": variant.edge,
-        "batch": variant.batch,
-        "fps": plan.most_fps or variant.fps,
-        "gpu_share": plan.gpu_share,
-        "performance_profile": performance_profile,
-        "minutes": minutes,
-        "governor": governor,
-    }
-
-
-def _frame_times(profile: Profile, mean_ms: float, frames: Sequence[float]) -> dict[str, float]:
+def _frame_times(profile: Profile, mean_ms: float, frames: Sequence[float]) -> dict[str, Any]:
     ordered = sorted(frames)
     shown = {f"p{p}": ordered[min(len(ordered) - 1, len(ordered) * p // 100)] for p in (50, 90, 95, 99)}
     low, high = ema_range_ms(profile, mean_ms)
@@ -292,8 +289,7 @@ def _mean(values: Sequence[float]) -> float:
 
 
 def _row_predictions(profile: Profile, network: Network, corners: Corners, variant: Variant) -> dict[str, Any]:
-    predictions: dict[str, Any] = {}
-    errors = []
+    predictions, errors, known = dict[str, Any](), [], is_known(profile, NETWORK_UNITS[-1])
     for unit in NETWORK_UNITS:
         alone = isolated_job_time(profile, network, unit, corners)
         frame = steady(profile, Plan(network, unit, variant), corners, quick=True).frame_ms
@@ -301,9 +297,8 @@ def _row_predictions(profile: Profile, network: Network, corners: Corners, varia
         errors.append(relative_error(alone, profile.units[unit]))
         predictions |= {f"bench_{unit}_ms": alone.total_ms, f"app_{unit}_ms": frame}
         predictions |= {f"app_{unit}_ms_min": low, f"app_{unit}_ms_max": high}
-        predictions[f"expected_error_{unit}"] = errors[-1]
-    answer = {**predictions, "confidence": max(0.0, 1 - _mean(errors))}
-    return with_known_intervals(profile, NETWORK_UNITS[-1], answer) if profile.name == HOST else answer
+        predictions[f"expected_error_{unit}"] = errors[-1] if known else None
+    return {**predictions, "confidence": max(0.0, 1 - _mean(errors)) if known else None}
 
 
 def _cells(row: ConfigurationRow) -> dict[str, Any]:
@@ -355,14 +350,14 @@ def least_ms(profile: Profile, plan: Plan) -> float:
     return max(profile.application.display_ms.or_else(0), 1e3 / fps if fps else 0.0)
 
 
-def around_frame(frame_ms: float, times: FrameInterval, least: float) -> dict[str, float]:
-    """Return the 80 % interval of a mean frame time, as `low` and `high`.
+def around_frame(frame_ms: float, times: FrameInterval, least: float) -> dict[str, Any]:
+    """Return the 80 % interval of a mean frame time, as `low` and `high`; None if unknown.
 
     `frame_ms`: mean frame time.
     `times`: times of a frame if nothing limits the application.
     `least`: result of `least_ms`.
     """
-    low, high = (frame_ms * max(ms, least) / max(times.ms, least) for ms in times[1:])
+    low, high = (None if ms is None else frame_ms * max(ms, least) / max(times.ms, least) for ms in times[1:])
     return {"low": low, "high": high}
 
 
@@ -376,7 +371,7 @@ def load_of(profile: Profile, plan: Plan) -> FrameLoad:
     return FrameLoad(work_ms, lambda corners: steady(profile, _unheld(plan), corners, quick=True).frame_ms)
 
 
-def power_of(profile: Profile, plan: Plan, corners: Corners, around: Interval) -> dict[str, Any]:
+def power_of(profile: Profile, plan: Plan, corners: Corners, around: Interval) -> DevicePower:
     """Return the power of the settled application, as `device_power` returns it.
 
     `profile`: hardware profile of the chip.

@@ -11,11 +11,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from trilane.hw_profiles.schema import CORNERS, SHARE_TEXT, Corner, Corners, Profile, interval_around
+from trilane.pipeline.run_metrics import Record
 from trilane.scheduler.events import DropCause
-from trilane.units import UNITS, UnitName
+from trilane.units import HOST, UNITS, UnitName
 
 
 class Wanted(NamedTuple):
@@ -33,26 +34,52 @@ NOTHING = Wanted()
 
 
 class FrameInterval(NamedTuple):
-    """The least time between two frames in ms: expected, and at both ends of the 80 % interval."""
+    """The time between two frames in ms: expected, and at both ends of the 80 % interval, which are None if unknown."""
 
     ms: float
-    low_ms: float
-    high_ms: float
+    low_ms: float | None = None
+    high_ms: float | None = None
 
 
-def holding(fps: float, times: FrameInterval, dropped: int = 0, late: int = 0, frames: int = 0) -> dict[str, Any]:
-    """Return whether a rate of `fps` frames a second holds, as a report's key `rate`.
+class HeldRate(Record):
+    """Whether a rate holds.
 
-    Its keys are `fps`, `holds`, `words`, `sentence`, and `reserve` with its interval. The reserve is the share of the
-    time between two frames that is left over. Jitter may drop or delay frames although the mean frame time is short
-    enough.
+    `fps`: rate in frames a second. `holds`: whether the expected time of a frame is short enough.
+    `words`, `sentence`: answer in words, and in a sentence with numbers.
+    `reserve`: share of the time between two frames that is left over.
+    `reserve_low`, `reserve_high`: 80 % interval of `reserve`; null if unknown.
+    """
+
+    fps: float
+    holds: bool
+    words: str
+    sentence: str
+    reserve: float
+    reserve_low: float | None
+    reserve_high: float | None
+
+    @property
+    def needs(self) -> FrameInterval:
+        """The least time between two frames."""
+        shares = (self.reserve_high, self.reserve_low)
+        low, high = (None if share is None else (1 - share) * 1e3 / self.fps for share in shares)
+        return FrameInterval((1 - self.reserve) * 1e3 / self.fps, low, high)
+
+
+def holding(fps: float, times: FrameInterval, dropped: int = 0, late: int = 0, frames: int = 0) -> HeldRate:
+    """Return whether a rate of `fps` frames a second holds.
+
+    Jitter may drop or delay frames although the mean frame time is short enough.
 
     `times`: least time between two frames.
     `dropped`, `late`: numbers of frames that a run at this rate drops, or presents too late.
     `frames`: number of frames of this run.
     """
-    reserve, high, low = (1 - ms * fps / 1e3 for ms in times)
-    if low >= 0:
+    reserve, high, low = (None if ms is None else 1 - ms * fps / 1e3 for ms in times)
+    assert reserve is not None
+    if low is None or high is None:
+        words = "holds" if reserve >= 0 else "does not hold"
+    elif low >= 0:
         words = "holds, and would at the slow end of the interval"
     elif reserve >= 0:
         words = "holds, but not at the slow end of the interval"
@@ -60,15 +87,10 @@ def holding(fps: float, times: FrameInterval, dropped: int = 0, late: int = 0, f
         words = "does not hold, but would at the fast end of the interval"
     else:
         words = "does not hold, nor would it at the fast end of the interval"
-    return {
-        "fps": fps,
-        "holds": reserve >= 0,
-        "words": words,
-        "sentence": _sentence(fps, times, {"dropped": dropped, "late": late}, frames),
-        "reserve": reserve,
-        "reserve_low": low,
-        "reserve_high": high,
-    }
+    sentence = _sentence(fps, times, {"dropped": dropped, "late": late}, frames)
+    return HeldRate(
+        fps=fps, holds=reserve >= 0, words=words, sentence=sentence, reserve=reserve, reserve_low=low, reserve_high=high
+    )
 
 
 def wanted_drops(dropped: Mapping[str, int]) -> int:
@@ -79,17 +101,12 @@ def wanted_drops(dropped: Mapping[str, int]) -> int:
     return sum(count for cause, count in dropped.items() if not cause.endswith(f":{DropCause.EVERY.value}"))
 
 
-def without_interval(rate: Mapping[str, Any]) -> dict[str, Any]:
-    """Return `rate`, a result of `holding`, without intervals, for a frame time of unknown error."""
-    ms = (1 - rate["reserve"]) * 1e3 / rate["fps"]
-    holds = f"{'yes' if rate['holds'] else 'no'}; {_short(ms)} ms of {_short(1e3 / rate['fps'])} ms (no interval)"
-    said = {"words": rate["words"].partition(",")[0], "sentence": f"holds {rate['fps']:g} fps: {holds}"}
-    return {**rate, **said, "reserve_low": None, "reserve_high": None}
-
-
 def _sentence(fps: float, times: FrameInterval, missed: Mapping[str, int], frames: int) -> str:
     """Return a sentence that says whether the rate holds, such as `holds 30 fps: yes; 12-19 ms of 33 ms (80 %)`."""
     frame_ms = 1e3 / fps
+    if times.low_ms is None or times.high_ms is None:
+        holds = "yes" if times.ms <= frame_ms else "no"
+        return f"holds {fps:g} fps: {holds}; {_short(times.ms)} ms of {_short(frame_ms)} ms (no interval)"
     holds = "yes" if times.high_ms <= frame_ms else "no" if times.low_ms > frame_ms else "perhaps"
     said = " and ".join(f"{count} {what}" for what, count in missed.items() if count)
     left_out = f"; of {frames} frames {said}" if said and holds == "yes" else ""
@@ -118,12 +135,28 @@ class FrameLoad(NamedTuple):
     frame_ms: Callable[[Corners], float]
 
 
-def within_power(profile: Profile, requested: Corners, load: FrameLoad, limit_w: float) -> dict[str, Any]:
-    """Return `fps`, the highest rate at which the device takes at most `limit_w`, and the units' `corners` at that
-    rate.
+class PowerLimit(Record):
+    """The highest rate within a limit of the device's power.
 
-    `limited_by` is `speed` if the requested corners cannot reach a higher rate, otherwise `power`. `low_fps` and
-    `high_fps` are the rates at the two ends of the 80 % interval of the device's power.
+    `limit_w`: limit in watts. `fps`: highest rate at which the device takes at most `limit_w`.
+    `low_fps`, `high_fps`: rates at the two ends of the 80 % interval of the device's power; null if unknown.
+    `power_w`, `idle_w`: power of the device in watts, at this rate, and if no unit works.
+    `corners`: corner of each working unit at this rate.
+    `limited_by`: `speed` if the requested corners cannot reach a higher rate.
+    """
+
+    limit_w: float
+    fps: float
+    low_fps: float | None
+    high_fps: float | None
+    power_w: float
+    idle_w: float
+    corners: dict[UnitName, Corner]
+    limited_by: Literal["speed", "power"]
+
+
+def within_power(profile: Profile, requested: Corners, load: FrameLoad, limit_w: float) -> PowerLimit:
+    """Return the highest rate at which the device takes at most `limit_w`.
 
     Each unit may run at any corner up to the requested one. For given corners the power is linear in the rate: the
     power of idle units, plus the energy of each frame's work.
@@ -137,18 +170,21 @@ def within_power(profile: Profile, requested: Corners, load: FrameLoad, limit_w:
     work = load.work_ms(best.corners)
     power = device_power(profile, {u: work.get(u, 0.0) * fps / 1e3 for u in UNITS}, best.corners, {})
     # A device that takes more power than expected reaches the limit as if the limit were lower.
-    slow, fast = (limit_w * power["w"] / power[end] for end in ("high_w", "low_w"))
+    low_fps, high_fps = (
+        None if watts is None else _best(profile, requested, load, limit_w * power.w / watts)[1]
+        for watts in (power.high_w, power.low_w)
+    )
     working = load.work_ms(requested)
-    return {
-        "limit_w": limit_w,
-        "fps": fps,
-        "low_fps": _best(profile, requested, load, slow)[1],
-        "high_fps": _best(profile, requested, load, fast)[1],
-        "power_w": best.idle_w + best.joules * fps,
-        "idle_w": best.idle_w,
-        "corners": {unit: corner for unit, corner in zip(UNITS, best.corners, strict=True) if working.get(unit)},
-        "limited_by": "speed" if fps >= (1 - 1e-9) * 1e3 / load.frame_ms(requested) else "power",
-    }
+    return PowerLimit(
+        limit_w=limit_w,
+        fps=fps,
+        low_fps=low_fps,
+        high_fps=high_fps,
+        power_w=best.idle_w + best.joules * fps,
+        idle_w=best.idle_w,
+        corners={unit: corner for unit, corner in zip(UNITS, best.corners, strict=True) if working.get(unit)},
+        limited_by="speed" if fps >= (1 - 1e-9) * 1e3 / load.frame_ms(requested) else "power",
+    )
 
 
 def _best(profile: Profile, requested: Corners, load: FrameLoad, limit_w: float) -> tuple[_Choice, float]:
@@ -225,18 +261,31 @@ def answers(
     return found
 
 
-class _Watts(NamedTuple):
-    """A mean power in watts, and the interval that contains it with a probability of 80 %."""
+class Watts(Record):
+    """A mean power in watts. `low_w`, `high_w`: its 80 % interval; null for this machine, which measures no power."""
 
     w: float
-    low_w: float
-    high_w: float
+    low_w: float | None
+    high_w: float | None
+
+
+class BasePower(Watts):
+    """The power of memory, screen and radio. `kind`: kind of the profile's number."""
+
+    kind: str
+
+
+class DevicePower(Watts):
+    """The power of the whole device, of its `units`, and of its `base`."""
+
+    units: dict[UnitName, Watts]
+    base: BasePower
 
 
 def device_power(
     profile: Profile, busy: Mapping[str, float], corners: Corners, busy_error: Mapping[UnitName, float]
-) -> dict[str, Any]:
-    """Return the power of the whole device, of its `units`, and of its `base`: memory, screen and radio.
+) -> DevicePower:
+    """Return the power of the whole device and of its parts.
 
     `profile`: hardware profile of the chip.
     `busy`: share of the time in which each unit works.
@@ -248,12 +297,13 @@ def device_power(
         unit: _unit(profile, unit, corners, busy[unit], busy_error.get(unit, 0.0) * (busy[unit] < 1)) for unit in UNITS
     }
     spreads_of_all = [*spreads.values(), (base.or_else(0.0), base.or_else(0.0) * base.relative_error)]
-    whole = _watts(sum(mean for mean, _ in spreads_of_all), math.hypot(*(deviation for _, deviation in spreads_of_all)))
-    return {
-        **whole._asdict(),
-        "units": {unit: _watts(*spread)._asdict() for unit, spread in spreads.items()},
-        "base": {**_watts(*spreads_of_all[-1])._asdict(), "kind": base.kind},
-    }
+    whole = sum(mean for mean, _ in spreads_of_all), math.hypot(*(deviation for _, deviation in spreads_of_all))
+    known = profile.name != HOST
+    return DevicePower(
+        **_watts(*whole, known),
+        units={unit: Watts(**_watts(*spread, known)) for unit, spread in spreads.items()},
+        base=BasePower(**_watts(*spreads_of_all[-1], known), kind=base.kind),
+    )
 
 
 def _unit(profile: Profile, name: UnitName, corners: Corners, busy: float, busy_error: float) -> tuple[float, float]:
@@ -273,9 +323,11 @@ def _unit(profile: Profile, name: UnitName, corners: Corners, busy: float, busy_
     return unit.power_w(corner, busy), math.hypot(*parts)
 
 
-def _watts(mean: float, deviation: float) -> _Watts:
-    """Return the mean and the 80 % interval of a log-normal distribution with this mean and standard deviation."""
-    if not mean:
-        return _Watts(0.0, 0.0, 0.0)
-    variance = math.log1p((deviation / mean) ** 2)
-    return _Watts(mean, *interval_around(mean * math.exp(-variance / 2), math.sqrt(variance)))
+def _watts(mean: float, deviation: float, known: bool) -> dict[str, Any]:
+    """Return the fields of `Watts` for a log-normal distribution with this mean and standard deviation.
+
+    `known`: whether the power has an interval.
+    """
+    variance = math.log1p((deviation / mean) ** 2) if mean else 0.0
+    low, high = interval_around(mean * math.exp(-variance / 2), math.sqrt(variance))
+    return {"w": mean, "low_w": low if known else None, "high_w": high if known else None}

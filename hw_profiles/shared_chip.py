@@ -16,9 +16,9 @@ from functools import cache
 from typing import Any, NamedTuple
 
 from trilane.hw_profiles.governor import Moment, last_fifth, temperatures_of, unit_power_w, warm_up
-from trilane.hw_profiles.host_model import UNMEASURED
+from trilane.hw_profiles.host_model import UNMEASURED, is_known
 from trilane.hw_profiles.pipeline_prediction import FED_FRAMES, Ends, over_ends, steady_ms
-from trilane.hw_profiles.rates import FrameInterval, holding, wanted_drops, without_interval
+from trilane.hw_profiles.rates import FrameInterval, holding, wanted_drops
 from trilane.hw_profiles.schema import Corners, Profile, corners_of
 from trilane.hw_profiles.tenants import SharingPipeline
 from trilane.scheduler.events import Stop
@@ -239,7 +239,7 @@ def predict_beside(
         "base_power_w": _base_w(profile),
         "base_power_kind": profile.thermal.base_power_w.kind,
         "unit_power_w": dict(powers),
-        "temperature_c": temperatures_of(moments),
+        "temperature_c": temperatures_of(moments).as_json(),
         "caps": {"throttled_share": _mean([float(moment.throttled) for moment in moments])},
         "notes": _notes(profile, tenants, turns),
     }
@@ -262,11 +262,10 @@ def _rate(
     `frames`: counts of its frames at its rate, from its report.
     """
     needs = needed(profile, tenants, number, corners, turns)
+    if not (is_known(profile, INFER[1]) and tenants[number].on(profile, corners, "expected", 0.0).is_known):
+        needs = FrameInterval(needs.ms)
     rate = holding(tenants[number].fps, needs, wanted_drops(frames["dropped"]), frames=frames["requested"])
-    is_measured = profile.name != HOST or profile.units[INFER[1]].measured is not None
-    if not (is_measured and tenants[number].on(profile, corners, "expected", 0.0).is_known):
-        return {"needs_ms": {"mean": needs.ms, "low": None, "high": None}, "rate": without_interval(rate)}
-    return {"needs_ms": {"mean": needs.ms, "low": needs.low_ms, "high": needs.high_ms}, "rate": rate}
+    return {"needs_ms": {"mean": needs.ms, "low": needs.low_ms, "high": needs.high_ms}, "rate": rate.as_json()}
 
 
 def _row(

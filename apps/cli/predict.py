@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from trilane.hw_profiles.application import Plan, Variant
+    from trilane.hw_profiles.prediction import ApplicationPrediction
     from trilane.hw_profiles.schema import Profile
     from trilane.hw_profiles.tenants import SharingPipeline
 
@@ -132,7 +133,7 @@ def _stages(answer: Mapping[str, Any]) -> Table:
 def _units(answer: Mapping[str, Any]) -> Table:
     from rich.table import Table
 
-    causes = idle_causes(answer["units"].values())
+    causes = idle_causes(row["idle"] for row in answer["units"].values())
     table = Table("unit", "busy", *causes)
     for name, row in answer["units"].items():
         table.add_row(name, f"{row['busy']:.1%}", *(f"{row['idle'].get(cause, 0.0):.1%}" for cause in causes))
@@ -272,7 +273,7 @@ def _idle(answer: dict[str, Any]) -> Table:
     from rich.table import Table
 
     rows = [row for one in answer["pipelines"] for row in one["units"].values()]
-    causes = idle_causes(rows)
+    causes = idle_causes(row["idle"] for row in rows)
     table = Table("unit", "pipeline", "busy", *causes)
     for unit in dict.fromkeys([*answer["units"], *(row["hardware"] for row in rows)]):
         heads = iter([unit])
@@ -361,17 +362,19 @@ def predict(options: PredictOptions, *, json: JsonOption = False) -> None:
     show_answer(answer, json)
 
 
-def _write_trace(chip: Profile, plan: Plan, options: PredictOptions, answer: dict[str, Any], target: Path) -> None:
+def _write_trace(
+    chip: Profile, plan: Plan, options: PredictOptions, answer: ApplicationPrediction, target: Path
+) -> None:
     """Simulate the run behind the predicted busy and idle shares again, and write its trace to the file `target`.
 
-    `chip`: hardware profile. `plan`: application on the chip. `options`: options of the prediction. `answer`: document
-    of the prediction, from which the trace takes `machine` and `config`.
+    `chip`: hardware profile. `plan`: application on the chip. `options`: options of the prediction.
+    `answer`: prediction, from which the trace takes `machine` and `config`.
     """
     from trilane.apps.explain.trace import write_predicted
     from trilane.hw_profiles.predict import predicted_run
 
     done = predicted_run(chip, plan, options.cap, options.wanted)
-    write_predicted({chip.name: done}, {key: answer[key] for key in ("machine", "config")}, target)
+    write_predicted({chip.name: done}, answer.model_dump(include={"machine", "config"}, exclude_unset=True), target)
 
 
 def _predict_table(chip: Profile, path: Path, options: PredictOptions) -> list[dict[str, Any]]:

@@ -5,11 +5,12 @@ Rule: nothing is computed here; the predictions come from `trilane.hw_profiles`.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from trilane.apps.cli.console import print_json, print_verdict, stdout_console
+from trilane.apps.run.predicted_verdict import document_of, predicted_verdict
 from trilane.hw_profiles.schema import SHARE_TEXT
 from trilane.units import BURST, SUSTAINED
 
@@ -19,7 +20,12 @@ if TYPE_CHECKING:
 
     from trilane.apps.predict.predict_options import PredictOptions
     from trilane.hw_profiles.application import Plan
+    from trilane.hw_profiles.prediction import ApplicationPrediction, NetworkPrediction, Throttling
+    from trilane.hw_profiles.rates import HeldRate, Watts
     from trilane.hw_profiles.schema import Profile
+    from trilane.pipeline.run_metrics import Temperature
+
+    AnyPrediction = ApplicationPrediction | NetworkPrediction
 
 MOST_EXPENSIVE = 10
 RANGES = f"ranges in brackets hold {SHARE_TEXT}"
@@ -68,7 +74,7 @@ def draw(chip: Profile, plan: Plan, asked: str, minutes: float, governor: str | 
     plot_over_time(runs, chip.thermal.skin_limit_c.or_else(0.0), title, path)
 
 
-def show_networks(chip: Profile, options: PredictOptions, answers: list[dict[str, Any]], as_json: bool) -> None:
+def show_networks(chip: Profile, options: PredictOptions, answers: Sequence[NetworkPrediction], as_json: bool) -> None:
     """Print the predictions for networks that run without the rest of the avatar's pipeline.
 
     `chip`: hardware profile of the chip. `options`: options of the prediction.
@@ -84,7 +90,7 @@ def show_networks(chip: Profile, options: PredictOptions, answers: list[dict[str
                 "clock": "virtual",
                 "machine": {"profile": chip.name, "title": chip.title},
                 "config": {**config, "governor": governor or chip.thermal.governor},
-                "networks": answers,
+                "networks": [document_of(answer) for answer in answers],
             }
         )
         return
@@ -99,78 +105,73 @@ def show_networks(chip: Profile, options: PredictOptions, answers: list[dict[str
         console.print(_operator_table(answer))
 
 
-def _compared_units(answers: list[dict[str, Any]]) -> Table:
+def _compared_units(answers: Sequence[NetworkPrediction]) -> Table:
     """Return a table with a row for each network on each unit. `answers`: predictions of `predict_network`."""
     from rich.table import Table
 
     table = Table("network", "unit", "numbers", "ms", f"{SHARE_TEXT}, ms", "a second", "W", "rate")
     for answer in answers:
         table.add_row(
-            Path(answer["file"]).name,
-            answer["unit"],
-            answer["precision"],
-            f"{answer['network_ms']:.2f}",
-            _span(answer["low_ms"], answer["high_ms"], ".2f").strip(" ()") or "-",
-            f"{answer['fps']:.1f}",
-            f"{answer['power']['w']:.2f}",
-            answer["rate"]["sentence"] if "rate" in answer else "-",
+            Path(answer.file).name,
+            answer.unit,
+            answer.precision,
+            f"{answer.network_ms:.2f}",
+            _span(answer.low_ms, answer.high_ms, ".2f").strip(" ()") or "-",
+            f"{answer.fps:.1f}",
+            f"{answer.power.w:.2f}",
+            answer.rate.sentence if answer.rate else "-",
         )
     return table
 
 
-def _print_bare(console: Console, answer: dict[str, Any], minutes: float) -> None:
-    under = f" under {answer['engine_runtime']}" if answer["engine_runtime"] else ""
-    said = "" if answer["numbers"] == "w8a8" else f" (numbers of the file: {answer['numbers']})"
-    console.print(
-        f"{Path(answer['file']).name} on the {answer['unit']} in {answer['precision']}{under}{said}: {_size(answer)}"
-    )
-    print_verdict(answer["verdict"]["lines"])
+def _print_bare(console: Console, answer: NetworkPrediction, minutes: float) -> None:
+    under = f" under {answer.engine_runtime}" if answer.engine_runtime else ""
+    said = "" if answer.numbers == "w8a8" else f" (numbers of the file: {answer.numbers})"
+    size = f"{answer.gmac:.3g} GMAC, {answer.parameters_m:.3g} M parameters, {len(answer.operators)} operators"
+    console.print(f"{Path(answer.file).name} on the {answer.unit} in {answer.precision}{under}{said}: {size}")
+    print_verdict(predicted_verdict(answer).lines())
     if minutes:
         _print_settled(console, answer, minutes)
-    span = _span(answer["low_ms"], answer["high_ms"], ".2f", " ms")
-    console.print(f"network alone   {answer['network_ms']:.2f} ms{span}, {answer['fps']:.1f} a second")
-    for why in answer["why"]:
+    span = _span(answer.low_ms, answer.high_ms, ".2f", " ms")
+    console.print(f"network alone   {answer.network_ms:.2f} ms{span}, {answer.fps:.1f} a second")
+    for why in answer.why:
         console.print(f"                {why}")
-    for kind in answer["without_rule"]:
-        share = f"{100 * kind['share_of_elements']:.1f} % of the moved elements"
-        console.print(f"no rule for     {kind['op_type']}: {kind['count']} with {share}, priced as data movement")
+    for kind in answer.without_rule:
+        share = f"{100 * kind.share_of_elements:.1f} % of the moved elements"
+        console.print(f"no rule for     {kind.op_type}: {kind.count} with {share}, priced as data movement")
     _print_wanted(console, answer)
     _print_power(console, answer)
-    if minutes:
-        _print_heat(console, answer)
+    if answer.temperature_c and answer.caps:
+        _print_heat(console, answer.temperature_c, answer.caps)
 
 
-def _print_settled(console: Console, answer: dict[str, Any], minutes: float) -> None:
+def _print_settled(console: Console, answer: AnyPrediction, minutes: float) -> None:
     name = f"after {minutes:g} min"
-    console.print(f"{name:<16}{answer['fps_settled']:.1f} fps, begins with {answer['fps_start']:.1f} fps")
+    console.print(f"{name:<16}{answer.fps_settled:.1f} fps, begins with {answer.fps_start:.1f} fps")
 
 
-def _size(answer: dict[str, Any]) -> str:
-    count = len(answer["operators"])
-    return f"{answer['gmac']:.3g} GMAC, {answer['parameters_m']:.3g} M parameters, {count} operators"
-
-
-def _print_wanted(console: Console, answer: dict[str, Any]) -> None:
-    if rate := answer.get("rate"):
-        console.print(f"rate            {rate['sentence']}")
+def _print_wanted(console: Console, answer: AnyPrediction) -> None:
+    if rate := answer.rate:
+        console.print(f"rate            {rate.sentence}")
         console.print(f"                {_reserve(rate)}")
-    if limit := answer.get("power_limit"):
-        name = f"within {limit['limit_w']:g} W"
-        if not limit["fps"]:
-            console.print(f"{name:<16}never: the device takes {limit['power_w']:.2f} W when no unit works")
+    if limit := answer.power_limit:
+        name = f"within {limit.limit_w:g} W"
+        if not limit.fps:
+            console.print(f"{name:<16}never: the device takes {limit.power_w:.2f} W when no unit works")
             return
-        corners = ", ".join(f"{unit} {corner}" for unit, corner in limit["corners"].items())
-        span = _span(limit["low_fps"], limit["high_fps"], ".1f")
-        reason = "its full speed" if limit["limited_by"] == "speed" else "by power"
-        console.print(f"{name:<16}{limit['fps']:.1f} fps{span}, {reason}, at {limit['power_w']:.2f} W ({corners})")
+        corners = ", ".join(f"{unit} {corner}" for unit, corner in limit.corners.items())
+        span = _span(limit.low_fps, limit.high_fps, ".1f")
+        reason = "its full speed" if limit.limited_by == "speed" else "by power"
+        console.print(f"{name:<16}{limit.fps:.1f} fps{span}, {reason}, at {limit.power_w:.2f} W ({corners})")
 
 
-def _reserve(rate: dict[str, Any]) -> str:
-    if rate["holds"]:
-        low, high = (None if rate[key] is None else 100 * rate[key] for key in ("reserve_low", "reserve_high"))
-        return f"reserve {100 * rate['reserve']:.0f} % of a frame's time{_span(low, high, '.0f', ' %')}"
-    most, least = (None if rate[key] is None else 1 - rate[key] for key in ("reserve_low", "reserve_high"))
-    return f"needs {1 - rate['reserve']:.2f} times a frame's time{_span(least, most, '.2f')}"
+def _reserve(rate: HeldRate) -> str:
+    ends = (rate.reserve_low, rate.reserve_high)
+    if rate.holds:
+        low, high = (None if end is None else 100 * end for end in ends)
+        return f"reserve {100 * rate.reserve:.0f} % of a frame's time{_span(low, high, '.0f', ' %')}"
+    most, least = (None if end is None else 1 - end for end in ends)
+    return f"needs {1 - rate.reserve:.2f} times a frame's time{_span(least, most, '.2f')}"
 
 
 def _span(low: float | None, high: float | None, form: str, unit: str = "") -> str:
@@ -181,113 +182,108 @@ def _span(low: float | None, high: float | None, form: str, unit: str = "") -> s
     return "" if low is None or high is None else f" ({low:{form}} to {high:{form}}{unit})"
 
 
-def _print_power(console: Console, answer: dict[str, Any]) -> None:
-    power = answer["power"]
-    units = ", ".join(f"{unit} {_watts(watts)}" for unit, watts in power["units"].items())
+def _print_power(console: Console, answer: AnyPrediction) -> None:
+    power = answer.power
+    units = ", ".join(f"{unit} {_watts(watts)}" for unit, watts in power.units.items())
     console.print(f"settled at      {_watts(power)} W: {units}")
-    console.print(f"of it base      {_watts(power['base'])} W, {power['base']['kind']}: memory, screen, radio")
+    console.print(f"of it base      {_watts(power.base)} W, {power.base.kind}: memory, screen, radio")
 
 
-def _watts(watts: dict[str, Any]) -> str:
-    return f"{watts['w']:.2f}{_span(watts['low_w'], watts['high_w'], '.2f')}"
+def _watts(watts: Watts) -> str:
+    return f"{watts.w:.2f}{_span(watts.low_w, watts.high_w, '.2f')}"
 
 
-def _print_heat(console: Console, answer: dict[str, Any]) -> None:
-    heat, caps = answer["temperature_c"], answer["caps"]
+def _print_heat(console: Console, heat: Temperature, caps: Throttling) -> None:
     console.print(
-        f"temperature     device {heat['device_max']:.1f} °C, junction {heat['junction_max']:.1f} °C; "
-        f"lowered for heat {100 * caps['throttled_share']:.0f} % of the time"
+        f"temperature     device {heat.device_max:.1f} °C, junction {heat.junction_max:.1f} °C; "
+        f"lowered for heat {100 * caps.throttled_share:.0f} % of the time"
     )
 
 
-def _operator_table(answer: dict[str, Any]) -> Table:
+def _operator_table(answer: NetworkPrediction) -> Table:
     from rich.table import Table
 
     table = Table("operator", "type", "ms", "share", "bound by")
-    for row in sorted(answer["operators"], key=lambda row: -row["ms"])[:MOST_EXPENSIVE]:
-        table.add_row(row["name"], row["op_type"], f"{row['ms']:.3f}", f"{100 * row['share']:.1f} %", row["bound"])
+    for row in sorted(answer.operators, key=lambda row: -row.ms)[:MOST_EXPENSIVE]:
+        table.add_row(row.name, row.op_type, f"{row.ms:.3f}", f"{100 * row.share:.1f} %", row.bound)
     return table
 
 
-def show_answer(answer: dict[str, Any], as_json: bool) -> None:
+def show_answer(answer: ApplicationPrediction, as_json: bool) -> None:
     """Print one prediction of the avatar's pipeline.
 
-    `answer`: document of `trilane predict --json`. `as_json`: whether to print this document, or text and tables.
+    `as_json`: whether to print the document of the prediction, or text and tables.
     """
     if as_json:
-        print_json(answer)
+        print_json(document_of(answer))
         return
     console = stdout_console()
-    print_verdict(answer["verdict"]["lines"])
+    print_verdict(predicted_verdict(answer).lines())
     _print_network(console, answer)
     _print_times(console, answer)
-    if answer["temperature_c"]:
-        _print_heat(console, answer)
-    if answer["expected_error"] is not None:
-        error = f"±{100 * answer['expected_error']:.0f} % of the network's time"
-        console.print(f"expected error  {error} (confidence {answer['confidence']:.2f})")
+    if answer.timeline:
+        _print_heat(console, answer.temperature_c, answer.caps)
+    if answer.expected_error is not None:
+        error = f"±{100 * answer.expected_error:.0f} % of the network's time"
+        console.print(f"expected error  {error} (confidence {answer.confidence:.2f})")
     console.print(_unit_table(answer))
-    if "alternatives" in answer:
-        console.print(_alternatives_table(answer))
+    if answer.alternatives:
+        console.print(_alternatives_table(answer.alternatives))
 
 
-def _print_network(console: Console, answer: dict[str, Any]) -> None:
-    config, network = answer["config"], answer["network"]
-    name = ", ".join(str(config[key]) for key in ("avatar", "network", "encoder", "norm") if key in config)
-    console.print(f"{answer['machine']['title']} (virtual clock), {config['performance_profile']}; {RANGES}")
+def _print_network(console: Console, answer: ApplicationPrediction) -> None:
+    config, network = answer.config, answer.network
+    name = ", ".join(filter(None, (config.avatar, config.network, config.encoder, config.norm)))
+    console.print(f"{answer.machine.title} (virtual clock), {config.performance_profile}; {RANGES}")
     console.print(
-        f"{name}, {config['size']}x{config['channels']} {config['layout']} "
-        f"on the {config['unit']}: {network['gmac']:.1f} GMAC, {network['parameters_m']:.1f} M parameters"
+        f"{name}, {config.size}x{config.channels} {config.layout} "
+        f"on the {config.unit}: {network.gmac:.1f} GMAC, {network.parameters_m:.1f} M parameters"
     )
-    console.print(f"policy          {config['policy']}, edge {config['edge']}")
-    if minutes := config["minutes"]:
-        _print_settled(console, answer, minutes)
-    span = _span(network["low_ms"], network["high_ms"], ".1f")
-    console.print(f"network alone   {network['alone_ms']:.1f} ms{span}")
+    console.print(f"policy          {config.policy}, edge {config.edge}")
+    if config.minutes:
+        _print_settled(console, answer, config.minutes)
+    span = _span(network.low_ms, network.high_ms, ".1f")
+    console.print(f"network alone   {network.alone_ms:.1f} ms{span}")
 
 
-def _print_times(console: Console, answer: dict[str, Any]) -> None:
-    frame = answer["frame_time_ms"]
-    held = "the display" if "rate" not in answer else "the rate that was asked for"
-    capped = f", held by {held}" if answer["display_capped"] else ""
-    stray = f"averages over 20 frames {frame['ema20_min']:.1f} to {frame['ema20_max']:.1f} ms"
-    span = _span(frame["low"], frame["high"], ".1f")
-    means = f"{frame['mean']:.1f} ms{span}, {answer['fps']:.1f} fps{capped}"
-    console.print(f"{'over all' if answer['config']['minutes'] else 'application':<16}{means}; {stray}")
-    ms = answer["latency_ms"]["mean"]
+def _print_times(console: Console, answer: ApplicationPrediction) -> None:
+    frame, latency_ms = answer.frame_time_ms, answer.latency_ms.mean
+    held = "the rate that was asked for" if answer.rate else "the display"
+    capped = f", held by {held}" if answer.display_capped else ""
+    stray = f"averages over 20 frames {frame.ema20_min:.1f} to {frame.ema20_max:.1f} ms"
+    means = f"{frame.mean:.1f} ms{_span(frame.low, frame.high, '.1f')}, {answer.fps:.1f} fps{capped}"
+    console.print(f"{'over all' if answer.config.minutes else 'application':<16}{means}; {stray}")
     none = "none: no frame is in time, so the frame time is that of the longest stage"
-    console.print(f"latency         {none if ms is None else f'{ms:.1f} ms'}")
-    console.print(f"efficiency      {answer['efficiency']:.2f}")
+    console.print(f"latency         {none if latency_ms is None else f'{latency_ms:.1f} ms'}")
+    console.print(f"efficiency      {answer.efficiency:.2f}")
     _print_wanted(console, answer)
-    console.print(f"power           {answer['power_w']:.1f} W, {answer['energy_mj_per_frame']:.0f} mJ a frame")
+    console.print(f"power           {answer.power_w:.1f} W, {answer.energy_mj_per_frame:.0f} mJ a frame")
     _print_power(console, answer)
-    for note in answer["notes"]:
+    for note in answer.notes:
         console.print(f"note            {note}")
 
 
-def _unit_table(answer: dict[str, Any]) -> Table:
+def _unit_table(answer: ApplicationPrediction) -> Table:
     from rich.table import Table
 
-    causes = idle_causes(answer["units"].values())
+    causes = idle_causes(unit.idle for unit in answer.units.values())
     units = Table("unit", "busy", *causes)
-    for name, unit in answer["units"].items():
-        shares = (f"{100 * unit['idle'].get(cause, 0):.1f} %" for cause in causes)
-        units.add_row(name, f"{100 * unit['busy']:.1f} %", *shares)
+    for name, unit in answer.units.items():
+        units.add_row(name, f"{100 * unit.busy:.1f} %", *(f"{100 * unit.idle.get(cause, 0):.1f} %" for cause in causes))
     return units
 
 
-def idle_causes(units: Iterable[Mapping[str, Any]]) -> list[str]:
+def idle_causes(units: Iterable[Mapping[str, float]]) -> list[str]:
     """Return the idle causes of all `units`, each once, in the order in which they are found.
 
-    `units`: mappings whose key `idle` has the share of each cause.
+    `units`: share of each cause, for each unit.
     """
-    return [*dict.fromkeys(cause for unit in units for cause in unit["idle"])]
+    return [*dict.fromkeys(cause for idle in units for cause in idle)]
 
 
-def _alternatives_table(answer: dict[str, Any]) -> Table:
+def _alternatives_table(rows: Sequence[Mapping[str, Any]]) -> Table:
     from rich.table import Table
 
-    rows = answer["alternatives"]
     at_rate = "holds" in rows[0]
     table = Table("what if", "policy", "edge", "frame, ms", "fps", "latency, ms", *(AT_RATE if at_rate else ()))
     for row in rows:
@@ -301,5 +297,5 @@ def _alternatives_table(answer: dict[str, Any]) -> Table:
     return table
 
 
-def _at_rate(row: dict[str, Any]) -> tuple[str, str, str]:
+def _at_rate(row: Mapping[str, Any]) -> tuple[str, str, str]:
     return "yes" if row["holds"] else "no", f"{100 * row['dropped']:.0f} %", f"{row['power_w']:.2f}"

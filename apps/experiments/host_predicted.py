@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from statistics import median
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 from trilane.apps.avatar_files import remade_avatar
 from trilane.apps.predict.asked_prediction import answer_of, application_of, predict_networks
@@ -24,6 +24,7 @@ from trilane.bench.lib.interleaved_processes import ProcessVariant, runners
 from trilane.errors import BadInputError
 from trilane.hw_profiles.host_model import NETWORK
 from trilane.hw_profiles.profile_files import load_runnable
+from trilane.hw_profiles.rates import FrameInterval
 from trilane.hw_profiles.schema import SIGMAS
 from trilane.stages.configure import requested_runtime
 from trilane.stages.run_options import RunOptions
@@ -31,14 +32,6 @@ from trilane.units import HOST
 
 RUN, ALONE = "run", "network"
 MIN_FRAMES = 100  # frames of a run that is placed by its times
-
-
-class Predicted(NamedTuple):
-    """A predicted time in ms, and the ends of its 80 % interval; None: the interval is not known."""
-
-    ms: float
-    low_ms: float | None
-    high_ms: float | None
 
 
 def measure(
@@ -79,11 +72,10 @@ def measure(
     return {"rows": rows, **summaries, "config": config}
 
 
-def _of_run(avatar: str) -> Predicted:
+def _of_run(avatar: str) -> FrameInterval:
     options = PredictOptions(profile=HOST, avatar=avatar)
     chip, plan = application_of(load_runnable(HOST), options)
-    frame = answer_of(chip, plan, options)["frame_time_ms"]
-    return Predicted(frame["mean"], frame["low"], frame["high"])
+    return answer_of(chip, plan, options).frame
 
 
 def _run(avatar: str, frames: int, out: Path) -> tuple[float, float | None]:
@@ -96,9 +88,9 @@ def _run(avatar: str, frames: int, out: Path) -> tuple[float, float | None]:
     return report.frame_time_ms.mean or 0.0, report.other_programs
 
 
-def _of_network(file: Path) -> Predicted:
+def _of_network(file: Path) -> FrameInterval:
     (answer,) = predict_networks(load_runnable(HOST), PredictOptions(profile=HOST, network=(file,)))
-    return Predicted(answer["network_ms"], answer["low_ms"], answer["high_ms"])
+    return answer.frame
 
 
 def _calls(file: Path, seconds: float) -> float:
@@ -108,7 +100,7 @@ def _calls(file: Path, seconds: float) -> float:
         return median(by_name[ALONE].run_for(seconds))
 
 
-def _row(name: str, what: str, predicted: Predicted, measured_ms: float, others: float | None) -> dict[str, Any]:
+def _row(name: str, what: str, predicted: FrameInterval, measured_ms: float, others: float | None) -> dict[str, Any]:
     ms, low, high = predicted
     return {
         "name": name,

@@ -12,9 +12,9 @@ from typing import Any, Final
 from trilane.apps.check.port_types import port_types, read_networks
 from trilane.apps.explain.explained_run import open_journal
 from trilane.apps.predict.predict_options import PredictOptions
+from trilane.apps.run.predicted_verdict import pipeline_verdict
 from trilane.apps.run.report import read_report
 from trilane.apps.run.verdict import Trust, trust_of
-from trilane.apps.run.verdict_facts import predicted_verdict
 from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import GraphFile
 from trilane.hw_profiles.network_time import Computes
@@ -205,4 +205,4 @@ def _answer(
     prices = prices_of(file, graphs, chip_for, lambda chip: corners_of(chip, options.cap), measured)
     answer = predict_file(file, prices, options.frames or 0, options.seed)
     rests_on_run = any(each.is_measured for each in prices.values())
-    return {"what_if": text, **answer, "verdict": predicted_verdict(answer, of_run if rests_on_run else None).shown()}
+    return {"what_if": text, **answer, "verdict": pipeline_verdict(answer, of_run if rests_on_run else None).shown()}

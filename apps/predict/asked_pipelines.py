@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from trilane.apps.check.port_types import port_types, read_networks
 from trilane.apps.explain.scene_plan import ScenePlan
 from trilane.apps.predict.predict_options import PredictOptions
-from trilane.apps.run.verdict_facts import predicted_verdict
+from trilane.apps.run.predicted_verdict import pipeline_verdict
 from trilane.arrays import Shape
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import LEAST_FPS, MOST_FPS, NETWORK_UNITS, Variant
@@ -119,7 +119,8 @@ def answer_of(chip: Profile, pipelines: Sequence[SharingPipeline], options: Pred
     `options`: options of the prediction. Raises BadInputError if the prediction cannot be made.
     """
     answer = predict_beside(chip, pipelines, options.cap, options.minutes, options.governor, options.turns)
-    rows = [row | {"verdict": predicted_verdict(answer | row).shown()} for row in answer["pipelines"]]
+    is_cold = not options.minutes
+    rows = [row | {"verdict": pipeline_verdict(row, is_cold=is_cold).shown()} for row in answer["pipelines"]]
     return answer | {"pipelines": rows}
 
 

@@ -8,16 +8,16 @@ options of the prediction. `say` is a function that gets a message before an act
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 from trilane.apps.predict.predict_options import PredictOptions
-from trilane.apps.run.verdict_facts import predicted_verdict
 from trilane.errors import BadInputError
 from trilane.units import HOST, INFER, UnitName
 
 if TYPE_CHECKING:
     from trilane.hw_profiles.application import Plan
     from trilane.hw_profiles.network_work import Network
+    from trilane.hw_profiles.prediction import ApplicationPrediction, NetworkPrediction
     from trilane.hw_profiles.schema import Profile
 
 #: Note on a prediction without options that choose network, policy or edge.
@@ -26,7 +26,7 @@ AS_RUN: Final = "the avatar, policy and edge are those of `trilane run` without 
 
 def predict_networks(
     chip: Profile, options: PredictOptions, say: Callable[[str], None] = lambda _: None
-) -> list[dict[str, Any]]:
+) -> list[NetworkPrediction]:
     """Return a prediction for each network of `options` by itself, on each unit of `options`.
 
     With the profile `host` and no requested precision, calls of each network on this machine's unit for networks are
@@ -54,7 +54,7 @@ def predict_networks(
 
                 used = with_file(used, graph, shapes, say)
             answers.append(predict_network(used, graph, unit, *over))
-    return [answer | {"verdict": predicted_verdict(answer).shown()} for answer in answers]
+    return answers
 
 
 def application_of(
@@ -112,17 +112,16 @@ def _is_measured(chip: Profile, options: PredictOptions, unit: UnitName) -> bool
     return chip.name == HOST and unit == INFER[1] and options.precision is None
 
 
-def answer_of(chip: Profile, plan: Plan, options: PredictOptions) -> dict[str, Any]:
+def answer_of(chip: Profile, plan: Plan, options: PredictOptions) -> ApplicationPrediction:
     """Return the prediction of the application `plan` on `chip`.
 
-    With `what_if` in `options`, the key `alternatives` has predictions with other policies and edges.
+    With `what_if` in `options`, `alternatives` has predictions with other policies and edges.
     """
     from trilane.hw_profiles import predict as predictions
 
     cap, wanted = options.cap, options.wanted
     answer = predictions.predict(chip, plan, cap, options.minutes, options.governor, wanted)
     if options.what_if:
-        answer["alternatives"] = predictions.what_if(chip, plan.network, plan.unit, cap, wanted.fps)
-    if options.is_as_run:
-        answer["notes"] = [AS_RUN, *answer["notes"]]
-    return answer | {"verdict": predicted_verdict(answer).shown()}
+        rows = predictions.what_if(chip, plan.network, plan.unit, cap, wanted.fps)
+        answer = answer.model_copy(update={"alternatives": tuple(rows)})
+    return answer.model_copy(update={"notes": (AS_RUN, *answer.notes)}) if options.is_as_run else answer

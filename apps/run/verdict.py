@@ -1,7 +1,8 @@
 """The verdict of a run or a prediction: does it hold its rate, what bounds it, can its times be trusted, what to try?
 
 Rule: the functions are pure, and only this module judges. All commands, pages, notebooks and report.json show its
-verdict. `trilane.apps.run.verdict_facts` makes the facts that the verdict rests on.
+verdict. `verdict_facts.py` makes the facts of a run that the verdict rests on, `predicted_verdict.py` the facts of a
+prediction.
 
 The trust in a run is part of the verdict; sweeps and gates use the trust too. A run is not trusted if its machine was
 not quiet, or if nobody knows whether the machine was quiet. Each reason states its figure.

@@ -1,4 +1,4 @@
-"""Makes the facts of a verdict from a report, from the figures of a live run, or from a prediction.
+"""Makes the facts of a verdict from a report, or from the figures of a live run.
 
 Rule: the functions are pure. The verdict leaves out unknown values. A report and a live run name their bound, and the
 verdict has the same bound.
@@ -7,14 +7,11 @@ verdict has the same bound.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from math import inf
 from typing import TYPE_CHECKING, Any, Final
 
 from trilane.apps.explain.reasons import SHORTER
 from trilane.apps.run.report import Check, Report
 from trilane.apps.run.verdict import (
-    COMPUTED,
-    DISPLAY,
     LEAST_NAMED,
     MOST_OTHERS,
     SO_FAR,
@@ -31,7 +28,6 @@ from trilane.apps.run.verdict import (
     trust_of,
 )
 from trilane.hw_profiles.rates import wanted_drops
-from trilane.hw_profiles.schema import SHARE_TEXT
 from trilane.pipeline.run_metrics import Bound, PolicyMetrics, RunMetrics, StageTimes
 from trilane.scheduler.policy import POLICIES, works_on_one_frame
 from trilane.units import NO_FIGURES, TARGET_FPS
@@ -43,8 +39,6 @@ if TYPE_CHECKING:
 MUCH_LATER: Final = 2.0
 #: Unused share of a frame's time from which the verdict proposes larger pictures.
 MUCH_LEFT: Final = 0.5
-#: Relative error by which two computations of the same rate may differ.
-ROUNDED: Final = 1e-6
 NOT_YET: Final = Trust(False, ("the run goes on: its machine is judged at its end",))
 NO_TRUTH: Final = "nothing to compare with: a pipeline of your own has no true picture"
 
@@ -122,7 +116,7 @@ def _target_fps(config: Mapping[str, Any]) -> float:
     The rate comes from `--fps`, the scene or the pipeline file; if none of them has a rate, TARGET_FPS counts.
     `config`: block `config` of report.json, as far as it is known.
     """
-    return float(config.get("scene", {}).get("fps") or TARGET_FPS)
+    return float((config.get("scene") or {}).get("fps") or TARGET_FPS)
 
 
 def _is_paced(config: Mapping[str, Any], policy: str) -> bool:
@@ -131,7 +125,7 @@ def _is_paced(config: Mapping[str, Any], policy: str) -> bool:
     In other runs, the pipeline takes a frame as soon as it can. `config`: see `_target_fps`. `policy`: policy of the
     run.
     """
-    run = config.get("pipeline", {}).get("run", {})
+    run = (config.get("pipeline") or {}).get("run") or {}
     return bool(run.get("fps") or run.get("arrivals") or (policy in POLICIES and POLICIES[policy].paced))
 
 
@@ -252,138 +246,3 @@ def _shorter(run: RunMetrics, config: Mapping[str, Any], bound: NamedBound | Non
             yield f"trilane predict {pipeline['file']} --set stages.{stage}.unit={units[0]}"
         return
     yield f"{stage}: {SHORTER.get(stage, 'less work, or a unit of its own')}".replace("`", "")
-
-
-def predicted_verdict(answer: Mapping[str, Any], of_run: Trust | None = None) -> Verdict:
-    """Return the verdict of a prediction: of an application, a network by itself, or a pipeline.
-
-    `answer`: part of `trilane predict --json` that has this prediction. The prediction can be trusted if the 80 %
-    interval of its rate is known and does not contain the target.
-    `of_run`: judgement of the run whose times the prediction uses; None if it uses no run. If this run is not trusted,
-    the prediction is not trusted either.
-    """
-    times = _needed(answer)
-    config = answer.get("config") or {}
-    target = float((answer.get("rate") or {}).get("fps") or config.get("fps") or TARGET_FPS)
-    low, high = times.get("low"), times.get("high")
-    least, most = (None, None) if low is None or high is None or not low else (1e3 / high, 1e3 / low)
-    units, latency = answer.get("units") or {}, answer.get("latency_ms")
-    is_own = "cycle" in answer or answer.get("kind") == "pipeline"  # a pipeline file by itself, or beside others
-    return judged(
-        Facts(
-            Rate(1e3 / times["mean"] if times["mean"] else inf, least, most, SHARE_TEXT),
-            target,
-            _predicted_lateness(answer),
-            _resting_on(of_run, _trust_in(least, most, target, is_held=_is_held_by_display(answer))),
-            frame_ms=times["mean"],
-            latency_ms=latency["mean"] if latency and latency.get("samples", 1) else None,
-            bound=_predicted_bound(answer, times["mean"]),
-            idle={unit: (1 - row["busy"], _causes(row["idle"])) for unit, row in units.items()},
-            image=NO_TRUTH if is_own else "trilane quality measures it here: a prediction has no pictures",
-            tries=tuple(_predicted_tries(answer, times["mean"] * target > 1e3)),
-            source=COMPUTED,
-        )
-    )
-
-
-def _predicted_lateness(answer: Mapping[str, Any]) -> LateFrames | None:
-    """Return how many frames of the simulated run were not in time; None if no fixed rate released the frames.
-
-    Random times and other pipelines can make frames late although the mean frame time is short enough.
-    `answer`: see `predicted_verdict`.
-    """
-    if "frames" not in answer or "rate" not in answer:
-        return None
-    frames = answer["frames"]
-    lost = frames.get("lost", 0)  # a prediction loses none
-    return _lateness(frames["presented"], answer["deadline_misses"], frames["dropped"], lost, is_paced=True)
-
-
-def _needed(answer: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the frame time that neither the rate nor the display limits, in ms.
-
-    The keys are `mean`, and `low` and `high`, the 80 % interval, which are None if unknown. `answer`: see
-    `predicted_verdict`.
-    """
-    if rate := answer.get("rate"):
-        keys = {"mean": "reserve", "low": "reserve_high", "high": "reserve_low"}
-        left = {name: rate[key] for name, key in keys.items()}
-        return {name: None if part is None else (1 - part) * 1e3 / rate["fps"] for name, part in left.items()}
-    if "network_ms" in answer:
-        return {"mean": answer["network_ms"], "low": answer["low_ms"], "high": answer["high_ms"]}
-    return dict(answer.get("needs_ms") or answer["frame_time_ms"])
-
-
-def _trust_in(low: float | None, high: float | None, target: float, *, is_held: bool) -> Trust:
-    if low is None or high is None:
-        return Trust(False, ("computed, with an unknown error",))
-    interval = f"{SHARE_TEXT} interval"
-    if low < target <= high:
-        return Trust(False, (f"computed, and the {interval} of {low:.0f} to {high:.0f} fps holds the target",))
-    if low < high:
-        return Trust(True, (f"computed, and the whole {interval} is on one side of the target",))
-    why = f"the display holds the rate over the whole {interval}" if is_held else "the times have no interval"
-    return Trust(True, (f"computed; {why}",))
-
-
-def _resting_on(of_run: Trust | None, trust: Trust) -> Trust:
-    """Return `trust`, or a worse judgement if the prediction uses times of a run that is not trusted.
-
-    `of_run`: judgement of the run whose times the prediction uses; None if it uses no run.
-    """
-    if of_run is None or of_run.trusted:
-        return trust
-    return Trust(False, (f"its times are from an UNSURE run: {', '.join(of_run.reasons)}", *trust.reasons))
-
-
-def _is_held_by_display(answer: Mapping[str, Any]) -> bool:
-    """Return whether only the refresh rate of the chip's display limits the predicted frame rate."""
-    rate = answer.get("rate")
-    return bool(answer.get("display_capped")) and (rate is None or answer["fps"] < rate["fps"] * (1 - ROUNDED))
-
-
-def _predicted_bound(answer: Mapping[str, Any], frame_ms: float) -> NamedBound | None:
-    """Return the bound of a prediction: the unit whose stages take most of a frame's time; None if none takes time.
-
-    For a pipeline file, only the stages that determine the period count; if the file's rate determines the period, all
-    stages count. If the display limits the rate, the bound is the display. A network by itself is the only stage of its
-    unit. `answer`: see `predicted_verdict`. `frame_ms`: time of a frame.
-    """
-    stages = answer.get("stages")
-    if not stages:
-        unit = answer.get("unit")
-        return unit and NamedBound(unit, {"network": frame_ms}, 1.0, of_unit=frozenset({"network"}))
-    cycle = [name for name in answer.get("cycle") or stages if name in stages]
-    ms_of = {name: float(stages[name].get("alone_ms") or stages[name]["service_ms"]["mean"]) for name in stages}
-    if answer.get("limit") == "rate":  # without the rate, the unit with the most work would determine the period
-        cycle = list(stages)
-    by_unit: dict[str, float] = {}
-    for name in cycle:
-        by_unit[stages[name]["unit"]] = by_unit.get(stages[name]["unit"], 0.0) + ms_of[name]
-    unit = max(by_unit, key=by_unit.__getitem__)
-    if not by_unit[unit] or not frame_ms:
-        return None
-    if _is_held_by_display(answer):
-        return NamedBound(DISPLAY, {name: ms_of[name] for name in cycle if stages[name]["unit"] == unit}, 1.0)
-    own = sorted((name for name in cycle if stages[name]["unit"] == unit), key=lambda name: -ms_of[name])
-    return NamedBound(
-        unit, {name: ms_of[name] for name in own}, min(by_unit[unit] / frame_ms, 1.0), of_unit=frozenset(own)
-    )
-
-
-def _predicted_tries(answer: Mapping[str, Any], is_slow: bool) -> Iterator[str]:
-    bound = _predicted_bound(answer, 1.0)
-    if "cycle" in answer and is_slow and bound:
-        others = [unit for unit in answer["units"] if unit != bound.unit]
-        if others:
-            yield f"--set stages.{next(iter(bound.stages))}.unit={others[0]}"
-    elif is_slow and "policy" in (answer.get("config") or {}):
-        yield "--what-if: every policy and edge on this chip"
-    elif is_slow and answer.get("precision") not in (None, "int8"):
-        yield f"--precision w8a8 in place of {answer['precision']}"
-    elif is_slow:
-        yield "a smaller network, or another --profile"
-    elif (lateness := _predicted_lateness(answer)) and lateness.missed:
-        yield "--trace FILE: which frames are late, and what they wait for"
-    elif "temperature_c" in answer and not answer["temperature_c"]:
-        yield "--minutes 30: what heat leaves of it"

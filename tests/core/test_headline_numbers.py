@@ -23,6 +23,7 @@ from trilane.apps.explain.scene_plan import ScenePlan
 from trilane.hw_profiles.application import Plan
 from trilane.hw_profiles.governor import Governor
 from trilane.hw_profiles.predict import predict
+from trilane.hw_profiles.prediction import ApplicationPrediction
 from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
 from trilane.hw_profiles.schema import Profile
@@ -206,20 +207,21 @@ def chip(times: float, **thermal: float) -> Profile:
     return profile.model_copy(update={"units": units, "thermal": profile.thermal.model_copy(update=changes)})
 
 
-def burst(profile: Profile, minutes: float = 0.0) -> dict[str, Any]:
+def burst(profile: Profile, minutes: float = 0.0) -> ApplicationPrediction:
     network = reference_network(NetworkSpec("resnet18", "batch", 512, 512, 16))
     return predict(profile, Plan(network, "dsp"), "burst", minutes)
 
 
 def test_halved_power_halves_watts_and_energy_and_leaves_the_frames() -> None:
     whole, half = burst(chip(1.0)), burst(chip(0.5))
-    assert (half["frame_time_ms"], half["fps"], half["units"]) == (whole["frame_time_ms"], whole["fps"], whole["units"])
-    for key in ("power_w", "energy_mj_per_frame", "base_power_w"):
-        assert half[key] == pytest.approx(whole[key] / 2)
-    for key in ("w", "low_w", "high_w"):
-        assert half["power"][key] == pytest.approx(whole["power"][key] / 2)
+    assert (half.frame_time_ms, half.fps, half.units) == (whole.frame_time_ms, whole.fps, whole.units)
+    watts = [
+        (each.power_w, each.energy_mj_per_frame, each.base_power_w, each.power.w, each.power.low_w, each.power.high_w)
+        for each in (half, whole)
+    ]
+    assert watts[0] == pytest.approx([value and value / 2 for value in watts[1]])
     # XRBench's score falls in a straight line from 1 at no energy
-    assert 1 - half["xrbench"]["energy"] == pytest.approx((1 - whole["xrbench"]["energy"]) / 2)
+    assert 1 - half.xrbench["energy"] == pytest.approx((1 - whole.xrbench["energy"]) / 2)
 
 
 AMBIENT_C, LIMIT_C, TIME_S, POLL_S = 25.0, 45.0, 100.0, 1.0
@@ -247,15 +249,15 @@ HEAT = {
 @pytest.mark.parametrize("times", [1.0, 0.5, 0.25])
 def test_halved_power_moves_when_a_prediction_throttles_and_a_quarter_never_does(times: float) -> None:
     """At full power the device would end 60 degrees above the room, three times as far as it may."""
-    kelvin_per_w = 60 / burst(chip(1.0))["power_w"]
+    kelvin_per_w = 60 / burst(chip(1.0)).power_w
     answer = burst(chip(times, device_k_per_w=kelvin_per_w, **HEAT), 3.0)
     over_s = first_over_s(60 * times)
     assert over_s == {1.0: 41, 0.5: 110, 0.25: None}[times]
-    caps = answer["caps"]
-    assert caps["first_throttled_s"] == (None if over_s is None else over_s + POLL_S)
-    assert caps["throttled_share"] == pytest.approx(0 if over_s is None else 1 - over_s / 180)
+    caps = answer.caps
+    assert caps.first_throttled_s == (None if over_s is None else over_s + POLL_S)
+    assert caps.throttled_share == pytest.approx(0 if over_s is None else 1 - over_s / 180)
     cool_s = 30.0
-    (then,) = [row for row in answer["timeline"] if row["t_s"] == cool_s]
+    (then,) = [row for row in answer.timeline if row["t_s"] == cool_s]
     assert then["device_c"] == pytest.approx(AMBIENT_C + 60 * times * (1 - math.exp(-cool_s / TIME_S)))
 
 

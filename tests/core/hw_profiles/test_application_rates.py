@@ -106,7 +106,7 @@ def test_a_row_of_the_comparison(frame_ms: float, holds: bool, monkeypatch: pyte
     row = at_rate(PROFILE, PACED, CORNERS, 25.0)
     assert asked == [(PROFILE, held_to(PACED, 25.0), CORNERS)]
     power = row.pop("power_w")
-    assert power == pytest.approx(device_power(PROFILE, now.busy, CORNERS, {})["w"])
+    assert power == pytest.approx(device_power(PROFILE, now.busy, CORNERS, {}).w)
     assert row == {
         **{"name": "latest, double", "policy": "latest", "edge": "double", "frame_ms": frame_ms},
         **{"fps": 1e3 / frame_ms, "latency_ms": 70.0, "holds": holds, "dropped": 0.25},
@@ -117,12 +117,12 @@ def test_a_row_of_the_comparison(frame_ms: float, holds: bool, monkeypatch: pyte
 def test_an_answer_at_a_rate_and_within_a_power() -> None:
     """Held to 20 frames a second; 1.75 W leave less than what the display would show, at lower corners."""
     found = predict.predict(PROFILE, PLAN, "burst", wanted=Wanted(20.0, 1.75))
-    assert found["fps"] == pytest.approx(20.0, rel=2e-3) and found["config"]["fps"] == 20.0
-    assert found["rate"]["holds"] and found["rate"]["fps"] == 20.0
+    assert found.fps == pytest.approx(20.0, rel=2e-3) and found.config.fps == 20.0
+    assert found.rate and found.rate.holds and found.rate.fps == 20.0
     free = predict.predict(PROFILE, PLAN, "burst")
-    assert found["power_w"] < free["power_w"] and free["config"]["fps"] == 30.0
-    assert found["power"]["w"] == pytest.approx(found["power_w"]) and "rate" not in free
-    limit = found["power_limit"]
-    assert limit["idle_w"] < limit["power_w"] <= 1.75 and limit["limited_by"] == "power"
-    assert limit["corners"]["dsp"] != CORNERS[2]
-    assert 0 < limit["fps"] < free["fps"]
+    assert found.power_w < free.power_w and free.config.fps == 30.0
+    assert found.power.w == pytest.approx(found.power_w) and free.rate is None
+    limit = found.power_limit
+    assert limit.idle_w < limit.power_w <= 1.75 and limit.limited_by == "power"
+    assert limit.corners["dsp"] != CORNERS[2]
+    assert 0 < limit.fps < free.fps

@@ -57,27 +57,27 @@ TOP: Corners = ("max", "max", "max")
 def test_power_is_of_each_unit_and_of_the_base() -> None:
     """The GPU works a quarter of the time at half its clock, with 4 * 0.5^2 = 1 W: 0.25 * 1 + 0.75 * 0.5 W."""
     found = device_power(chip(), {"cpu": 0.0, "gpu": 0.25, "dsp": 1.0}, ("max", "turbo", "max"), {})
-    units = {unit: watts["w"] for unit, watts in found["units"].items()}
+    units = {unit: watts.w for unit, watts in found.units.items()}
     assert units == {"cpu": 0.5, "gpu": 0.625, "dsp": 4.0}
-    assert found["base"] == {"w": 1.0, "low_w": 1.0, "high_w": 1.0, "kind": "assumed"}
-    assert (found["w"], found["low_w"], found["high_w"]) == pytest.approx((6.125, 6.125, 6.125))
+    assert found.base.as_json() == {"w": 1.0, "low_w": 1.0, "high_w": 1.0, "kind": "assumed"}
+    assert (found.w, found.low_w, found.high_w) == pytest.approx((6.125, 6.125, 6.125))
 
 
 def test_an_interval_of_power_is_that_of_a_log_normal_number() -> None:
     """Of one number alone, with spread s: quantiles of 10 and 90 % lie exp(+-1.2816 s') from the median."""
-    found = device_power(chip(0.3), {"cpu": 0.0, "gpu": 0.0, "dsp": 1.0}, TOP, {})["units"]["dsp"]
+    found = device_power(chip(0.3), {"cpu": 0.0, "gpu": 0.0, "dsp": 1.0}, TOP, {}).units["dsp"]
     variance = math.log(1 + 0.3**2)
     median = 4.0 / math.exp(variance / 2)
     ends = [median * math.exp(sign * 1.2816 * math.sqrt(variance)) for sign in (-1, 1)]
-    assert [found["low_w"], found["high_w"]] == pytest.approx(ends)
+    assert [found.low_w, found.high_w] == pytest.approx(ends)
 
 
 def test_the_busy_share_of_a_held_rate_is_as_uncertain_as_the_time() -> None:
     """Half of the time at 4 W instead of 0.5 W: 10 % more time is 0.175 W more. Who always works has no such error."""
     for busy, deviation in ((0.5, 0.5 * 0.1 * 3.5), (1.0, 0.0)):
-        found = device_power(chip(), {"cpu": 0.0, "gpu": 0.0, "dsp": busy}, TOP, {"dsp": 0.1})["units"]["dsp"]
-        variance = math.log(1 + (deviation / found["w"]) ** 2)
-        assert found["high_w"] / found["low_w"] == pytest.approx(math.exp(2 * 1.2816 * math.sqrt(variance)))
+        found = device_power(chip(), {"cpu": 0.0, "gpu": 0.0, "dsp": busy}, TOP, {"dsp": 0.1}).units["dsp"]
+        variance = math.log(1 + (deviation / found.w) ** 2)
+        assert found.high_w / found.low_w == pytest.approx(math.exp(2 * 1.2816 * math.sqrt(variance)))
 
 
 @pytest.mark.parametrize(
@@ -92,8 +92,8 @@ def test_the_busy_share_of_a_held_rate_is_as_uncertain_as_the_time() -> None:
 def test_whether_a_rate_holds(times: tuple[float, float, float], holds: bool, words: str) -> None:
     """At 25 frames a second, a frame has 40 ms."""
     found = holding(25.0, FrameInterval(*times))
-    assert (found["holds"], found["words"], found["fps"]) == (holds, words, 25.0)
-    reserves = [found[key] for key in ("reserve", "reserve_high", "reserve_low")]
+    assert (found.holds, found.words, found.fps) == (holds, words, 25.0)
+    reserves = [found.reserve, found.reserve_high, found.reserve_low]
     assert reserves == pytest.approx([1 - ms / 40 for ms in times])
 
 
@@ -120,17 +120,17 @@ def on_dsp(ms: float) -> FrameLoad:
 )
 def test_the_rate_within_a_power(limit: float, fps: float, corner: str, by: str) -> None:
     found = within_power(chip(), TOP, on_dsp(10.0), limit)
-    assert found["fps"] == pytest.approx(fps, rel=1e-9)
-    assert (found["limited_by"], found["idle_w"]) == (by, 2.5)
-    assert found["power_w"] <= limit + 1e-9 or not fps
-    assert found["corners"] == {"dsp": corner}
+    assert found.fps == pytest.approx(fps, rel=1e-9)
+    assert (found.limited_by, found.idle_w) == (by, 2.5)
+    assert found.power_w <= limit + 1e-9 or not fps
+    assert found.corners == {"dsp": corner}
 
 
 def test_only_corners_that_may_be_the_best_are_simulated() -> None:
     """At the highest clock 100 a second are within the power; no lower one can pass that."""
     load, asked = on_dsp(10.0), list[Corners]()
     told = FrameLoad(load.work_ms, lambda corners: asked.append(corners) or load.frame_ms(corners))
-    assert within_power(chip(), TOP, told, 9.0)["fps"] == 100.0
+    assert within_power(chip(), TOP, told, 9.0).fps == 100.0
     assert set(asked) == {TOP}
 
 
@@ -138,13 +138,14 @@ def test_the_rate_within_a_power_is_as_uncertain_as_the_power() -> None:
     """The rate within the limit that would be kept if the device took what the ends of its interval say."""
     profile, load = chip(0.3), on_dsp(10.0)
     found = within_power(profile, TOP, load, 5.0)
-    power = device_power(profile, {"cpu": 0.0, "gpu": 0.0, "dsp": found["fps"] / 100}, TOP, {})
-    assert power["w"] == pytest.approx(5.0) == found["power_w"]
+    power = device_power(profile, {"cpu": 0.0, "gpu": 0.0, "dsp": found.fps / 100}, TOP, {})
+    assert power.w == pytest.approx(5.0) == found.power_w
     for key, end in (("low_fps", "high_w"), ("high_fps", "low_w")):
-        assert found[key] == pytest.approx(within_power(profile, TOP, load, 5.0 * 5.0 / power[end])["fps"])
-    assert found["low_fps"] < found["fps"] < found["high_fps"]
+        limit = within_power(profile, TOP, load, 5.0 * 5.0 / getattr(power, end))
+        assert getattr(found, key) == pytest.approx(limit.fps)
+    assert found.low_fps < found.fps < found.high_fps
     sure = within_power(chip(), TOP, load, 5.0)
-    assert sure["low_fps"] == pytest.approx(sure["fps"]) == pytest.approx(sure["high_fps"])
+    assert sure.low_fps == pytest.approx(sure.fps) == pytest.approx(sure.high_fps)
 
 
 def test_the_rate_within_a_power_is_the_best_of_all_corners() -> None:
@@ -165,14 +166,14 @@ def test_the_rate_within_a_power_is_the_best_of_all_corners() -> None:
             if sum(work.values()) * fps <= 1e3 and watts + profile.thermal.base_power_w.or_else(0) <= limit:
                 best = max(best, fps)
     found = within_power(profile, requested, FrameLoad(work_ms, lambda c: sum(work_ms(c).values())), limit)
-    assert best == int(found["fps"])
+    assert best == int(found.fps)
 
 
 def test_only_what_is_wanted_is_answered() -> None:
     times = FrameInterval(10.0, 9.0, 11.0)
     assert answers(chip(), on_dsp(10.0), TOP, Wanted(), times) == {}
     found = answers(chip(), on_dsp(10.0), TOP, Wanted(30.0, 6.0), times)
-    assert (found["rate"]["fps"], found["power_limit"]["limit_w"]) == (30.0, 6.0)
+    assert (found["rate"].fps, found["power_limit"].limit_w) == (30.0, 6.0)
 
 
 def test_operators_and_what_has_no_rule() -> None:
@@ -188,11 +189,11 @@ def test_operators_and_what_has_no_rule() -> None:
     work = Work(operators, 1, 1, 1)
     times = tuple(OperatorTime(o.name, o.op_type, 1.0 + n, "fixed") for n, o in enumerate(operators))
     rows = operator_rows(work, NetworkTime("dsp", 2.0, times))
-    assert rows[0] == {
+    assert rows[0].as_json() == {
         **{"name": "a", "op_type": "Conv", "ms": 1.0, "share": 1 / 12, "bound": "fixed", "macs": 7, "elements": 50}
     }
-    assert [row["ms"] for row in rows] == [1, 2, 3, 4]
-    assert without_rule(work) == [
+    assert [row.ms for row in rows] == [1, 2, 3, 4]
+    assert [row.as_json() for row in without_rule(work)] == [
         {"op_type": "Warp", "count": 1, "share_of_elements": 0.6},
         {"op_type": "Odd", "count": 2, "share_of_elements": 0.15},
     ]
@@ -221,11 +222,11 @@ def test_the_runtime_of_an_engine(tmp_path: Path) -> None:
     graph, profile = graph_of(tmp_path), load_profile("snapdragon-8-gen-3")
     under = {name: under_runtime(profile, "dsp", name) for name in ENGINE_RUNTIMES}
     usual, other = (predict_network(under[name], graph, "dsp") for name in ("tflite", "qnn_dlc"))
-    assert (usual["engine_runtime"], other["engine_runtime"]) == ("tflite", "qnn_dlc")
-    assert usual["network_ms"] != other["network_ms"]
+    assert (usual.engine_runtime, other.engine_runtime) == ("tflite", "qnn_dlc")
+    assert usual.network_ms != other.network_ms
     assert under_runtime(profile, "dsp", None) is profile
     assert under_runtime(profile, "dsp", "qnn_dlc").units["gpu"] == profile.units["gpu"]
-    assert predict_network(profile, graph, "gpu")["engine_runtime"] is None
+    assert predict_network(profile, graph, "gpu").engine_runtime is None
     for unit, precision in (("gpu", "fp16"), ("dsp", "fp32")):
         told = (
             f"found tflite for the {unit} .* in {precision}, expected tflite or qnn_dlc for the dsp in int8 or fp16; "
@@ -265,13 +266,13 @@ def test_everything_about_one_network(unit: UnitName, tmp_path: Path) -> None:
     work, corners = count_work(graph.model), corners_of(profile, "burst")
     time = price(profile, work, unit, corners)
     around = interval(profile, work, time)
-    assert (found["network_ms"], found["low_ms"], found["high_ms"]) == (time.total_ms, *around[:2])
-    assert found["job_ms"] + sum(row["ms"] for row in found["operators"]) == pytest.approx(found["network_ms"])
-    assert found["gmac"] == work.macs / 1e9 == 64 * 32 * 27 * 4 / 1e9
-    assert found["parameters_m"] == 27 * 4 / 1e6
+    assert (found.network_ms, found.low_ms, found.high_ms) == (time.total_ms, *around[:2])
+    assert found.job_ms + sum(row.ms for row in found.operators) == pytest.approx(found.network_ms)
+    assert found.gmac == work.macs / 1e9 == 64 * 32 * 27 * 4 / 1e9
+    assert found.parameters_m == 27 * 4 / 1e6
     busy = {each: float(each == unit) for each in UNITS}
-    assert found["power"] == device_power(profile, busy, corners, {unit: spread_of(around)})
-    assert "rate" not in found and "timeline" not in found
+    assert found.power == device_power(profile, busy, corners, {unit: spread_of(around)})
+    assert found.rate is None and not found.timeline
 
 
 def test_a_network_at_a_rate_is_busy_for_its_share(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -282,17 +283,17 @@ def test_a_network_at_a_rate_is_busy_for_its_share(tmp_path: Path, monkeypatch: 
         monkeypatch.setattr(network_time, "interval", lambda *_, ms=ms: Interval(ms / 2, 2 * ms, ()))
         found = predict_network(chip(), graph_of(tmp_path), "dsp", wanted=Wanted(25.0))
         corner = corners_of(chip(), "burst")[2]
-        assert found["power"]["units"]["dsp"]["w"] == pytest.approx(chip().units["dsp"].power_w(corner, share))
-        assert found["rate"]["reserve"] == pytest.approx(1 - ms / 40)
-        assert found["rate"]["reserve_low"] == pytest.approx(1 - 2 * ms / 40)
+        assert found.power.units["dsp"].w == pytest.approx(chip().units["dsp"].power_w(corner, share))
+        assert found.rate.reserve == pytest.approx(1 - ms / 40)
+        assert found.rate.reserve_low == pytest.approx(1 - 2 * ms / 40)
 
 
 def test_over_minutes_a_slow_rate_heats_less_than_full_speed(tmp_path: Path) -> None:
     graph, profile = graph_of(tmp_path, (1, 3, 1024, 1024)), load_profile("snapdragon-888")
     full, slow = (predict_network(profile, graph, "dsp", "burst", 2.0, None, Wanted(fps)) for fps in (None, 5.0))
-    assert slow["temperature_c"]["device_end"] < full["temperature_c"]["device_end"]
-    assert slow["fps_settled"] == slow["fps_start"] == pytest.approx(5.0)
-    assert full["fps_start"] > 5.0 and len(full["timeline"]) > 10
+    assert slow.temperature_c.device_end < full.temperature_c.device_end
+    assert slow.fps_settled == slow.fps_start == pytest.approx(5.0)
+    assert full.fps_start > 5.0 and len(full.timeline) > 10
 
 
 @pytest.mark.parametrize("shape", [(1, 3, 64, 32), (1, 64, 32, 3)])

@@ -12,7 +12,7 @@ import pytest
 
 from support.pipeline_files import DEPTH, additions
 from trilane.apps.predict import asked_pipelines as sources
-from trilane.apps.run.verdict_facts import predicted_verdict
+from trilane.apps.run.predicted_verdict import pipeline_verdict
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan, stage_times_ms
 from trilane.hw_profiles.pipeline_prediction import predict_file, prices_of
@@ -286,7 +286,7 @@ def test_a_file_beside_others_as_a_table_and_as_json(
     ]
     for row in answer["pipelines"]:
         verdict = row["verdict"]
-        assert verdict == predicted_verdict(answer | row).shown()
+        assert verdict == pipeline_verdict(row, is_cold=True).shown()
         assert (verdict["target_fps"], verdict["pass"]) == (row["rate_fps"], row["rate"]["holds"])
         assert verdict["lines"][0][1].startswith(f"{1e3 / row['needs_ms']['mean']:.3g} fps")
     due = answer["pipelines"][0]["frames"]["presented"] + 3  # the others are left out by `every`

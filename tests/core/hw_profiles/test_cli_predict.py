@@ -14,20 +14,20 @@ import pytest
 from trilane.apps.cli import predict as cli
 from trilane.apps.cli import predict_output
 from trilane.apps.predict.predict_options import PredictOptions
-from trilane.apps.run.verdict_facts import predicted_verdict
+from trilane.apps.run.predicted_verdict import predicted_verdict
 from trilane.avatars.bundle import load_bundle
 from trilane.hw_profiles import governor, profile_files, reference_networks
 from trilane.hw_profiles import predict as predictions
 from trilane.hw_profiles.application import REFERENCE, Plan, Variant
 from trilane.hw_profiles.network_work import Network, count_work
+from trilane.hw_profiles.prediction import ApplicationPrediction, NetworkPrediction
 from trilane.hw_profiles.rates import NOTHING, Wanted
 from trilane.hw_profiles.reference_networks import NetworkSpec
 from trilane.units import BURST, SUSTAINED
 
 Command = Callable[..., tuple[str, str]]
 CHIP = profile_files.load_profile("snapdragon-888").model_copy(update={"name": "chip", "title": "A Chip"})
-
-JUDGED = SimpleNamespace(shown=lambda: {"pass": True})
+ANSWER = ApplicationPrediction.model_construct(fps=12.5, notes=())
 
 
 @pytest.fixture
@@ -39,10 +39,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
         return lambda *given, **_: found.update({name: given}) or answer
 
     monkeypatch.setattr(profile_files, "load_runnable", told("profile", CHIP))
-    monkeypatch.setattr(
-        predictions, "predict", lambda *given: found.update(predict=given) or {"fps": 12.5, "notes": []}
-    )
-    monkeypatch.setattr("trilane.apps.predict.asked_prediction.predicted_verdict", lambda _: JUDGED)
+    monkeypatch.setattr(predictions, "predict", lambda *given: found.update(predict=given) or ANSWER)
     monkeypatch.setattr(predictions, "what_if", told("what_if", ["alternatives"]))
     monkeypatch.setattr(cli, "draw", told("draw", None))
     monkeypatch.setattr(cli, "show_answer", told("shown", None))
@@ -75,7 +72,7 @@ ASKED: dict[tuple[str, ...], tuple[tuple[Any, ...], dict[str, Any]]] = {
             "profile": ("mine",),
             "what_if": (CHIP, SPEC, "gpu", "power_saver", None),
             "draw": (CHIP, OWN, "power_saver", 2.5, "step_wise", Path("heat.svg")),
-            "shown": ({"fps": 12.5, "notes": [], "alternatives": ["alternatives"], "verdict": JUDGED.shown()}, True),
+            "shown": (ANSWER.model_copy(update={"alternatives": ("alternatives",)}), True),
         },
     ),
     ("--gpu-share", "0.25"): ((replace(USUAL, gpu_share=0.25), SUSTAINED, 0.0, None, NOTHING), {}),
@@ -276,11 +273,12 @@ POWER = {
     "base": {"w": 1.2, "low_w": 0.6, "high_w": 1.9, "kind": "assumed"},
 }
 RATE = {
-    **{"fps": 30.0, "holds": True, "sentence": "holds 30 fps: yes; 21-30 ms of 33.3 ms (80 %)"},
+    **{"fps": 30.0, "holds": True, "words": "holds", "sentence": "holds 30 fps: yes; 21-30 ms of 33.3 ms (80 %)"},
     **{"reserve": 0.255, "reserve_low": 0.1, "reserve_high": 0.375},
 }
 LIMIT = {
     **{"limit_w": 3.0, "fps": 28.76, "low_fps": 20.34, "high_fps": 33.3, "power_w": 2.995, "limited_by": "power"},
+    "idle_w": 2.5,
     "corners": {"gpu": "svs", "dsp": "max"},
 }
 
@@ -288,16 +286,25 @@ LIMIT = {
 def an_answer(**changes: Any) -> dict[str, Any]:
     idle = {"starved": 0.101, "blocked": 0.202, "throttled": 0.0, "preempted": 0.003, "overhead": 0.044}
     return {
-        "machine": {"title": "A Chip"},
+        **{"schema": 1, "clock": "virtual", "machine": {"profile": "chip", "title": "A Chip"}},
         "config": {
             **{"encoder": "resnet18", "norm": "batch", "size": "64x32", "channels": 4, "layout": "packed"},
             **{"unit": "gpu", "policy": "pipelined", "edge": "single", "performance_profile": "burst", "minutes": 0.0},
+            **{"batch": 1, "fps": 30.0, "gpu_share": 0.0, "governor": "step_wise"},
         },
-        "network": {"gmac": 1.25, "parameters_m": 2.35, "alone_ms": 3.45, "low_ms": 3.05, "high_ms": 3.95},
-        "frame_time_ms": {"mean": 4.55, "ema20_min": 4.15, "ema20_max": 5.75, "low": 4.25, "high": 4.95},
+        "network": {
+            **{"gmac": 1.25, "parameters_m": 2.35, "alone_ms": 3.45, "low_ms": 3.05, "high_ms": 3.95},
+            **{"parts_ms": {"fixed": 3.45}, "why": []},
+        },
+        "frame_time_ms": {
+            **dict.fromkeys(("p50", "p90", "p95", "p99", "max"), 4.55),
+            **{"mean": 4.55, "ema20_min": 4.15, "ema20_max": 5.75, "low": 4.25, "high": 4.95},
+        },
         **{"latency_ms": {"mean": 6.85}, "fps": 219.78, "fps_settled": 200.12, "fps_start": 230.34},
         **{"efficiency": 0.756, "display_capped": False, "power_w": 3.21, "power": POWER, "notes": []},
-        **{"energy_mj_per_frame": 14.6, "temperature_c": None, "caps": None},
+        **{"base_power_w": 1.2, "base_power_kind": "assumed", "energy_mj_per_frame": 14.6, "xrbench": {"energy": 0.9}},
+        **{"temperature_c": {}, "caps": {"throttled_share": 0.0, "first_throttled_s": None}, "timeline": []},
+        "stages": {"infer": {"unit": "gpu", "service_ms": {"mean": 0.0}}},
         **{"expected_error": 0.123, "confidence": 0.877},
         "units": {"gpu": {"busy": 0.65, "idle": idle}, "dsp": {"busy": 0.25, "idle": {"throttled": 0.755}}},
         **changes,
@@ -315,7 +322,8 @@ def everything() -> dict[str, Any]:
         config={**an_answer()["config"], "avatar": "someone", "network": "a.onnx", "minutes": 10.0},
         **{"display_capped": True, "notes": ["first", "second"], "rate": RATE, "power_limit": LIMIT},
         temperature_c={"device_max": 41.25, "junction_max": 77.75},
-        caps={"throttled_share": 0.125},
+        caps={"throttled_share": 0.125, "first_throttled_s": 4.0},
+        timeline=[{"t_s": 1.0}],
         alternatives=[
             alternative("newest", "latest", "triple", 7.77, 128.7, 9.99, 0.125, 4.565, holds=True),
             alternative("slow", "sequential", "single", 17.7, 56.5, 18.8, 0.0, 2.345, holds=False),
@@ -327,15 +335,11 @@ def everything() -> dict[str, Any]:
 def test_an_answer_is_shown(
     name: str, answer: dict[str, Any], capsys: pytest.CaptureFixture[str], check_printed: Callable[..., None]
 ) -> None:
-    answer = judged(answer)
-    predict_output.show_answer(answer, as_json=False)
+    prediction = ApplicationPrediction.model_validate(answer)
+    predict_output.show_answer(prediction, as_json=False)
     check_printed(f"predict-{name}", capsys.readouterr().out)
-    predict_output.show_answer(answer, as_json=True)
-    assert json.loads(capsys.readouterr().out) == answer
-
-
-def judged(answer: dict[str, Any]) -> dict[str, Any]:
-    return {**answer, "verdict": predicted_verdict(answer).shown()}
+    predict_output.show_answer(prediction, as_json=True)
+    assert json.loads(capsys.readouterr().out) == answer | {"verdict": predicted_verdict(prediction).shown()}
 
 
 def a_network(**changes: Any) -> dict[str, Any]:
@@ -354,17 +358,17 @@ def test_networks_are_shown_with_their_ten_most_expensive_operators(
     capsys: pytest.CaptureFixture[str], check_printed: Callable[..., None]
 ) -> None:
     asked = PredictOptions(performance_profile="burst", minutes=30.0, fps=30.0, power_limit_w=3.0)
-    over = {"fps_settled": 25.55, "fps_start": 40.0, "caps": {"throttled_share": 0.5}, "without_rule": [ODD]}
+    over = {"fps_settled": 25.55, "fps_start": 40.0, "caps": CAPS, "without_rule": [ODD]}
     heat = {"device_max": 41.25, "junction_max": 77.75}
     rate = {**RATE, "holds": False, "reserve": -0.5, "reserve_low": -0.75, "reserve_high": -0.255, "sentence": "no"}
     answers = [a_network(rate=RATE, temperature_c=heat, **over)]
     answers.append(
         a_network(**over, engine_runtime=None, temperature_c=heat, numbers="not said", rate=rate, power_limit=LIMIT)
     )
-    answers = [judged(answer) for answer in answers]
-    predict_output.show_networks(CHIP, asked, answers, as_json=False)
+    predictions = [NetworkPrediction.model_validate(answer) for answer in answers]
+    predict_output.show_networks(CHIP, asked, predictions, as_json=False)
     check_printed("predict-networks", capsys.readouterr().out)
-    predict_output.show_networks(CHIP, asked, answers, as_json=True)
+    predict_output.show_networks(CHIP, asked, predictions, as_json=True)
     assert json.loads(capsys.readouterr().out) == {
         "schema": 1,
         "clock": "virtual",
@@ -373,16 +377,20 @@ def test_networks_are_shown_with_their_ten_most_expensive_operators(
             **{"performance_profile": "burst", "minutes": 30.0, "governor": CHIP.thermal.governor},
             **{"fps": 30.0, "power_limit_w": 3.0},
         },
-        "networks": answers,
+        "networks": [
+            answer | {"verdict": predicted_verdict(each).shown()}
+            for answer, each in zip(answers, predictions, strict=True)
+        ],
     }
 
 
 def test_a_limit_below_what_an_idle_device_takes(capsys: pytest.CaptureFixture[str]) -> None:
     limit = {**LIMIT, "fps": 0.0, "low_fps": 0.0, "high_fps": 0.0, "power_w": 3.25}
-    predict_output.show_answer(judged(an_answer(power_limit=limit)), as_json=False)
+    predict_output.show_answer(ApplicationPrediction.model_validate(an_answer(power_limit=limit)), as_json=False)
     assert "within 3 W      never: the device takes 3.25 W when no unit works\n" in capsys.readouterr().out
 
 
+CAPS = {"throttled_share": 0.5, "first_throttled_s": 4.0}
 ODD = {"op_type": "Warp", "count": 3, "share_of_elements": 0.125}
 
 

@@ -107,32 +107,30 @@ def test_the_error_is_that_of_the_model_and_the_scatter_of_what_was_measured() -
 def test_a_prediction_of_what_was_measured_has_its_interval() -> None:
     """80 % of a normal distribution are within 1.2816 deviations; of an error of 0.1, a factor of exp(0.12816)."""
     answer = predict(measured(error=0.1, t1=6.5, t2=6.4), Plan(NETWORK, "dsp", PIPELINED), BURST)
-    frame, network, factor = answer["frame_time_ms"], answer["network"], math.exp(0.12816)
-    assert (network["low_ms"], network["high_ms"]) == pytest.approx(
-        (network["alone_ms"] / factor, network["alone_ms"] * factor)
-    )
-    assert frame["mean"] == pytest.approx(network["alone_ms"], rel=0.02), "the slowest unit"
-    assert (frame["low"], frame["high"]) == pytest.approx((frame["mean"] / factor, frame["mean"] * factor))
-    assert (answer["expected_error"], answer["confidence"]) == pytest.approx((0.1, 0.9))
-    assert network["why"] == [SAID] and any(SAID in note for note in answer["notes"])
-    assert answer["power"]["low_w"] is answer["power"]["units"]["gpu"]["high_w"] is None, "no power is measured"
+    frame, network, factor = answer.frame_time_ms, answer.network, math.exp(0.12816)
+    assert (network.low_ms, network.high_ms) == pytest.approx((network.alone_ms / factor, network.alone_ms * factor))
+    assert frame.mean == pytest.approx(network.alone_ms, rel=0.02), "the slowest unit"
+    assert (frame.low, frame.high) == pytest.approx((frame.mean / factor, frame.mean * factor))
+    assert (answer.expected_error, answer.confidence) == pytest.approx((0.1, 0.9))
+    assert network.why == (SAID,) and any(SAID in note for note in answer.notes)
+    assert answer.power.low_w is answer.power.units["gpu"].high_w is None, "no power is measured"
 
 
 def test_a_frame_that_the_network_does_not_bound_has_an_interval_too() -> None:
     """The GPU's unit, with 6 ms of raster and composite, was measured as well as the network."""
     answer = predict(measured(error=0.1, t1=1.0, t2=1.0), Plan(NETWORK, "dsp", PIPELINED), BURST)
-    frame = answer["frame_time_ms"]
-    assert frame["mean"] == pytest.approx(6.0, rel=0.02)
-    assert frame["high"] / frame["mean"] == pytest.approx(math.exp(0.12816))
+    frame = answer.frame_time_ms
+    assert frame.mean == pytest.approx(6.0, rel=0.02)
+    assert frame.high / frame.mean == pytest.approx(math.exp(0.12816))
 
 
 def test_a_display_bounds_the_interval() -> None:
     """At a period of 6.5 ms, frames of 6 ms are held; at the slow end, of 6.8 ms, they are not."""
     profile, plan = measured(error=0.1, t1=1.0, t2=1.0), Plan(NETWORK, "dsp", PIPELINED)
     answer = predict(profile, plan, BURST, wanted=Wanted(1e3 / 6.5))
-    frame = answer["frame_time_ms"]
-    assert (frame["mean"], frame["low"]) == pytest.approx((6.5, 6.5), rel=0.01)
-    assert frame["high"] == pytest.approx(6.0 * math.exp(0.12816), rel=0.02)
+    frame = answer.frame_time_ms
+    assert (frame.mean, frame.low) == pytest.approx((6.5, 6.5), rel=0.01)
+    assert frame.high == pytest.approx(6.0 * math.exp(0.12816), rel=0.02)
 
 
 @pytest.mark.parametrize("runtime", ["dsp", "gpu"])
@@ -140,28 +138,28 @@ def test_what_was_not_measured_has_no_interval(runtime: Any) -> None:
     """Neither of times nor of powers, and no confidence; the words of a rate say whether it holds and no more."""
     host = load_profile("host") if runtime == "dsp" else measured()
     answer = predict(host, Plan(NETWORK, runtime, PIPELINED), BURST, wanted=Wanted(1.0))
-    assert [answer["frame_time_ms"][key] for key in ("low", "high")] == [None, None]
-    assert [answer["network"][key] for key in ("low_ms", "high_ms")] == [None, None]
-    assert answer["expected_error"] is answer["confidence"] is None
-    rate = answer["rate"]
-    assert (rate["words"], rate["reserve_low"], rate["reserve_high"]) == ("holds", None, None)
-    assert UNMEASURED in answer["notes"]
+    assert answer.frame[1:] == (None, None)
+    assert (answer.network.low_ms, answer.network.high_ms) == (None, None)
+    assert answer.expected_error is answer.confidence is None
+    rate = answer.rate
+    assert (rate.words, rate.reserve_low, rate.reserve_high) == ("holds", None, None)
+    assert UNMEASURED in answer.notes
     chip = predict(load_profile("snapdragon-888"), Plan(NETWORK, runtime, PIPELINED), BURST, wanted=Wanted(1.0))
-    assert "slow end" in chip["rate"]["words"] and chip["power"]["low_w"] > 0 and chip["confidence"] > 0
+    assert "slow end" in chip.rate.words and chip.power.low_w > 0 and chip.confidence > 0
 
 
 def test_a_network_by_itself_has_its_measured_time_or_no_interval() -> None:
     graph: Any = GraphFile("net.onnx", None, "w8a8", NETWORK.work)  # type: ignore[arg-type]
     answer = predict_network(measured(error=0.1, t1=6.5), graph, "dsp")
-    assert answer["network_ms"] == pytest.approx(6.5) and answer["why"] == [SAID]
-    assert answer["low_ms"] == pytest.approx(6.5 / math.exp(0.12816))
-    assert sum(row["share"] for row in answer["operators"]) == pytest.approx(1 - answer["job_ms"] / 6.5)
+    assert answer.network_ms == pytest.approx(6.5) and answer.why == (SAID,)
+    assert answer.low_ms == pytest.approx(6.5 / math.exp(0.12816))
+    assert sum(row.share for row in answer.operators) == pytest.approx(1 - answer.job_ms / 6.5)
     plain = predict_network(load_profile("host"), graph, "dsp", wanted=Wanted(1.0, 900.0))
-    limit = plain["power_limit"]
-    assert limit["low_fps"] is limit["high_fps"] is None and limit["fps"] > 0 and plain["rate"]["words"] == "holds"
-    assert plain["low_ms"] is plain["high_ms"] is None and plain["why"] == [UNMEASURED]
+    limit = plain.power_limit
+    assert limit.low_fps is limit.high_fps is None and limit.fps > 0 and plain.rate.words == "holds"
+    assert plain.low_ms is plain.high_ms is None and plain.why == (UNMEASURED,)
     on_gpu = predict_network(measured(), graph, "gpu")
-    assert on_gpu["low_ms"] is None and on_gpu["why"] == [UNMEASURED], "only the unit for networks is measured"
+    assert on_gpu.low_ms is None and on_gpu.why == (UNMEASURED,), "only the unit for networks is measured"
 
 
 def test_units_are_placed_by_the_measured_times() -> None:

@@ -14,6 +14,7 @@ from trilane.hw_profiles.governor import caps_of, ends_of, settled_corners, temp
 from trilane.hw_profiles.network_time import Interval, NetworkTime, OperatorTime, interval, price, spread_of
 from trilane.hw_profiles.network_work import Operator, Work
 from trilane.hw_profiles.operators import NAMES, EngineLayer, Layers
+from trilane.hw_profiles.prediction import Throttling
 from trilane.hw_profiles.profile_files import load_profile
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
 from trilane.hw_profiles.schema import Profile, Quantity, corners_of
@@ -216,11 +217,11 @@ def test_what_is_said_of_minutes() -> None:
     assert ends_of(moments[:3]) == {"fps_start": 50.0, "fps_settled": 50.0}
     assert settled_corners(moments) == ("max", "turbo", "max")  # as often as the other one, and before it
     assert settled_corners([*moments, *moments[-1:] * 5]) == ("max", "max", "max")
-    assert temperatures_of(moments) == {"device_end": 39.0, "device_max": 39.0, "junction_max": 50.0}
-    assert temperatures_of(moments[::-1])["device_end"] == 30.0
-    assert temperatures_of([]) == {}
-    assert caps_of(moments) == {"throttled_share": 0.2, "first_throttled_s": 3}
-    assert caps_of([]) == caps_of(moments[:2]) == {"throttled_share": 0.0, "first_throttled_s": None}
+    assert temperatures_of(moments).as_json() == {"device_end": 39.0, "device_max": 39.0, "junction_max": 50.0}
+    assert temperatures_of(moments[::-1]).device_end == 30.0
+    assert temperatures_of([]).as_json() == {}
+    assert caps_of(moments).as_json() == {"throttled_share": 0.2, "first_throttled_s": 3}
+    assert caps_of([]) == caps_of(moments[:2]) == Throttling(throttled_share=0.0, first_throttled_s=None)
     assert timeline_of(moments)[7] == {
         **{"t_s": 7, "fps": 50.0, "device_c": 37.0, "junction_c": 43.0, "power_w": 2.0},
         "corners": {"cpu": "max", "gpu": "turbo", "dsp": "max"},

@@ -429,10 +429,11 @@ def test_options_of_a_file_without_one(command: Command) -> None:
         ((50, 40, 60), "holds 30 fps: no; 40-60 ms of 33.3 ms (80 %)"),
         ((14, 14, 14), "holds 30 fps: yes; 14 ms of 33.3 ms"),
         ((5000, 1234.5, 9000), "holds 30 fps: no; 1234-9000 ms of 33.3 ms (80 %)"),
+        ((15,), "holds 30 fps: yes; 15 ms of 33.3 ms (no interval)"),
     ],
 )
-def test_the_sentence(times: tuple[float, float, float], words: str) -> None:
-    assert holding(30, FrameInterval(*times))["sentence"] == words
+def test_the_sentence(times: tuple[float, ...], words: str) -> None:
+    assert holding(30, FrameInterval(*times)).sentence == words
 
 
 @pytest.mark.parametrize("precision", [None, "float", "w8a8"])

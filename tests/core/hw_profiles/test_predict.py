@@ -190,7 +190,7 @@ def test_every_alternative_is_what_predict_says_of_the_same_policy_and_edge() ->
     profile = load_profile("snapdragon-888")
     for row in what_if(profile, NETWORK, "dsp", SUSTAINED)[:-2]:  # the last two have batches and a share of the GPU
         alone = predict(profile, Plan(NETWORK, "dsp", Variant(row["policy"], row["edge"], fps=MOST_FPS)), SUSTAINED)
-        means = {"frame_ms": alone["frame_time_ms"]["mean"], "latency_ms": alone["latency_ms"]["mean"]}
+        means = {"frame_ms": alone.frame_time_ms.mean, "latency_ms": alone.latency_ms.mean}
         assert {key: row[key] for key in means} == pytest.approx(means), row["name"]
 
 
@@ -199,9 +199,9 @@ def test_half_an_hour_says_where_it_begins_and_where_it_settles() -> None:
     profile, plan = load_profile("snapdragon-888"), Plan(NETWORK, "dsp")
     answer, moments = predict(profile, plan, BURST, 30), over_time(profile, plan, BURST, 30)
     last = [m.frame_ms for m in moments if m.t_s > 24 * 60]
-    assert answer["fps_start"] == pytest.approx(1e3 / moments[0].frame_ms)
-    assert answer["fps_settled"] == pytest.approx(1e3 * len(last) / sum(last))
-    assert answer["fps_settled"] < 0.97 * answer["fps"] < 0.97 * answer["fps_start"]
+    assert answer.fps_start == pytest.approx(1e3 / moments[0].frame_ms)
+    assert answer.fps_settled == pytest.approx(1e3 * len(last) / sum(last))
+    assert answer.fps_settled < 0.97 * answer.fps < 0.97 * answer.fps_start
 
 
 def with_cores(profile: Profile, **cores: str) -> Profile:
@@ -261,7 +261,7 @@ def test_units_that_share_a_core_work_in_turns() -> None:
     for unit in UNITS:
         assert now.busy[unit] + sum(now.idle[unit].values()) == pytest.approx(1.0)
     assert "preempted" not in now.idle["dsp"]
-    assert "cpu and gpu share a core and work in turns" in predict(profile, plan)["notes"]
+    assert "cpu and gpu share a core and work in turns" in predict(profile, plan).notes
 
 
 def test_a_placed_network_has_the_rates_of_its_threads_and_no_other_unit_changes(
@@ -324,9 +324,9 @@ def test_this_machine_in_virtual_time_is_placed_as_its_times_ask(count: int, mon
     assert chosen <= 1.05 * min(frames.values())
     assert chosen <= 1.03 * steady(on_cores(profile, placed.rule.placement), plan, corners).frame_ms
     answer = predict(profile, plan)
-    assert answer["placement"] == placed.facts
-    assert answer["fps"] == pytest.approx(1e3 / chosen)
-    assert any("placement: cpu 0" in note for note in answer["notes"])
+    assert answer.placement == placed.facts
+    assert answer.fps == pytest.approx(1e3 / chosen)
+    assert any("placement: cpu 0" in note for note in answer.notes)
 
 
 @pytest.mark.parametrize("fps", [0.0, 1e-300, 0.0009, 1001.0, float("nan")])
@@ -368,23 +368,23 @@ def test_an_answer_follows_from_its_moments(minutes: int) -> None:
     moments = over_time(profile, plan, BURST, minutes) if minutes else []
     frames = sorted(moment.frame_ms for moment in moments) or [now.frame_ms]
     mean = sum(frames) / len(frames)
-    times, half = answer["frame_time_ms"], profile.application.ema20_half_range_fraction.or_else(0) * mean
-    assert (times["mean"], times["p50"], times["max"]) == pytest.approx((mean, frames[len(frames) // 2], frames[-1]))
+    times, half = answer.frame_time_ms, profile.application.ema20_half_range_fraction.or_else(0) * mean
+    assert (times.mean, times.p50, times.max) == pytest.approx((mean, frames[len(frames) // 2], frames[-1]))
     least = max(profile.application.display_ms.or_else(0), mean - half)
-    assert (times["ema20_min"], times["ema20_max"]) == pytest.approx((least, mean + half))
-    assert answer["fps"] == pytest.approx(1e3 / mean) and answer["latency_ms"]["mean"] == now.latency_ms
+    assert (times.ema20_min, times.ema20_max) == pytest.approx((least, mean + half))
+    assert answer.fps == pytest.approx(1e3 / mean) and answer.latency_ms.mean == now.latency_ms
     base = profile.thermal.base_power_w.or_else(0)
     watts = [base + sum(profile.units[u].power_w(c, now.busy[u]) for u, c in zip(UNITS, corners, strict=True))]
     power = mean_of([moment.power_w for moment in moments] or watts)
-    assert (answer["power_w"], answer["energy_mj_per_frame"]) == pytest.approx((power, power * mean))
-    assert answer["xrbench"] == {"energy": pytest.approx(1 - power * mean / 1500)}
-    assert answer["efficiency"] == pytest.approx(now.stages_ms["infer"] / 2 / now.frame_ms)
-    assert {name: stage["service_ms"]["mean"] for name, stage in answer["stages"].items()} == now.stages_ms
-    assert {unit: row["busy"] for unit, row in answer["units"].items()} == now.busy
-    assert answer["network"]["gmac"] == NETWORK.work.macs / 1e9
-    assert len(answer["timeline"]) == len(moments) == 60 * minutes
-    config = answer["config"]
-    assert (config["size"], config["policy"], config["batch"], config["fps"]) == ("512x512", "pipelined", 2, 24.0)
+    assert (answer.power_w, answer.energy_mj_per_frame) == pytest.approx((power, power * mean))
+    assert answer.xrbench == {"energy": pytest.approx(1 - power * mean / 1500)}
+    assert answer.efficiency == pytest.approx(now.stages_ms["infer"] / 2 / now.frame_ms)
+    assert {name: stage.service_ms.mean for name, stage in answer.stages.items()} == now.stages_ms
+    assert {unit: row.busy for unit, row in answer.units.items()} == now.busy
+    assert answer.network.gmac == NETWORK.work.macs / 1e9
+    assert len(answer.timeline) == len(moments) == 60 * minutes
+    config = answer.config
+    assert (config.size, config.policy, config.batch, config.fps) == ("512x512", "pipelined", 2, 24.0)
 
 
 def test_percentiles_of_a_hundred_moments() -> None:

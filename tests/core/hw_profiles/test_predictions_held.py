@@ -75,12 +75,12 @@ def predictions(chip: str) -> dict[str, dict[str, float]]:
     found: dict[str, Any] = {}
     for name in NETWORKS:
         for runtime in RUNTIMES:
-            found[f"{name}, {runtime}"] = predict(profile, Plan(network(name), runtime))
+            found[f"{name}, {runtime}"] = predict(profile, Plan(network(name), runtime)).as_json()
     dsp = Plan(network("resnet18 batch"), "dsp", Variant("pipelined", "double"))
     for performance in PERFORMANCE_PROFILES:
-        found[f"{performance}"] = predict(profile, dsp, performance)
+        found[f"{performance}"] = predict(profile, dsp, performance).as_json()
     for governor in ("step_wise", "power_allocator"):
-        found[f"burst, 12 minutes, {governor}"] = predict(profile, dsp, "burst", 12, governor)
+        found[f"burst, 12 minutes, {governor}"] = predict(profile, dsp, "burst", 12, governor).as_json()
     rows = what_if(profile, network("resnet18 batch"), "dsp", SUSTAINED)
     found["what if"] = {row["name"]: row["frame_ms"] for row in rows}
     return {asked: _kept(asked, answer) for asked, answer in found.items()}

@@ -23,7 +23,7 @@ from trilane.unet_tables import ENCODERS, NORMS
 FLOAT = TensorProto.FLOAT
 
 
-def priced(path: Path) -> dict[str, Any]:
+def priced(path: Path) -> Any:
     graph = read_graph(path)
     return predict_network(in_precision(load_profile("snapdragon-888"), "dsp", graph.numbers), graph, "dsp")
 
@@ -42,11 +42,11 @@ def test_the_published_graphs_are_priced_and_counted(shared_data: Path) -> None:
         graph = onnx.load(path).graph
         sizes = {i.name: i.type.tensor_type.shape.dim[0].dim_value for i in graph.input}
         means = sum(2 * sizes[node.input[3]] for node in graph.node if node.op_type == "BatchNormalization")
-        assert found["gmac"] == pytest.approx(float(row["gmac"]), abs=1e-4), row["name"]
-        assert found["parameters_m"] == pytest.approx(float(row["params_m"]) - means / 1e6, abs=2e-4), row["name"]
-        assert found["without_rule"] == [], row["name"]
-        assert found["low_ms"] < found["network_ms"] < found["high_ms"]
-        assert all(operator["ms"] >= 0 for operator in found["operators"])
+        assert found.gmac == pytest.approx(float(row["gmac"]), abs=1e-4), row["name"]
+        assert found.parameters_m == pytest.approx(float(row["params_m"]) - means / 1e6, abs=2e-4), row["name"]
+        assert found.without_rule == (), row["name"]
+        assert found.low_ms < found.network_ms < found.high_ms
+        assert all(operator.ms >= 0 for operator in found.operators)
 
 
 def saved(model: onnx.ModelProto, folder: Path) -> Path:
@@ -61,8 +61,8 @@ def test_the_reference_networks_are_priced(norm: str, tmp_path: Path) -> None:
         for layout in ("packed", "split"):
             model = build_network(NetworkSpec(encoder, norm, 64, 96, 12, layout))
             found = priced(saved(model, tmp_path))
-            assert found["numbers"] == "not said"
-            assert (found["without_rule"], found["gmac"]) == ([], count_work(model).macs / 1e9)
+            assert found.numbers == "not said"
+            assert (found.without_rule, found.gmac) == ((), count_work(model).macs / 1e9)
 
 
 def test_the_networks_of_an_avatar_are_priced(
@@ -70,10 +70,10 @@ def test_the_networks_of_an_avatar_are_priced(
 ) -> None:
     integer = priced(saved(tiny_quantised.network.model, tmp_path))
     plain = priced(saved(tiny_float, tmp_path))
-    assert (integer["numbers"], plain["numbers"]) == ("w8a8", "float")
-    assert (integer["precision"], plain["precision"]) == ("int8", "fp16")
-    assert integer["gmac"] == plain["gmac"] > 0
-    assert integer["without_rule"] == plain["without_rule"] == []
+    assert (integer.numbers, plain.numbers) == ("w8a8", "float")
+    assert (integer.precision, plain.precision) == ("int8", "fp16")
+    assert integer.gmac == plain.gmac > 0
+    assert integer.without_rule == plain.without_rule == ()
 
 
 def array(name: str, *shape: int) -> TensorProto:
@@ -305,5 +305,7 @@ def test_a_compiled_network_is_said_to_hide_what_it_computes(tmp_path: Path) -> 
     graph = helper.make_graph([node], "g", ends[:1], ends[1:])
     opsets = [helper.make_opsetid("", 17), helper.make_opsetid("com.microsoft", 1)]
     found = priced(saved(helper.make_model(graph, opset_imports=opsets), tmp_path))
-    assert found["without_rule"] == [{"op_type": "EPContext", "count": 1, "share_of_elements": 1.0}]
-    assert found["why"][-1] == INSIDE
+    assert [row.as_json() for row in found.without_rule] == [
+        {"op_type": "EPContext", "count": 1, "share_of_elements": 1.0}
+    ]
+    assert found.why[-1] == INSIDE

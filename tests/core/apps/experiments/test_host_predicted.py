@@ -9,8 +9,9 @@ from typing import Any
 import pytest
 
 from trilane.apps.experiments import host_predicted
-from trilane.apps.experiments.host_predicted import Predicted, measure, summary
+from trilane.apps.experiments.host_predicted import measure, summary
 from trilane.errors import BadInputError
+from trilane.hw_profiles.rates import FrameInterval
 
 
 def row(error: float, inside: bool = False) -> dict[str, Any]:
@@ -32,7 +33,7 @@ def test_errors_are_said_by_their_median_and_without_each_one_in_turn() -> None:
 
 @pytest.mark.parametrize(("ms", "inside"), [(8.9, False), (9.0, True), (11.0, True), (11.1, False)])
 def test_the_ends_of_an_interval_are_in_it(ms: float, inside: bool) -> None:
-    assert host_predicted._row("a", "run", Predicted(10.0, 9.0, 11.0), ms, None)["inside"] is inside
+    assert host_predicted._row("a", "run", FrameInterval(10.0, 9.0, 11.0), ms, None)["inside"] is inside
 
 
 def test_runs_that_are_not_placed_by_their_times_are_refused() -> None:
@@ -46,8 +47,8 @@ def test_runs_and_calls_stand_beside_their_predictions(monkeypatch: pytest.Monke
     for name, answer in (
         ("remade_avatar", (tmp_path, "")),
         ("load_bundle", bundle),
-        ("_of_run", Predicted(10.0, 9.0, 11.0)),
-        ("_of_network", Predicted(4.0, None, None)),
+        ("_of_run", FrameInterval(10.0, 9.0, 11.0)),
+        ("_of_network", FrameInterval(4.0)),
         ("_run", (12.0, 0.01)),
         ("_calls", 5.0),
     ):

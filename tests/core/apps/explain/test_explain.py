@@ -297,7 +297,7 @@ def test_on_this_machine_units_are_placed_as_in_a_prediction(
     shape = max(frames, key=lambda one: frames[one])
     network = load_bundle(checked.config.avatar_dirs[0]).read_network()
     described = Network({}, *shape, network.channels, "packed", count_work(reshaped(network, *shape).model))
-    expected = predict(load_profile("host"), Plan(described, "dsp", PIPELINED), CAP)["placement"]
+    expected = predict(load_profile("host"), Plan(described, "dsp", PIPELINED), CAP).placement
     assert document["placement"]["units"] == expected["units"]
     assert document["placement"]["predicted_ms"] == expected["predicted_ms"]
     assert f"{expected['rule_ms']:.1f} ms. A run measures" in document["placement"]["why"]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,11 +17,14 @@ from support.run_folders import write_run
 from support.run_report import TIMES, make_report
 from trilane.apps.explain.explained_run import explain_run
 from trilane.apps.interface import load_run
+from trilane.apps.run.predicted_verdict import pipeline_verdict, predicted_verdict
 from trilane.apps.run.report import Report, read_report
 from trilane.apps.run.verdict import COMPUTED, SO_FAR, Facts, LateFrames, NamedBound, Rate, Trust, judged, trust_of
-from trilane.apps.run.verdict_facts import predicted_verdict, verdict_of
+from trilane.apps.run.verdict_facts import verdict_of
 from trilane.apps.watch.followed_run import FollowedRun
 from trilane.apps.watch.live_figures import looks
+from trilane.hw_profiles.prediction import ApplicationPrediction, MeanTime, PredictedStage, PredictedTimes
+from trilane.hw_profiles.rates import FrameInterval, holding
 from trilane.machine import Machine
 from trilane.pipeline.journal import records_of
 from trilane.pipeline.reckoning import reckoned
@@ -91,31 +95,42 @@ def test_advice_follows_from_the_numbers() -> None:
 
 def test_a_prediction_is_sure_where_its_interval_is_on_one_side() -> None:
     """66.7 fps, 50 to 100: above 30 and below 120, but 60 lies within."""
-    stages = {"a": {"unit": "u", "service_ms": {"mean": 9.0}}, "b": {"unit": "v", "service_ms": {"mean": 12.0}}}
-    answer = {"frame_time_ms": {"mean": 15.0, "low": 10.0, "high": 20.0}, "stages": stages}
     for fps, passed, trusted in ((30, True, True), (60, True, False), (120, False, True)):
-        found = predicted_verdict({**answer, "config": {"fps": fps}}).as_json()
+        found = predicted_verdict(predicted((15.0, 10.0, 20.0), fps, gpu=9.0, dsp=12.0)).as_json()
         assert (found["pass"], found["trusted"]) == (passed, trusted)
-        assert found["bound"] == {"unit": "v", "stages": ["b"], "share": 0.8}
+        assert found["bound"] == {"unit": "dsp", "stages": ["of dsp"], "share": 0.8}
+
+
+def predicted(frame_ms: tuple[float, ...], fps: float = 30.0, /, **ms: Any) -> ApplicationPrediction:
+    """A prediction with a stage on each unit, and further fields."""
+    stages = {
+        f"of {unit}": PredictedStage(unit=unit, service_ms=MeanTime(mean=ms.pop(unit)))  # type: ignore[arg-type]
+        for unit in ("cpu", "gpu", "dsp")
+        if unit in ms
+    }
+    times = PredictedTimes.model_construct(mean=frame_ms[0], low=frame_ms[1], high=frame_ms[2])
+    config, known = (
+        SimpleNamespace(fps=fps),
+        {"latency_ms": MeanTime(mean=20.0), "units": {}, "display_capped": False, "timeline": ()},
+    )
+    return ApplicationPrediction.model_construct(frame_time_ms=times, config=config, stages=stages, **known | ms)
 
 
 def test_what_the_display_holds_back_is_bound_by_it() -> None:
     """The display shows a frame every 16.6 ms, 60.2 fps; the stages need 9 ms. A rate below that is no display's."""
-    stages = {"a": {"unit": "u", "service_ms": {"mean": 9.0}}}
-    held = {"stages": stages, "display_capped": True, "fps": 1e3 / 16.6}
-    shown = {"mean": 16.6, "low": 16.6, "high": 16.6}
-    found = predicted_verdict({**held, "frame_time_ms": shown})
+    held = {"gpu": 9.0, "display_capped": True, "fps": 1e3 / 16.6}
+    shown = (16.6, 16.6, 16.6)
+    found = predicted_verdict(predicted(shown, **held))
     lines = dict(found.lines())
     assert lines["BOUND"] == (
-        "display: 16.6 of 16.6 ms a frame (100 %); it shows no more frames a second; of stages most a 9.0"
+        "display: 16.6 of 16.6 ms a frame (100 %); it shows no more frames a second; of stages most of gpu 9.0"
     )
     assert lines["TRUST"] == "computed; the display holds the rate over the whole 80 % interval"
-    reserve = {"fps": 100.0, "reserve": 1 - 1.66, "reserve_low": 1 - 1.66, "reserve_high": 1 - 1.66}
-    slow = predicted_verdict({**held, "frame_time_ms": shown, "rate": reserve})
+    slow = predicted_verdict(predicted(shown, **held, rate=holding(100.0, FrameInterval(*shown))))
     assert (slow.passed, slow.as_json()["bound"]["unit"]) == (False, "display")
-    left = {"fps": 30.0, "reserve": 0.73, "reserve_low": 0.7, "reserve_high": 0.75}
-    quick = predicted_verdict({**held, "fps": 30.0, "frame_time_ms": {"mean": 33.3}, "rate": left})
-    assert (quick.passed, quick.as_json()["bound"]["unit"]) == (True, "u")
+    left = holding(30.0, FrameInterval(9.0, 8.0, 10.0))
+    quick = predicted_verdict(predicted((33.3, 33.3, 33.3), **{**held, "fps": 30.0}, rate=left))
+    assert (quick.passed, quick.as_json()["bound"]["unit"]) == (True, "gpu")
 
 
 def test_frames_that_gave_way_to_newer_ones_are_told_beside_the_rate() -> None:
@@ -148,12 +163,8 @@ def test_stages_that_round_to_no_time_bound_nothing_that_is_told() -> None:
 def test_frames_that_every_leaves_out_are_not_dropped_ones() -> None:
     """Of 300 frames a stage takes each second one: 147 came, 3 went because they were stale, 1 was late."""
     dropped = {"a->b:every": 150, "a->b:stale": 3}
-    frames = {"presented": 147, "dropped": dropped}
-    answer = {
-        "frame_time_ms": {"mean": 15.0},
-        "rate": {"fps": 30, "reserve": 0.5, "reserve_low": 0.4, "reserve_high": 0.6},
-    }
-    found = predicted_verdict({**answer, "frames": frames, "deadline_misses": 1})
+    rate = holding(30.0, FrameInterval(15.0, 12.0, 18.0)).as_json()
+    found = pipeline_verdict(simulated(frames={"presented": 147, "dropped": dropped}, deadline_misses=1, rate=rate))
     assert "1 of 150 frames late, 3 dropped at 30 fps" in str(found.as_json())
 
 
@@ -177,17 +188,26 @@ def test_a_run_of_one_frame_says_what_is_not_known(times: dict[str, Any]) -> Non
 
 
 def test_stages_that_take_no_time_bound_nothing() -> None:
-    stages = {"a": {"unit": "u", "alone_ms": 0.0, "service_ms": {"mean": 0.0}}}
-    found = predicted_verdict({"needs_ms": {"mean": 0.0, "low": None, "high": None}, "stages": stages})
+    found = pipeline_verdict(simulated(needs_ms={"mean": 0.0, "low": None, "high": None}, ms=0.0))
     assert (found.passed, found.as_json()["bound"]) == (True, None)
 
 
 def test_a_prediction_without_a_presented_frame_has_no_latency() -> None:
     frames = {"presented": 0, "lost": 0, "dropped": {"a->b:late": 300}}
-    answer = {"frame_time_ms": {"mean": 15.0}, "frames": frames, "latency_ms": {"mean": 0, "samples": 0}}
-    assert "latency" not in dict(predicted_verdict(answer).lines())["TIME"]
-    answer["latency_ms"] = {"mean": 20.5, "samples": 3}
-    assert "latency 20" in dict(predicted_verdict(answer).lines())["TIME"]
+    for latency, told in (({"mean": 0, "samples": 0}, False), ({"mean": 20.5, "samples": 3}, True)):
+        verdict = pipeline_verdict(simulated(frames=frames, latency_ms=latency))
+        assert ("latency 20" in dict(verdict.lines())["TIME"]) == told == ("latency" in dict(verdict.lines())["TIME"])
+
+
+def simulated(ms: float = 9.0, **changes: Any) -> dict[str, Any]:
+    """The prediction of a pipeline of one stage."""
+    return {
+        "needs_ms": {"mean": 15.0, "low": 12.0, "high": 18.0},
+        "stages": {"a": {"unit": "u", "alone_ms": ms, "service_ms": {"mean": ms}}},
+        **{"units": {}, "frames": {"presented": 300, "dropped": {}}, "deadline_misses": 0},
+        "latency_ms": {"mean": 20.0, "samples": 300},
+        **changes,
+    }
 
 
 #: A pipeline like the avatar's, whose stages have units of their own or share them.
