@@ -76,7 +76,15 @@ def film_of(names: Sequence[str], fps: float) -> Film:
     """
     clock = _clock(names)
     if clock:
-        return _film_by_clock(clock)
+        times = tuple(time - clock[0] for time in clock)
+        steps = sorted(later - earlier for earlier, later in pairwise(times))
+        usual = median(steps)
+        rate = [f"{1 / usual:.4g}/s by the times that are their names"]
+        gaps = sum(step > GAP * usual for step in steps)
+        if gaps:
+            longest = f"{gaps} gap{'s' * (gaps > 1)}, the longest {1000 * steps[-1]:.0f} ms"
+            rate.append(f"{longest}: the picture before is held")
+        return Film(times, times[-1] + usual, tuple(rate), clock[0])
     numbers = _numbers(names)
     step = _step(numbers)
     frames = [(number - numbers[0]) // step for number in numbers] if step else list(range(len(names)))
@@ -96,17 +104,6 @@ def _clock(names: Sequence[str]) -> list[float]:
         if len(times) == len(stems) > 1 and EARLIEST_S < times[0] < times[-1] < LATEST_S:
             return times if all(earlier < later for earlier, later in pairwise(times)) else []
     return []
-
-
-def _film_by_clock(clock: Sequence[float]) -> Film:
-    times = tuple(time - clock[0] for time in clock)
-    steps = sorted(later - earlier for earlier, later in pairwise(times))
-    usual = median(steps)
-    rate = [f"{1 / usual:.4g}/s by the times that are their names"]
-    gaps = sum(step > GAP * usual for step in steps)
-    if gaps:
-        rate.append(f"{gaps} gap{'s' * (gaps > 1)}, the longest {1000 * steps[-1]:.0f} ms: the picture before is held")
-    return Film(times, times[-1] + usual, tuple(rate), clock[0])
 
 
 def _numbers(names: Sequence[str]) -> list[int]:

@@ -248,13 +248,10 @@ def _unit_of(
                 path, f"the column name `{column.text}`", known, f"remove the unit there, and set {key}"
             )
     if len(set(found)) > 1:
-        both = " and ".join(f"`{column.text}`" for column in (of[0], of[_first_other(found)]))
+        other = next(column for column, unit in zip(of, found, strict=True) if unit != found[0])
+        both = f"`{of[0].text}` and `{other.text}`"
         raise BadInputError(path, f"the column names {both}", "one unit for all three", f"remove them, and set {key}")
     return found[0] if found else ""
-
-
-def _first_other(found: Sequence[str]) -> int:
-    return next(k for k, unit in enumerate(found) if unit != found[0])
 
 
 def elapsed(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
@@ -542,10 +539,7 @@ def _worst_step(column: F64) -> float:
 
 
 def _began(times: F64, unit: str) -> float | None:
-    """Return the first finite time of `times` in seconds since 1970; None if the times are not those of a clock.
-
-    `unit`: unit of `times`, a key of TIME_UNITS or FRAMES.
-    """
+    """Return the first finite time of `times` in seconds since 1970; None if the times are not those of a clock."""
     finite = times[np.isfinite(times)]
     if unit not in TIME_UNITS or not len(finite) or not _since_1970(float(finite[0]), unit):
         return None

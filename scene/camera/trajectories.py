@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -95,12 +94,7 @@ def load_kitti(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
 
 
 def _kitti_times(path: Path, read: MatrixTable, clock: TableClock) -> tuple[F64, str]:
-    """Return (times of the poses (N,), seconds; their source in words).
-
-    The source is the file, `times.txt`, the scene or the usual rate.
-
-    Raises BadInputError when `times.txt` has another number of times than there are poses.
-    """
+    """Return (times of the poses (N,), seconds; their source in words). Raises BadInputError."""
     if read.times is not None and read.times.unit != FRAMES:
         return read.times.since_s, f"by the times of the file, in {read.times.unit}"
     beside = path.with_name(KITTI_TIMES)
@@ -187,8 +181,10 @@ def load_euroc(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
         numbers = _sensor(sensor)
         to_body = numbers["data"].reshape(4, 4)
         turns, places = turns @ to_body[:3, :3], places + turns @ to_body[:3, 3] / LENGTH_UNITS[poses.lengths or "m"]
-        lens, source = checked_lens(sensor, _sensor_lens(numbers)), f"by {EUROC_SENSOR}"
-        how = (f"poses of the body, brought to the camera by {EUROC_SENSOR}", *_sensor_distortion(lens, numbers))
+        own = of_opencv(*(float(value) for key in ("resolution", "intrinsics") for value in numbers[key]))
+        lens, source = checked_lens(sensor, own), f"by {EUROC_SENSOR}"
+        bent = dict(zip(("k1", "k2", "p1", "p2"), map(float, numbers["distortion_coefficients"]), strict=True))
+        how = (f"poses of the body, brought to the camera by {EUROC_SENSOR}", *distortion_note([Bent(lens, bent)]))
     notes = (f"EuRoC poses, {len(poses.times_s)}{poses.rate}, time in {poses.time}, columns {poses.order}", *how)
     detected = Detected("EuRoC poses", "times in ns and commas", unit="m", rate="by the times of the file")
     return RawCamera(
@@ -204,17 +200,6 @@ def load_euroc(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
         began_s=poses.began_s,
         lengths=poses.lengths,
     )
-
-
-def _sensor_lens(numbers: Mapping[str, F64]) -> Lens:
-    width, height = (float(value) for value in numbers["resolution"])
-    fx, fy, cx, cy = (float(value) for value in numbers["intrinsics"])
-    return of_opencv(width, height, fx, fy, cx, cy)
-
-
-def _sensor_distortion(lens: Lens, numbers: Mapping[str, F64]) -> tuple[str, ...]:
-    keys = ("k1", "k2", "p1", "p2")
-    return distortion_note([Bent(lens, dict(zip(keys, map(float, numbers["distortion_coefficients"]), strict=True)))])
 
 
 def _sensor(path: Path) -> dict[str, F64]:
