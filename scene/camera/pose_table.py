@@ -405,20 +405,16 @@ EVEN, UNEVEN, LEAST_OF_A_CLOCK = 0.01, 0.5, 8
 class PoseTable:
     """The poses of a table with quaternions.
 
-    `times_s` (N,): times from 0.
     `turns` (N, 3, 3), `places` (N, 3): rotations and positions, with the file's axes and unit.
-    `time`: unit of the file's times. `rate`: rate for notes, such as `, 30/s`.
     `order`: source of the order of columns, in words.
     `names`: content of each column of `table`.
     `began_s`: time 0 in seconds since 1970; None if the file's times are not those of a clock.
     `lengths`: unit of the positions by the column names; "" if they state no unit.
     """
 
-    times_s: F64
+    times: ColumnTimes
     turns: F64
     places: F64
-    time: str
-    rate: str
     order: str
     names: Sequence[str]
     table: NumberTable
@@ -452,22 +448,10 @@ def read_pose_table(
     times = times_of(path, time, clock.stated(path, layout.unit))
     quats = np.column_stack([qw, qx, qy, qz])
     _require_quats(path, quats, table)
-    turns = matrix_from_quat(normalised(quats))
-    places = np.column_stack([x, y, z])
+    turns, places = matrix_from_quat(normalised(quats)), np.column_stack([x, y, z])
     if not layout.has_pose:
         _require_times(path, time, places)
-    return PoseTable(
-        times.since_s,
-        turns,
-        places,
-        times.unit,
-        times.rate,
-        order,
-        names,
-        table,
-        _began(time, times.unit),
-        layout.lengths,
-    )
+    return PoseTable(times, turns, places, order, names, table, _began(time, times.unit), layout.lengths)
 
 
 class MatrixTable(NamedTuple):

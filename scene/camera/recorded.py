@@ -259,15 +259,6 @@ def find_upright(turns: F64, usual: str, is_levelled: bool, stated: str = AUTO) 
     return Upright(best.up, best.quarter, _note(best, usual, stated) + _rival(best, guesses, stated) + of_first)
 
 
-def _is_nadir(turns: F64, usual: str, most_deg: float) -> bool:
-    """Return whether a camera looks straight down along the axis `usual`, within `most_deg` degrees.
-
-    If the map has the axes of the first picture, the result is False: such a camera looks ahead along an axis.
-    """
-    is_of_first = np.abs(np.diag(turns[0])).min() > AS_FIRST
-    return bool(turns[:, :, 2].mean(axis=0) @ UP[usual] > np.cos(np.radians(most_deg)) and not is_of_first)
-
-
 def price_of(turns: F64, usual: str) -> float:
     """Return the cost of the cheapest guess at up for cameras `turns` (N, 3, 3); 0 if they are level about `usual`."""
     return min((guess.price for guess in _guesses(turns, usual, ANY_WORLD, AUTO)), default=math.inf)
@@ -308,7 +299,9 @@ def _guesses(turns: F64, expected: str, prices: _Prices, stated: str) -> list[_G
         for quarter in range(4)
         if (price := _price(turns, np.array(up), quarter)) is not None
     ]
-    if stated == AUTO and _is_nadir(turns, expected, prices.nadir_deg):
+    looks_down = turns[:, :, 2].mean(axis=0) @ UP[expected] > np.cos(np.radians(prices.nadir_deg))
+    # A camera in whose map the first picture has the axes looks ahead along an axis.
+    if stated == AUTO and looks_down and np.abs(np.diag(turns[0])).min() <= AS_FIRST:
         guesses.append(_Guess(expected, np.array(UP[expected]), 0, prices.nadir, is_nadir=True))
     if stated != AUTO or prices.between is None:
         return guesses

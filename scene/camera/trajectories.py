@@ -134,14 +134,14 @@ def load_tum(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
     Format: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats.
     """
     poses = read_pose_table(path, clock, TUM_NAMES, TUM)
-    order = "" if poses.order == USUAL else f", columns {poses.order}"
-    time = "" if poses.time == "s" else f", time in {poses.time}"
-    notes = (f"TUM trajectory, {len(poses.times_s)} poses{poses.rate}{time}{order}, optical axes, camera to world",)
+    times, order = poses.times, "" if poses.order == USUAL else f", columns {poses.order}"
+    time = "" if times.unit == "s" else f", time in {times.unit}"
+    notes = (f"TUM trajectory, {len(poses.turns)} poses{times.rate}{time}{order}, optical axes, camera to world",)
     lens = ((KINECT,), "usual for a Kinect")
     reason = f"{TUM_COLUMNS} columns of numbers"
     detected = Detected("TUM trajectory", reason, unit="m", rate="by the times of the file")
     return RawCamera(
-        poses.times_s,
+        times.since_s,
         poses.turns,
         poses.places,
         "z",
@@ -185,10 +185,11 @@ def load_euroc(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
         lens, source = checked_lens(sensor, own), f"by {EUROC_SENSOR}"
         bent = dict(zip(("k1", "k2", "p1", "p2"), map(float, numbers["distortion_coefficients"]), strict=True))
         how = (f"poses of the body, brought to the camera by {EUROC_SENSOR}", *distortion_note([Bent(lens, bent)]))
-    notes = (f"EuRoC poses, {len(poses.times_s)}{poses.rate}, time in {poses.time}, columns {poses.order}", *how)
+    times = poses.times
+    notes = (f"EuRoC poses, {len(turns)}{times.rate}, time in {times.unit}, columns {poses.order}", *how)
     detected = Detected("EuRoC poses", "times in ns and commas", unit="m", rate="by the times of the file")
     return RawCamera(
-        poses.times_s,
+        times.since_s,
         turns,
         places,
         "z",
@@ -241,11 +242,12 @@ def load_stray(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
     file = path / STRAY_FILE if path.is_dir() else path
     poses = read_pose_table(file, clock, STRAY_NAMES, STRAY, may_have_more=True)
     lenses, source = _stray_lenses(file, poses)
-    time = "" if poses.time == "s" else f", time in {poses.time}"
-    notes = (f"Stray Scanner, {len(poses.times_s)} poses{poses.rate}{time}, optical axes, camera to world",)
+    times = poses.times
+    time = "" if times.unit == "s" else f", time in {times.unit}"
+    notes = (f"Stray Scanner, {len(poses.turns)} poses{times.rate}{time}, optical axes, camera to world",)
     detected = Detected("Stray Scanner odometry", "its column names", unit="m", rate="by the times of the file")
     return RawCamera(
-        poses.times_s,
+        times.since_s,
         poses.turns,
         poses.places,
         "y",

@@ -508,7 +508,7 @@ def _arms(poses: F64, times: F64, stride: F64, wave: bool) -> None:
     rise, fall = smooth_step((times - start) / (raised - start)), smooth_step((times - lower) / (down - lower))
     up = (rise - fall) * wave
     for side, name in ((1, "left"), (-1, "right")):
-        arm = hanging_arm(side, 0.6 * side * lag)
+        arm: tuple[F64, ...] = hanging_arm(side, 0.6 * side * lag)
         if side < 0 and wave:
             waving = waving_arm(np.sin(2 * np.pi * WAVES_PER_S * (times - raised)))
             arm = tuple(_between(low, high, up) for low, high in zip(arm, waving, strict=True))
