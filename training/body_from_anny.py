@@ -5,7 +5,6 @@ Rule: all numbers are rounded to fixed steps, so the file is small and the same 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,7 +42,8 @@ def build_body() -> dict[str, NDArray[Any]]:
 
 def _file_arrays(vertices: F64, weights: F64, j_regressor: F64, source: AnnyMesh) -> dict[str, NDArray[Any]]:
     count = len(weights)
-    nose = np.flatnonzero((source.faces == np.argmax(_nose_score(vertices[0], weights))).any(axis=1))[:1]
+    ahead = np.where(weights[:, JOINT_INDEX["head"]] > 0.5, vertices[0][:, 2], -np.inf)
+    nose = np.flatnonzero((source.faces == np.argmax(ahead)).any(axis=1))[:1]
     floats = {
         "v_template": vertices[0],
         "shapedirs": np.moveaxis(vertices[1:], 0, 2),
@@ -65,10 +65,6 @@ def _file_arrays(vertices: F64, weights: F64, j_regressor: F64, source: AnnyMesh
     }
     arrays: dict[str, NDArray[Any]] = {key: value.astype(np.float32) for key, value in floats.items()}
     return arrays | {key: value.astype(np.uint32) for key, value in integers.items()}
-
-
-def _nose_score(vertices: F64, weights: F64) -> F64:
-    return np.asarray(np.where(weights[:, JOINT_INDEX["head"]] > 0.5, vertices[:, 2], -np.inf))
 
 
 def relaxed_hand(bend: int) -> F64:
@@ -385,7 +381,7 @@ def _pose_arm(rotations: F64, joints: F64, side: str, out: F64, ends: dict[str, 
         return np.asarray(joints[JOINT_INDEX[f"{side}_{name}"]])
 
     upper = align(at("elbow") - at("shoulder"), out)
-    hand = _hand_rotation(at, out)
+    hand = frame(out, _FRONT) @ frame(at("middle1") - at("wrist"), at("index1") - at("pinky1")).T
     fore = align(at("wrist") - at("elbow"), out)
     fore = about(out, _FOREARM_TWIST * _twist(hand @ fore.T, out)) @ fore
     chosen = {"collar": power(upper, _COLLAR_LIFT), "shoulder": upper, "elbow": fore, "wrist": hand}
@@ -394,12 +390,6 @@ def _pose_arm(rotations: F64, joints: F64, side: str, out: F64, ends: dict[str, 
         chosen |= {f"{finger}{i + 1}": _flat(hand, chain[i + 1] - chain[i], finger) for i in range(3)}
     for name, rotation in chosen.items():
         rotations[JOINT_INDEX[f"{side}_{name}"]] = rotation
-
-
-def _hand_rotation(at: Callable[[str], F64], out: F64) -> F64:
-    along = at("middle1") - at("wrist")
-    across = at("index1") - at("pinky1")
-    return frame(out, _FRONT) @ frame(along, across).T
 
 
 def _flat(hand: F64, segment: F64, finger: str) -> F64:

@@ -214,7 +214,10 @@ def validate(
             "made_with": _made_with(plan, renderer),
             "size": plan.size,
             "per_band": plan.per_band,
-            "held_out": {Path(name).name: _origin(name) for name in plan.held_out},
+            "held_out": {
+                Path(name).name: ("built in" if name.startswith("builtin:") else f"sha256 {sha256_of([Path(name)])}")
+                for name in plan.held_out
+            },
             **_arranged(figures, plan.runtimes, float_network.name if float_network is not None else ""),
         }
     )
@@ -258,11 +261,6 @@ def _arranged(figures: Mapping[str, dict[str, Any]], runtimes: tuple[str, ...], 
             band: round(by_band[band] - psnr, 2) for band, psnr in own["psnr_db_by_band"].items()
         }
     return arranged
-
-
-def _origin(motion: str) -> str:
-    """Return the origin of a motion: `built in`, or `sha256` and the digest of its file."""
-    return "built in" if motion.startswith("builtin:") else f"sha256 {sha256_of([Path(motion)])}"
 
 
 # The image error by size of body and tensor: the same views, painted at several tensor sizes.

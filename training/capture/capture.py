@@ -128,7 +128,10 @@ class _Opening:
         masks = self._try(lambda: open_pictures(self.folder / self.file.masks, MASK))
         mask_of: list[int] = []
         if frames is not None:
-            self._count(frames)
+            if len(frames.names) < LEAST_FRAMES:
+                count = f"{len(frames.names)} frame" + "s" * (len(frames.names) > 1)
+                expected = f"at least {LEAST_FRAMES}, one for each side of the person"
+                self.faults.append(Fault(self.file.frames, count, expected))
             mask_of = self._matched(frames, masks) if masks is not None else []
             self._look(frames, masks, mask_of, track)
         fits = self._fits(frames.names, body) if frames is not None and body is not None else []
@@ -151,12 +154,6 @@ class _Opening:
         except BadInputError as error:
             self.faults.append(Fault.of(error))
             return None
-
-    def _count(self, frames: Pictures) -> None:
-        if len(frames.names) < LEAST_FRAMES:
-            count = f"{len(frames.names)} frame" + "s" * (len(frames.names) > 1)
-            expected = f"at least {LEAST_FRAMES}, one for each side of the person"
-            self.faults.append(Fault(self.file.frames, count, expected))
 
     def _matched(self, frames: Pictures, masks: Pictures) -> list[int]:
         """Return, for each frame, the number of its mask. A frame without a mask gets -1 and a fault.

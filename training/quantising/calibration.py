@@ -228,7 +228,9 @@ def power_of_two_weights(model: onnx.ModelProto, ranges: Any, reduce_range: bool
         ends = {node.input[0], node.output[0]} if node.op_type == "Conv" else set()
         if not ends or not ends <= known or node.input[1] not in constants:
             continue
-        source, target = (_step_of(ranges[name]) for name in (node.input[0], stored[node.output[0]]))
+        source, target = (
+            float(ranges[name].highest - ranges[name].lowest) / BYTE for name in (node.input[0], stored[node.output[0]])
+        )
         kernel = constants[node.input[1]]
         bias = _bias_of(node, kernel, constants, model)
         finest = np.maximum(FINEST * target, np.abs(numpy_helper.to_array(bias)) / LARGEST_BIAS) / source
@@ -305,10 +307,6 @@ def _round_bias(bias: onnx.TensorProto, scales: NDArray[np.float64]) -> None:
 
 def _like(tensor: onnx.TensorProto, values: NDArray[np.float64], shape: tuple[int, ...]) -> onnx.TensorProto:
     return numpy_helper.from_array(values.reshape(shape).astype(np.float32), tensor.name)
-
-
-def _step_of(data: Any) -> float:
-    return float(data.highest - data.lowest) / BYTE
 
 
 def _cut(name: str, data: Any, model: onnx.ModelProto) -> tuple[float, float]:

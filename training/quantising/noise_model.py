@@ -136,15 +136,12 @@ class NoiseGraph:
         if node.op_type == "QuantizeLinear":
             self.store(node)
         elif node.op_type == "DequantizeLinear" and node.input[0] in self.values:
-            self._constant(node)
+            # An input of the noise model, so that each draw can change it.
+            self.constants[node.output[0]] = self.constant(node)
         elif node.op_type == "DequantizeLinear" and node.input[0] != self.source.input[0].name:
             self.nodes.append(helper.make_node("Identity", [node.input[0]], list(node.output)))
         else:
             self.nodes.append(node)
-
-    def _constant(self, node: onnx.NodeProto) -> None:
-        """Make the constant that `node` dequantises an input of the noise model, so that each draw can change it."""
-        self.constants[node.output[0]] = self.constant(node)
 
     def constant(self, node: onnx.NodeProto) -> tuple[F32, NDArray[np.float64]]:
         """Return (float value of the constant that `node` dequantises, largest error of each element)."""
