@@ -82,18 +82,14 @@ class Preparation:
     def into(self, picture: U8, target: NDArray[Any]) -> None:
         """Write the input for `picture` (h,w,c) into `target`, which has the network's shape."""
         fitted = self._channelled(self._fitted(picture))
-        grid = target.reshape(self._grid_shape())
+        size = self._height, self._width
+        grid = target.reshape((*size, self._channels) if self._layout == NHWC else (self._channels, *size))
         if self._is_same:
             grid[...] = fitted if self._layout == NHWC else fitted.transpose(2, 0, 1)
             return
         for channel in range(self._channels):
             plane = grid[..., channel] if self._layout == NHWC else grid[channel]
             plane[...] = self._table[:, channel].take(fitted[..., channel])
-
-    def _grid_shape(self) -> tuple[int, int, int]:
-        if self._layout == NHWC:
-            return self._height, self._width, self._channels
-        return self._channels, self._height, self._width
 
     def _channelled(self, picture: U8) -> U8:
         """Return `picture` (h,w,c) with the number of channels that the network reads."""

@@ -82,11 +82,7 @@ class Outermost:
         return np.concatenate(found) if len(found) == len(sides) else None
 
     def _project(self, vertices: F32, camera: F64, reach: F64) -> F64:
-        """Compute the clip coordinates of `vertices`, and return the error bound of each coordinate (4,).
-
-        `camera`: matrix (4,4) to clip space.
-        `reach`: reach of a vertex's sphere along each clip coordinate (4,).
-        """
+        """Compute the clip coordinates of `vertices`, and return the error bound of each coordinate (4,)."""
         np.matmul(camera[:, :3].astype(np.float32), vertices.T, out=self._flat)
         self._flat += camera[:, 3:].astype(np.float32)
         furthest = max(float(vertices.max()), -float(vertices.min()))
@@ -370,8 +366,9 @@ class MeshBounds:
         for level in self._levels:
             touching, cut = self._sort_out(level, rows, view, seen)
             rows = join(level.parts, touching if level is self._levels[-1] else np.concatenate([touching, cut]))
-        self._add_vertices(rows, view, seen)
-        self._add_triangles(join(self._levels[-1].faces, cut), view, seen)
+        corners = self._project(self._faces[join(self._levels[-1].faces, cut)].ravel(), view).reshape(-1, 3, 4)
+        for points in (self._project(rows, view), _clip_near(corners, self._standoff * view.near_norm)):
+            seen.add(*_quotients(points, np.full(len(points), self._standoff), view))
         return seen.rect()
 
     def _rect_of_whole(self, vertices: NDArray[np.float32], view: _View) -> Rect | None:
@@ -409,26 +406,12 @@ class MeshBounds:
         return rows[front][seen.widened_by(low[front], high[front])], rows[cut]
 
     def _project(self, vertices: NDArray[np.integer[Any]], view: _View, blend: bool = True) -> F64:
-        """Return the clip coordinates (N,4) of vertices.
-
-        `vertices`: indices (N,).
-        `blend`: whether to add the pose blend shapes.
-        """
+        """Return the clip coordinates (N,4) of vertices."""
         rest = self._rest[vertices]
         if blend and self._blend is not None:
             rest[:, :3] += np.einsum("naf,f->na", self._blend[vertices], view.posed.feature)
         blended = blend_matrices(self._weights[vertices], view.per_joint).reshape(-1, 4, 4)
         return np.asarray(np.einsum("nab,nb->na", blended, rest))
-
-    def _add_vertices(self, vertices: I64, view: _View, seen: _Extent) -> None:
-        points = self._project(vertices, view)
-        seen.add(*_quotients(points, np.full(len(points), self._standoff), view))
-
-    def _add_triangles(self, faces: I64, view: _View, seen: _Extent) -> None:
-        """Clip triangles to the near plane, and widen `seen` by them. `faces`: indices of triangles."""
-        corners = self._project(self._faces[faces].ravel(), view).reshape(-1, 3, 4)
-        clipped = _clip_near(corners, self._standoff * view.near_norm)
-        seen.add(*_quotients(clipped, np.full(len(clipped), self._standoff), view))
 
 
 def _reach(shaped: ShapedBody, weights: F64, levels: list[Level]) -> float:

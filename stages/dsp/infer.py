@@ -203,10 +203,8 @@ class InferStage:
         """Run each network that paints somebody in view, and return metrics.
 
         With nobody in view, transparent pictures are written. The metrics are `inferred`, the number of inferences, and
-        the
-        bytes moved. The least bytes are the networks' inputs and outputs, and their weights if these do not fit into
-        the
-        last-level cache.
+        the bytes moved. The least bytes are the networks' inputs and outputs, and their weights if these do not fit
+        into the last-level cache.
         """
         assert slot_in is not None and slot_out is not None
         pose, picture, moved = self._inputs[slot_in].header, self._outputs[slot_out].payload, self._moved
@@ -219,7 +217,10 @@ class InferStage:
         height, width = pose["tensor_shape"].tolist()
         numbers = np.unique(self._painters[is_seen]).tolist()
         for number in numbers:
-            bound = self._binding((number, (height, width), slot_in, slot_out), frame)
+            bound = self._bindings.get((number, (height, width), slot_in, slot_out))
+            if bound is None:
+                known = ", ".join(f"{h}x{w}" for h, w in self._shapes)
+                raise BadInputError(f"frame {frame}", f"tensor shape {height}x{width}", f"one of {known}")
             bound.run(moved)
             if self._copies:
                 moved.uploaded += bound.in_bytes
@@ -235,13 +236,6 @@ class InferStage:
         """Drop all sessions and bindings, because they have views of the slots."""
         self._bindings.clear()
         self._inputs = self._outputs = ()
-
-    def _binding(self, key: Key, frame: int) -> BoundPart:
-        try:
-            return self._bindings[key]
-        except KeyError:
-            shape, known = key[1], ", ".join(f"{h}x{w}" for h, w in self._shapes)
-            raise BadInputError(f"frame {frame}", f"tensor shape {shape[0]}x{shape[1]}", f"one of {known}") from None
 
 
 def build(settings: Mapping[str, Any], unit: UnitContext) -> InferStage:
