@@ -396,9 +396,7 @@ def _seeds(film: Filming) -> F64:
     lenses, turns, eyes = film.lenses[picked], film.turns[picked], film.eyes[picked]
     across = [(at - lenses[:, k, 1, None]) / lenses[:, k, 0, None] for k, at in enumerate((x, y))]
     rays = np.stack([*across, -np.ones_like(across[0])], axis=-1) @ turns.transpose(0, 2, 1)
-    extents = np.ptp(film.points, axis=1)
-    sizes = np.stack([np.hypot(extents[:, 0], extents[:, 2]), extents[:, 1]], axis=1)
-    fills = float((sizes * film.lenses[:, :, 0]).max() / 2)  # depth at which the largest bodies fill the picture
+    fills = _filling_depth(film)
     far = FARTHEST * fills + FARTHEST_OF_PATH * float(np.linalg.norm(np.ptp(film.eyes, axis=0)))
     depths = NEAREST * fills * FARTHER ** np.arange(np.log(far / (NEAREST * fills)) / np.log(FARTHER) + 1)
     points = (eyes[:, None, None] + rays[:, :, None] * depths[:, None]).reshape(-1, 3)
@@ -410,6 +408,13 @@ def _seeds(film: Filming) -> F64:
     places[:, 1] = np.minimum(places[:, 1], highest_floor(film))
     some = film.every(SEEDS_EVERY)
     return places[np.argsort(-_merits(some, PlaceJudge(some), places), kind="stable")]
+
+
+def _filling_depth(film: Filming) -> float:
+    """Return the depth, metres, at which the bodies fill the picture in height or width when they are largest."""
+    extents = np.ptp(film.points, axis=1)
+    sizes = np.stack([np.hypot(extents[:, 0], extents[:, 2]), extents[:, 1]], axis=1)
+    return float((sizes * film.lenses[:, :, 0]).max() / 2)
 
 
 def _looked_at(film: Filming) -> F64:
