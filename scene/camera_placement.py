@@ -270,10 +270,7 @@ def _placed(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Seq
 
 
 def _far(places: F64, points: F64, spec: CameraSpec) -> tuple[float, tuple[str, ...]]:
-    """Return (distance of the far clip plane, metres, that cuts off none of `points`; a note if it is increased).
-
-    `places` (N, 3): positions of the camera. `points` (F, P, 3): points of the bodies, in the same world.
-    """
+    """Return (distance of the far clip plane, metres, that cuts off none of `points`; a note if it is increased)."""
     corners = points.reshape(-1, 3)
     low, high = np.minimum(places.min(axis=0), corners.min(axis=0)), np.maximum(places.max(axis=0), corners.max(axis=0))
     needed = min(BEYOND * float(np.linalg.norm(high - low)), MAX_DEPTH_RATIO * spec.near_m)
@@ -296,9 +293,6 @@ def _from_the_middle(path: CameraPath) -> tuple[CameraPath, F64, F64]:
 
 
 def _tilt_deg(path: CameraPath, times: F64) -> float:
-    """Return the angle, degrees, by which the camera is tilted up to bring its median line of sight into SIGHT_DEG.
-
-    `times` (F,): moments of the median, seconds.
-    """
+    """Return the angle, degrees, by which the camera is tilted up to bring its median line of sight into SIGHT_DEG."""
     sight = float(np.median([np.degrees(np.arcsin(np.clip(-path.pose(float(t))[0][1, 2], -1, 1))) for t in times]))
     return float(np.clip(np.clip(sight, *SIGHT_DEG) - sight, -LARGEST_TILT_DEG, LARGEST_TILT_DEG))

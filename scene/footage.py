@@ -210,12 +210,7 @@ def filmed(path: CameraPath, footage: Footage | None, output: Shape) -> tuple[Ca
 def _over_all(
     path: CameraPath, footage: Footage, output: Shape, notes: tuple[str, ...]
 ) -> tuple[CameraPath, tuple[str, ...]]:
-    """Return (camera that filmed the whole footage, notes on the background).
-
-    The footage is a video, a picture, or pictures that are not matched to poses; the first picture's shape stands for
-    all.
-    `notes`: earlier notes. The other parameters are those of `filmed`.
-    """
+    """Return (camera that filmed the whole footage, notes on the background)."""
     camera, turn_notes = _turned(path, footage.stored[:1])
     camera = replace(camera, repeat_s=footage.period_s)
     return camera, (
@@ -231,11 +226,7 @@ def _over_all(
 
 
 def _turned(path: CameraPath, stored: tuple[Stored, ...]) -> tuple[CameraPath, tuple[str, ...]]:
-    """Return (`path` with the shape of each picture and the turns that make it fit the camera, notes).
-
-    No turns are set if all of them agree with the turns that the files state, and the path is not held.
-    `stored`: one picture for all samples of the path, or one for each.
-    """
+    """Return (`path` with the shape of each picture and the turns that make it fit the camera, notes)."""
     lenses = path.optics.lenses
     turns = tuple(
         _turn(lenses[k % len(lenses)], path.quarter, one, is_own=path.is_held) for k, one in enumerate(stored)

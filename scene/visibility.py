@@ -299,10 +299,7 @@ class PlaceJudge:
         return PlaceMerits(*np.concatenate(parts, axis=1))
 
     def _shown(self, places: F64) -> F64:
-        """Return an array (3, S) whose rows are the fields `whole`, `well` and `nearly` of `PlaceMerits`.
-
-        `places`: at most PLACES_AT_ONCE places (S, 3).
-        """
+        """Return an array (3, S) whose rows are the fields `whole`, `well` and `nearly` of `PlaceMerits`."""
         film = self._film
         turned = np.rint(facing(film, places) * (HEADINGS / (2 * np.pi))).astype(np.intp) % HEADINGS
         values = (places.astype(np.float32) @ self._along).reshape(len(places), ROWS, -1)

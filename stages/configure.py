@@ -215,9 +215,6 @@ def _accuracy(avatars: Sequence[tuple[AvatarData, int]], drawn: DrawnAs) -> dict
     """Return the result of `accuracy_of` for each avatar, by its name.
 
     If several avatars have the same name, the key also contains the folder.
-
-    `avatars`: pairs of an avatar and the number of avatars that share its tensor.
-    `drawn`: how the run draws avatars.
     """
     bundles = [(avatar.bundle, sharing) for avatar, sharing in avatars]
     names = Counter(bundle.manifest.name for bundle, _ in bundles)

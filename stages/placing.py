@@ -194,10 +194,7 @@ def _kept(
     made_from: Sequence[str],
     say: Callable[[str], None],
 ) -> tuple[Rehearsed, str]:
-    """Return (the time that each unit needs for a frame, when it was measured, UTC).
-
-    `made_from`: result of `_made_from`. `rule`: placement that suits any run.
-    """
+    """Return (the time that each unit needs for a frame, when it was measured, UTC)."""
 
     def measured() -> dict[str, NDArray[Any]]:
         say(MEASURING)

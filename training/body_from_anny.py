@@ -278,12 +278,7 @@ def _mesh_of(model: Any, shown: NDArray[np.bool_]) -> AnnyMesh:
 def _rest(
     model: Any, used: NDArray[np.int64], phenotypes: dict[str, F64], actions: dict[str, float]
 ) -> tuple[F64, F64]:
-    """Return (vertices followed by joints (B, V + 55, 3), finger ends (B, 10, 3)) in anny's rest pose; metres, Y up.
-
-    `used`: indices (V,) of the vertices to return.
-    `phenotypes`: values (B,) of B persons, by the phenotype's name.
-    `actions`: strength of each facial action, by the action's name.
-    """
+    """Return (vertices followed by joints (B, V + 55, 3), finger ends (B, 10, 3)) in anny's rest pose; metres, Y up."""
     import torch
 
     tensors = {name: torch.as_tensor(value) for name, value in phenotypes.items()}
@@ -302,10 +297,7 @@ def _y_up(points: F64) -> F64:
 
 
 def _principal_components(model: Any, used: NDArray[np.int64]) -> F64:
-    """Return the first principal components (BETAS, V + 55, 3) of random adults, scaled to one standard deviation.
-
-    `used`: indices (V,) of the vertices to return.
-    """
+    """Return the first principal components (BETAS, V + 55, 3) of random adults, scaled to one standard deviation."""
     random = np.random.default_rng(0)
     drawn = {name: random.uniform(low, high, SAMPLES) for name, (low, high) in ADULTS.items()}
     population = _rest(model, used, drawn, {})[0].reshape(SAMPLES, -1)
@@ -397,8 +389,6 @@ def _flat(hand: F64, segment: F64, finger: str) -> F64:
 
     The segment turns with the hand, and then by the smallest rotation that makes it horizontal. A segment of the thumb
     turns only with the hand.
-
-    `hand`: rotation (3, 3) of the hand. `segment`: vector (3,) along the segment. `finger`: name of the finger.
     """
     turned = hand @ segment
     return hand if finger == "thumb" else align(turned, turned - _UP * (turned @ _UP)) @ hand

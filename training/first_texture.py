@@ -250,12 +250,7 @@ def _pulled(total: F64, weight: F64) -> F64:
 
 
 def _barycentric(corners: F64, counts: Ints, x: Ints, y: Ints) -> tuple[F64, F64, F64]:
-    """Return the three barycentric weights, (N,) each, of points in their faces.
-
-    `corners`: corners (F,3,2) of the faces.
-    `counts`: (F,), number of successive points that belong to each face.
-    `x`, `y`: coordinates (N,) of the points.
-    """
+    """Return the three barycentric weights, (N,) each, of points in their faces."""
     (bx, by), (cx, cy) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
     area = np.where(counts > 0, bx * cy - cx * by, 1.0)
     px, py = x - np.repeat(corners[:, 0, 0], counts), y - np.repeat(corners[:, 0, 1], counts)

@@ -240,8 +240,6 @@ def _scenery(shape: Shape, rng: np.random.Generator) -> F32:
     """Return a random part (h,w,3) of a random scene, mirrored and with its channels in another order at random.
 
     Scenes wrap at their edges.
-
-    `shape`: (h, w).
     """
     scene = scenes()[int(rng.integers(SCENES))]
     rows, columns = ((int(rng.integers(SIDE)) + np.arange(side)) % SIDE for side in shape)

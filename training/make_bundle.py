@@ -257,10 +257,7 @@ def held_out_views(renderer: SampleRenderer, bundle: Bundle, views: int) -> list
 
 
 def _tensors(renderer: SampleRenderer, bundle: Bundle, sample: Callable[[int], Sample], wanted: int) -> Iterator[F32]:
-    """Yield `wanted` inputs (H,W,C) of the network of `bundle`, of samples with a tensor of `CALIBRATION_SHAPE`.
-
-    `sample`: function that returns sample 0, 1, 2, ...; samples with another tensor shape are skipped.
-    """
+    """Yield `wanted` inputs (H,W,C) of the network of `bundle`, of samples with a tensor of `CALIBRATION_SHAPE`."""
     levels = levels_of(bundle)
     found = (one for one in map(sample, count()) if one.crop.shape == CALIBRATION_SHAPE)
     for _, one in zip(range(wanted), found, strict=False):

@@ -86,10 +86,7 @@ def steps(
 
 
 def _step(state: TrainingState, stream: Iterator[Batch], settings: TrainingSettings, frozen: bool) -> dict[str, float]:
-    """Do one step by the mean gradient of the next batches, and return the means of their loss terms, by name.
-
-    `frozen`: whether the running statistics of batch norms stay fixed.
-    """
+    """Do one step by the mean gradient of the next batches, and return the means of their loss terms, by name."""
     options, avatar = settings.optimiser, state.avatar
     state.optimiser.zero_grad(set_to_none=True)
     sums: dict[str, float] = {}

@@ -346,10 +346,7 @@ def _ends(values: F64) -> tuple[F64, NDArray[np.bool_]]:
 
 
 def _medians(number: Ints, value: F64, weight: F64, count: int) -> tuple[F64, F64]:
-    """Return the weighted median (V,) of each vertex's values, 0 without values, and the number (V,) of values.
-
-    `number`: vertex of each value, (N,). `value`, `weight`: (N,). `count`: number V of vertices.
-    """
+    """Return the weighted median (V,) of each vertex's values, 0 without values, and the number (V,) of values."""
     order = np.lexsort((value, number))
     number, value, weight = number[order], value[order], weight[order]
     total = np.bincount(number, weights=weight, minlength=count)

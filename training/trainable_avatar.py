@@ -523,10 +523,7 @@ def _places(network: UNet) -> Iterator[str]:
 
 
 def _modules_of(tensor: str) -> tuple[str, ...]:
-    """Return the names of the places of a `ByteGrid` that store the exported `tensor`.
-
-    `tensor`: name by the exporter, such as `/a/b.0/b.0.1/Conv_output_0`.
-    """
+    """Return the names of the places of a `ByteGrid` that store the exported `tensor`."""
     if tensor in NAMED:
         return NAMED[tensor]
     name, operator = module_of(tensor), tensor.rpartition("/")[2]

@@ -242,10 +242,7 @@ def _made_with(plan: ValidationPlan, renderer: SampleRenderer) -> MadeWith:
 
 
 def _arranged(figures: Mapping[str, dict[str, Any]], runtimes: tuple[str, ...], float_network: str) -> dict[str, Any]:
-    """Return the figures of the painters under the keys of `Validation`.
-
-    `figures`: summary of each painter's errors, by the painter's name. `float_network`: name of the float network.
-    """
+    """Return the figures of the painters under the keys of `Validation`."""
     first, *others = runtimes
     own = figures[first]
     arranged: dict[str, Any] = {
@@ -351,10 +348,7 @@ def shown(image: U8, painted: Crop, seen: Crop) -> U8:
 
 
 def _read(rows: F64, painted: Crop, seen: Crop, element: int) -> F64:
-    """Return the lines of the crop `seen`, read from the lines `rows` of the crop `painted`.
-
-    `element`: row of the projection that the lines follow: 0 for columns, 1 for rows.
-    """
+    """Return the lines of the crop `seen`, read from the lines `rows` of the crop `painted`."""
     old, new = painted.projection, seen.projection
     scale = old[element, element] / new[element, element]
     shift = (old[element, 2] - scale * new[element, 2]) / old[3, 2] * (1 if element == 0 else -1)

@@ -376,10 +376,7 @@ def _along(turns: F64, places: F64) -> float:
 
 
 def _missed(turns: F64, places: F64) -> float:
-    """Return by how much lines of sight miss the point that the cameras go round, as a share of its distance.
-
-    The result is infinite if there is no such point. `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes.
-    """
+    """Return by how much lines of sight miss the point that the cameras go round, as a share of its distance."""
     point = meeting_point(turns, places) if len(turns) >= LEAST_ROWS else None
     if point is None:
         return math.inf
@@ -500,11 +497,7 @@ BODY_AXES = "forward-left-up"
 
 
 def _require_camera(path: Path, raw: RawCamera, kind: str, spec: CameraSpec) -> None:
-    """Raise BadInputError if the poses of `raw` more likely belong to a vehicle's body than to a camera.
-
-    `raw`: file of the format `kind` as its reader returned it. Nothing is checked if the scene states axes or up, or if
-    the poses of the format have OpenGL axes.
-    """
+    """Raise BadInputError if the poses of `raw` more likely belong to a vehicle's body than to a camera."""
     if spec.axes != AUTO or spec.up_axis != AUTO or kind in OPENGL_KINDS:
         return
     turns = raw.turns[np.isfinite(raw.turns).all(axis=(1, 2))]

@@ -234,11 +234,7 @@ def _plain(name: str) -> str:
 def _unit_of(
     path: Path, columns: tuple[ColumnName, ...], holding: tuple[str, ...], units: Mapping[str, float], key: str
 ) -> str:
-    """Return the unit, a key of `units`, that the columns with a content in `holding` state; "" if they state no unit.
-
-    `key`: key of the scene that states the unit instead, for messages. Raises BadInputError when a unit is unknown, or
-    when the names state different units.
-    """
+    """Return the unit, a key of `units`, that the columns with a content in `holding` state; "" if none."""
     of = [column for column in columns if column.holds in holding]
     found = [SPELLINGS.get(column.unit.lower(), column.unit) for column in of]
     for column, unit in zip(of, found, strict=True):
@@ -513,10 +509,7 @@ def _require_times(path: Path, times: F64, places: F64) -> None:
 
 
 def _worst_step(column: F64) -> float:
-    """Return the largest deviation of the steps of `column` (N,) from their median, as a share of the median.
-
-    The result is infinite if the column does not grow.
-    """
+    """Return the largest deviation of the steps of `column` (N,) from their median, as a share of the median."""
     steps = np.diff(column)
     median = float(np.median(steps))
     return float(np.abs(steps - median).max() / median) if median > 0 and np.isfinite(steps).all() else math.inf

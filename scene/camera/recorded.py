@@ -489,10 +489,7 @@ def _in_metres(raw: RawCamera, where: str, spec: CameraSpec) -> tuple[F64, Camer
 
 
 def _optics(raw: RawCamera, usable: NDArray[np.intp], quarter: int, spec: CameraSpec) -> tuple[Optics, str]:
-    """Return (lenses of the poses with the indices `usable`, source of the lenses in words).
-
-    The lenses are those of the picture after `quarter` quarter turns.
-    """
+    """Return (lenses of the poses with the indices `usable`, source of the lenses in words)."""
     if spec.fov_y_deg is not None:
         optics = one_lens(spec.fov_y_deg, spec.near_m, spec.far_m)
         return optics, f"field of view {spec.fov_y_deg:.4g} degrees high, as given"

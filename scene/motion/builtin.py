@@ -165,10 +165,7 @@ class Walker:
 
     @staticmethod
     def _pitches(old: tuple[float, float, float], new: tuple[float, float, float]) -> tuple[float, float]:
-        """Return the pitch at toe-off (heel up) and at heel strike (toes up), radians; both grow with the stride.
-
-        `old`, `new`: footprints before and after the swing.
-        """
+        """Return the pitch at toe-off (heel up) and at heel strike (toes up), radians; both grow with the stride."""
         ahead = np.array([np.sin(new[2]), np.cos(new[2])]) @ (np.array(new[:2]) - np.array(old[:2]))
         size = float(np.clip(ahead / 0.9, 0.0, 1.0))
         return 0.12 + 0.55 * size, -0.28 * size
@@ -395,10 +392,7 @@ def _route(times: F64) -> tuple[F64, F64, F64]:
 
 
 def _along_z(times: F64, start_m: float, walks: Changes, turns: Changes) -> tuple[F64, F64, F64]:
-    """Return (x, z, heading) at `times` (T,) of a route along z that begins at `start_m`, metres; x is 0.
-
-    `walks`, `turns`: tables of the changes of z, metres, and of the heading, radians.
-    """
+    """Return (x, z, heading) at `times` (T,) of a route along z that begins at `start_m`, metres; x is 0."""
     z = start_m + sum(far * _eased((times - start) / (end - start)) for start, end, far in walks)
     heading = sum(angle * smooth_step((times - start) / (end - start)) for start, end, angle in turns)
     return np.zeros_like(times), np.asarray(z), np.asarray(heading)
@@ -420,13 +414,7 @@ def _eased(x: F64) -> F64:
 def _body(
     times: F64, left: FootTrack, right: FootTrack, wave: bool = True, shift_m: F64 | float = 0.0
 ) -> tuple[F64, F64]:
-    """Return poses (T, 55, 3) and pelvis positions (T, 3) of a body on two feet.
-
-    `times` (T,): seconds in the cycle.
-    `left`, `right`: tracks of the feet.
-    `wave`: whether the right arm waves.
-    `shift_m`: shift of the pelvis to its left, metres, (T,) or one number.
-    """
+    """Return poses (T, 55, 3) and pelvis positions (T, 3) of a body on two feet. `shift_m`: shift to its left."""
     heading = blurred_heading(left, right)
     stride = blurred(_along(heading, left.ankle - right.ankle), 3)
     weight = blurred(left.load - right.load, 7)

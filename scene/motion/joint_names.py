@@ -186,10 +186,7 @@ def _missing(found: Mapping[str, int], stated: Mapping[str, int | None]) -> list
 
 
 def _stated(path: Path, names: list[str], target: str, source: str) -> int | None:
-    """Return the index of the joint whose name is `source`, or has the same `plain` name; None if `source` is "".
-
-    `target`: SMPL-X joint that `source` is to be matched to. Raises BadInputError when the file has no such joint.
-    """
+    """Return the index of the joint whose name is `source`, or has the same `plain` name; None if `source` is ""."""
     if not source:
         return None
     if source in names:

@@ -334,11 +334,7 @@ def _broken_as(poses: F64, shift: F64) -> str:
 
 
 def _up_axis(poses: F64, places: F64 | None, raw: RawMotion, stated: str) -> tuple[str, str, tuple[str, ...]]:
-    """Return (axis that is up, reason in words, a note if another axis may be up).
-
-    `poses` (T, 55, 3), `places` (T, 3): poses, and positions of the pelvis if recorded, of the usable frames.
-    `stated`: axis by the scene, or `auto`.
-    """
+    """Return (axis that is up, reason in words, a note if another axis may be up)."""
     if stated != "auto":
         return stated, "as given", ()
     mean = matrix_from_rotvec(poses[:, 0])[:, :, 1].mean(axis=0)

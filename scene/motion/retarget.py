@@ -149,10 +149,7 @@ def _leg(work: Retarget, side: str) -> None:
 
 
 def _feet(work: Retarget, up: F64) -> None:
-    """Set the rotations of the feet in `work`: along the recorded feet, but with toes and heels above the floor.
-
-    `up` (3,): up direction of the recording.
-    """
+    """Set the rotations of the feet in `work`: along the recorded feet, but with toes and heels above the floor."""
     tracks = work.tracks
     feet = [foot for side in SIDES if (foot := _recorded_foot(work, side, up)) is not None]
     planted = [foot for foot in feet if foot.planted.any()]
@@ -195,10 +192,6 @@ class _RecordedFoot:
         A foot that lies flat has the slope `ours` + `flat_by`. This slope limits how far toes may point down. If the
         ankle is higher by r, the limit's sine is larger by r / `length`, which puts the toes on the floor. A limit in
         the other direction does the same for the heel, which turns about the ankle.
-
-        `floor`: height of the ankle of a flat foot, metres.
-        `steeper`, `flat_by`: results of `_steeper`, radians.
-        `up` (3,): up direction of the recording.
         """
         if not steeper:
             return self.way
@@ -213,10 +206,7 @@ class _RecordedFoot:
 
 
 def _recorded_foot(work: Retarget, side: str, up: F64) -> _RecordedFoot | None:
-    """Return the recorded foot of a leg whose thigh and shin have rotations; None if its direction is unknown.
-
-    `side`: `left` or `right`. `up` (3,): up direction of the recording.
-    """
+    """Return the recorded foot of a leg whose thigh and shin have rotations; None if its direction is unknown."""
     way = _foot(work.tracks, side)
     if way is None:
         return None

@@ -260,11 +260,7 @@ def limb_turns(bone: F64, recorded: F64, carrier: F64, evidence: Sequence[Eviden
 
 
 def _twist(held: F64, axis: F64, laid: F64, evidence: Sequence[Evidence]) -> F64:
-    """Return the rotation (3, 3) about `axis` (3,) that brings the evidence closest to its recorded directions.
-
-    `held` (T, 3, 3): rotations before the twist. `laid` (3, 3): rotation that takes the rest bone to `axis`.
-    `evidence`: as in `limb_turns`.
-    """
+    """Return the rotation (3, 3) about `axis` (3,) that brings the evidence closest to its recorded directions."""
     cosine = sine = 0.0
     inside = transposed(held)
     for ours, theirs in evidence:

@@ -124,10 +124,7 @@ _DEFAULTS: Final = {"mean": 0.0, "sd": 1.0}
 
 
 def _each(values: Sequence[float] | None, channels: int, other: float, where: str) -> NDArray[np.float64]:
-    """Return a value for each channel (channels,).
-
-    `other`: value of all channels if `values` is None. `where`: place of the stage in its file, for errors.
-    """
+    """Return a value for each channel (channels,)."""
     given = [other] if values is None else list(values)
     if len(given) not in (1, channels):
         expected = f"1 or {channels}, one for each channel"
@@ -136,10 +133,7 @@ def _each(values: Sequence[float] | None, channels: int, other: float, where: st
 
 
 def _layout(wanted: PortType, asked: str | None, where: str) -> tuple[str, tuple[int, int, int]]:
-    """Return (layout of a network's input, (height, width, channels) of the picture in it).
-
-    `wanted`: type of the input. `asked`: layout that the file states. `where`: place of the stage in its file.
-    """
+    """Return (layout of a network's input, (height, width, channels) of the picture in it)."""
     shape = wanted.shape[-3:]
     if len(wanted.shape) not in (3, 4):
         expected = "one that reads pictures, 1xCxHxW or 1xHxWxC"

@@ -89,13 +89,7 @@ class Outermost:
         return np.asarray(8 * U * (np.abs(camera[:, :3]).sum(axis=1) * furthest + np.abs(camera[:, 3]) + reach))
 
     def _side(self, row: F32, reach: float, sign: int, slack: float) -> I64 | None:
-        """Return the indices of the vertices that may be outermost on one side; None if one may be off the screen.
-
-        `row`: clip coordinate x or y of each vertex (V,).
-        `reach`: reach of a vertex's sphere along this coordinate.
-        `sign`: 1 for the side with the lowest coordinates, -1 for the side with the highest.
-        `slack`: largest error of a quotient, twice.
-        """
+        """Return the indices of the vertices that may be outermost on one side; None if one may be off the screen."""
         scratch, least, most = self._scratch
         place = np.subtract(row, np.float32(reach), out=scratch) if sign > 0 else np.negative(row, out=scratch)
         if sign < 0:
@@ -388,8 +382,6 @@ class MeshBounds:
         """Return indices of (patches that may widen `seen`, patches that the near plane may cut).
 
         Each patch that is certainly visible widens `seen` by one point.
-
-        `rows`: indices of the patches of `level` to examine.
         """
         radius = level.size[rows] + (self._standoff + ROUNDING_M)
         radius += np.einsum("pj,j->p", level.give[rows], view.turned / np.sqrt(2.0))
@@ -434,9 +426,6 @@ def _against_near(centres: F64, radius: F64, view: _View) -> tuple[Mask, Mask]:
     """Return two masks (N,): spheres wholly in front of the near plane and of W = 0, and spheres that cross it.
 
     A sphere in neither mask is not visible.
-
-    `centres`: clip coordinates of the centres (N,4).
-    `radius`: radius of each sphere (N,), metres.
     """
     near, far = centres[:, 3] + centres[:, 2], centres[:, 3] - centres[:, 2]
     within = far + radius * view.far_norm >= 0.0
@@ -449,9 +438,6 @@ def _quotients(points: F64, radius: F64, view: _View) -> tuple[F64, F64]:
 
     X, Y and W are linear in the point. Therefore each varies over a sphere by the radius times the norm of its matrix
     row.
-
-    `points`: clip coordinates of the centres (N,4).
-    `radius`: radius of each sphere (N,), metres.
     """
     reach = radius[:, None] * view.norms[:2]
     least = np.maximum(points[:, 3] - radius * view.norms[3], W_LEAST)[:, None]
@@ -461,11 +447,7 @@ def _quotients(points: F64, radius: F64, view: _View) -> tuple[F64, F64]:
 
 
 def _clip_near(triangles: F64, slack: float) -> F64:
-    """Return the clip coordinates (N,4) of corners in front of the near plane, and of points where edges cross it.
-
-    `triangles`: clip coordinates of the corners (F,3,4).
-    `slack`: distance by which the near plane is moved towards the camera, in clip coordinates.
-    """
+    """Return the clip coordinates (N,4) of corners in front of the near plane, and of points where edges cross it."""
     near = triangles[:, :, 2] + triangles[:, :, 3] + slack
     points = [triangles[near > 0.0]]
     for a, b in ((0, 1), (1, 2), (2, 0)):

@@ -344,11 +344,7 @@ class PoseStage:
         self._moved.least += sampled + packet.nbytes
 
     def _view(self, t_s: float, moved: Sequence[tuple[F64, F64]]) -> F64:
-        """Return the matrix (4,4) from world to camera: the scene's camera, steered about the first avatar.
-
-        `t_s`: time in the scene, seconds.
-        `moved`: (pose, place) of each avatar.
-        """
+        """Return the matrix (4,4) from world to camera: the scene's camera, steered about the first avatar."""
         view = self._camera.sample(t_s)
         if self._window is None:
             return view
@@ -372,11 +368,7 @@ class PoseStage:
         return self._made[work].shown if work in self._made else None
 
     def _make(self, slot_out: int, frame: int, view: F64, projection: F64, moved: Sequence[tuple[F64, F64]]) -> bool:
-        """Fill the header of slot `slot_out` with camera and avatars, and return whether an avatar is visible.
-
-        `view`, `projection`: matrices (4,4) of `frame`.
-        `moved`: (pose, place) of each avatar in `frame`.
-        """
+        """Fill the header of slot `slot_out` with camera and avatars, and return whether an avatar is visible."""
         packet = self._slots[slot_out]
         packet["avatar_count"] = len(self._actors)
         packet["view"], packet["projection"] = view, projection
@@ -395,8 +387,6 @@ class PoseStage:
         """Set crop rectangles, `tensor_rect`s and the tensor's shape in the header `packet`.
 
         With nobody in view, the tensor has the smallest shape.
-
-        `seen`: pairs of an avatar's part of the header and its place on the screen.
         """
         if not seen:
             packet["tensor_shape"] = min(self._buckets, key=lambda shape: shape[0] * shape[1])
@@ -436,12 +426,6 @@ class PoseStage:
 
         An avatar that is far off the screen is not posed. An avatar that the last computed frame did not show is first
         searched by its patches, before it is skinned.
-
-        `actor`: body, motion and place of the avatar.
-        `avatar`: the avatar's part of the header.
-        `vertices`: array for its skinned vertices; None if the GPU unit skins.
-        `moved`: (pose, place) of each avatar.
-        `clip`: projection @ view (4,4).
         """
         pose, translation = moved[actor.index]
         avatar["avatar"], avatar["visible"] = actor.index, False

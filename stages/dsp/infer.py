@@ -191,10 +191,7 @@ class InferStage:
         return bindings
 
     def _own(self, packet: Packet, number: int, channels: int) -> U8:
-        """Return the part of a slot that belongs to network `number`; the whole slot for an only network.
-
-        `channels`: channels of a pixel in this slot.
-        """
+        """Return the part of a slot that belongs to network `number`; the whole slot for an only network."""
         if len(self._networks) == 1:
             return packet.payload
         return network_parts(packet.payload, len(self._networks), self._shapes, channels)[number]
@@ -247,10 +244,7 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> InferStage:
 
 
 def _bound(session: Session, part: NetworkPart, source: U8, target: U8, weights: int) -> BoundPart:
-    """Return `part`, bound to the slots `source` and `target`.
-
-    `weights`: number of bytes of the part's weights that each run reads from memory.
-    """
+    """Return `part`, bound to the slots `source` and `target`."""
     given, handed_on = views(source, part.crossing_in), views(target, part.crossing_out)
     inputs, outputs = [given[name] for name in part.inputs], [handed_on[name] for name in part.outputs]
     passed = [(given[name], handed_on[name]) for name in handed_on if name not in part.outputs]

@@ -344,10 +344,7 @@ class SkinnedMesh(Mesh):
 
 
 def _layout(arrays: MeshArrays, with_source: bool) -> tuple[list[str], list[str], list[NDArray[Any]]]:
-    """Return (names, formats, columns) of the interleaved vertex buffer; the formats are moderngl's.
-
-    `with_source`: whether each vertex has the index of the body's vertex.
-    """
+    """Return (names, formats, columns) of the interleaved vertex buffer; the formats are moderngl's."""
     columns: dict[str, tuple[str, NDArray[Any]]] = {"position": ("3f", arrays.position), "uv": ("2f", arrays.uv)}
     columns |= {name: (f"{values.shape[1]}f", values) for name, values in arrays.surface.items()}
     for group in range(arrays.weights_per_vertex // 4):

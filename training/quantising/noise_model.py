@@ -191,10 +191,6 @@ class NoiseGraph:
         """Add nodes for `y` = (round(`x` / step + offset) - offset) step, which has an error of at most ½ step.
 
         A value that is exactly 0, or at an end of the range or beyond, is only clipped.
-
-        `x`, `y`: names of the tensor before and after rounding.
-        `step`: step of the stored tensor, as a real number.
-        `ends`: names of the constants (lower end, upper end) of the range.
         """
         step_name, none = self._limit(f"{y}.step", step), self._limit(f"{y}.none", 0.0)
         offset = f"{y}.offset"

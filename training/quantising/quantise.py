@@ -167,10 +167,7 @@ def _measured(model: onnx.ModelProto, frames: Sequence[F32], method: str) -> tup
 
 
 def _calibrated(model: onnx.ModelProto, ranges: Any, reduce_range: bool, keep_float: Sequence[str]) -> _Calibrated:
-    """Return `model` rounded so that all runtimes round alike; if this is impossible, `model` with measured ranges.
-
-    `ranges`: measured ranges, ONNX Runtime's TensorsData. `reduce_range`, `keep_float`: as for `quantise`.
-    """
+    """Return `model` rounded so that all runtimes round alike; if this is impossible, `model` with measured ranges."""
     if not keep_float and may_round_alike(model):
         rounded, widened = copy.deepcopy(model), copy.deepcopy(ranges)
         power_of_two_ranges(rounded, widened)
@@ -373,11 +370,7 @@ def replace_ends_by_bytes(model: onnx.ModelProto) -> None:
 
 
 def _nhwc_to_real(inner: list[onnx.NodeProto], source: str, quantised: str) -> list[onnx.NodeProto]:
-    """Return nodes that dequantise and transpose the input, and make the other nodes read their output.
-
-    `inner`: other nodes of the graph; those that dequantise the tensor `quantised` are removed.
-    `source`: name of the input.
-    """
+    """Return nodes that dequantise and transpose the input, and make the other nodes read their output."""
     readers = [node for node in inner if quantised in node.input]
     scale, zero_point = readers[0].input[1:3]
     nchw = readers[0].output[0]
