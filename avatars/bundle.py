@@ -118,7 +118,10 @@ def read_texture(path: Path, channels: int) -> NDArray[np.float32]:
     arrays = read_npz(path, TEXTURE_KEYS, "a neural texture")
     if "texture" not in arrays:
         raise BadInputError(path, "no array 'texture'", "a neural texture")
-    return _decode_texture(arrays["texture"], arrays.get("scale"), path, channels)
+    shape = arrays["texture"].shape
+    if len(shape) != 3 or min(shape[:2]) < 2 or max(shape[:2]) > MAX_SIDE or shape[2] != channels:
+        raise BadInputError(path, f"a texture of shape {shape}", f"(H, W, {channels}) with sides of 2 to {MAX_SIDE}")
+    return _decoded(arrays["texture"], arrays.get("scale"), path)
 
 
 def bundle_folder(name: str | Path) -> Path:
@@ -198,7 +201,9 @@ def write_bundle(
         arrays |= {} if levels is None else {"levels": levels}
         np.savez_compressed(draft / manifest.texture, **arrays)
         onnx.save(network.model, draft / manifest.network.file)
-        (draft / MANIFEST).write_bytes(_content(_with_own_validation(manifest, draft)))
+        if manifest.validation is not None and manifest.validation.digests != digests_of(draft, manifest):
+            manifest = manifest.model_copy(update={"validation": None})
+        (draft / MANIFEST).write_bytes(_content(manifest))
         bundle = load_bundle(draft)
         bundle.read_mesh_levels(bundle.shaped_body())
         bundle.read_texture()
@@ -235,13 +240,6 @@ def _content(manifest: Manifest) -> bytes:
     return (manifest.model_dump_json(indent=1) + "\n").encode()
 
 
-def _with_own_validation(manifest: Manifest, folder: Path) -> Manifest:
-    """Return `manifest`; its validation is left out if it was made with other files than those in `folder`."""
-    validation = manifest.validation
-    own = validation is not None and validation.digests == digests_of(folder, manifest)
-    return manifest if own else manifest.model_copy(update={"validation": None})
-
-
 def _check_inside(folder: Path, file: str, where: str) -> None:
     resolved = (folder / file).resolve()
     if folder.resolve() not in resolved.parents:
@@ -257,13 +255,6 @@ def _check_same(of_file: Affine, expected: ByteRange, where: str) -> None:
             f"scale {of_file.scale:g}, zero point {of_file.zero_point}",
             f"scale {expected.scale:g}, zero point {expected.zero_point} by the manifest",
         )
-
-
-def _decode_texture(texture: NDArray[Any], scale: Any, path: Path, channels: int) -> NDArray[np.float32]:
-    shape = texture.shape
-    if len(shape) != 3 or min(shape[:2]) < 2 or max(shape[:2]) > MAX_SIDE or shape[2] != channels:
-        raise BadInputError(path, f"a texture of shape {shape}", f"(H, W, {channels}) with sides of 2 to {MAX_SIDE}")
-    return _decoded(texture, scale, path)
 
 
 def _decoded(texture: NDArray[Any], scale: Any, path: Path) -> NDArray[np.float32]:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -153,7 +153,10 @@ ZERO_POINT_TYPES = {
 
 def check_network(model: onnx.ModelProto, where: str) -> NetworkFile:
     """Return `model` as a checked network. Raises BadInputError, which names `where` and the wrong node."""
-    _check_operators(model, where)
+    for node in model.graph.node:
+        if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
+            name = f"{node.domain}:{node.op_type}" if node.domain else node.op_type
+            raise BadInputError(where, f"operator {name} in node {node_name(node)!r}", "operators a DSP has")
     shape = _check_input(model, where)
     _check_output(model, where, shape)
     graph = model.graph
@@ -164,13 +167,6 @@ def check_network(model: onnx.ModelProto, where: str) -> NetworkFile:
     first = _reader_of(graph, graph.input[0].name, "DequantizeLinear", where)
     last = _maker_of(graph, graph.output[0].name, "QuantizeLinear", where)
     return NetworkFile(where, model, shape, _affine(first, constants, where), _affine(last, constants, where))
-
-
-def _check_operators(model: onnx.ModelProto, where: str) -> None:
-    for node in model.graph.node:
-        if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
-            name = f"{node.domain}:{node.op_type}" if node.domain else node.op_type
-            raise BadInputError(where, f"operator {name} in node {node_name(node)!r}", "operators a DSP has")
 
 
 def _check_input(model: onnx.ModelProto, where: str) -> tuple[int, int, int, int]:
@@ -336,7 +332,14 @@ def read_network(path: Path) -> NetworkFile:
 def parse_network(path: Path) -> onnx.ModelProto:
     """Return the unchecked ONNX model in a file, with its external data. Raises BadInputError if this fails."""
     model = _parse(path)
-    _load_external(model, path)
+    for tensor in _external_tensors(model):
+        file = _external_file(tensor, path)
+        try:
+            external_data_helper.load_external_data_for_tensor(tensor, str(path.parent.resolve()))
+        except (OSError, ValueError, onnx.checker.ValidationError) as error:
+            raise BadInputError(path, f"tensor {tensor.name!r} in {file}: {reason(error)}", "readable data") from error
+        tensor.data_location = TensorProto.DEFAULT
+        del tensor.external_data[:]
     return model
 
 
@@ -367,17 +370,6 @@ def _parse(path: Path) -> onnx.ModelProto:
     return model
 
 
-def _load_external(model: onnx.ModelProto, path: Path) -> None:
-    for tensor in _external_tensors(model):
-        file = _external_file(tensor, path)
-        try:
-            external_data_helper.load_external_data_for_tensor(tensor, str(path.parent.resolve()))
-        except (OSError, ValueError, onnx.checker.ValidationError) as error:
-            raise BadInputError(path, f"tensor {tensor.name!r} in {file}: {reason(error)}", "readable data") from error
-        tensor.data_location = TensorProto.DEFAULT
-        del tensor.external_data[:]
-
-
 def _external_file(tensor: TensorProto, path: Path) -> Path:
     """Return the file with the external data of `tensor`. `path`: file of the network.
 
@@ -394,13 +386,7 @@ def _external_file(tensor: TensorProto, path: Path) -> Path:
 
 
 def _external_tensors(model: onnx.ModelProto) -> list[TensorProto]:
-    return [tensor for tensor in _tensors(model) if tensor.data_location == TensorProto.EXTERNAL]
-
-
-def _tensors(model: onnx.ModelProto) -> Iterator[TensorProto]:
-    yield from model.graph.initializer
-    for node in model.graph.node:
-        for attribute in node.attribute:
-            if attribute.HasField("t"):
-                yield attribute.t
-            yield from attribute.tensors
+    attributes = [attribute for node in model.graph.node for attribute in node.attribute]
+    of_nodes = (tensor for one in attributes for tensor in (*([one.t] if one.HasField("t") else ()), *one.tensors))
+    tensors = (*model.graph.initializer, *of_nodes)
+    return [tensor for tensor in tensors if tensor.data_location == TensorProto.EXTERNAL]

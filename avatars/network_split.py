@@ -94,10 +94,7 @@ def split(network: NetworkFile, at: Sequence[str]) -> list[NetworkPart]:
 
 
 def _crossing(graph: onnx.GraphProto, nodes: int) -> Shapes | None:
-    """Return the shape of each tensor that crosses a cut, by name; None if any of these tensors is not uint8.
-
-    `nodes`: number of the graph's nodes before the cut.
-    """
+    """Return the shape of each tensor that crosses a cut, by name; None if any of these tensors is not uint8."""
     makers = {name: node for node in graph.node[:nodes] for name in node.output}
     names = []
     for node in graph.node[nodes:]:

@@ -160,13 +160,7 @@ def _drawn_otherwise(validation: Validation, drawn: DrawnAs) -> str:
 
 
 def _no_figures(bundle: Bundle, changed: Sequence[str], why: str, how: str = "", remark: str = "") -> dict[str, Any]:
-    """Return the keys of `refused`. Their `why` ends with the command that measures the figures.
-
-    `changed`: keys of `PARTS` that were changed since the validation.
-    `why`: reason.
-    `how`: options of the command.
-    `remark`: words after the command.
-    """
+    """Return the keys of `refused`. Their `why` ends with the command that measures the figures."""
     command = f"{VALIDATE} {shlex.quote(name_of(bundle.folder))}{how}"
     return {"source": NO_FIGURES, "changed": list(changed), "why": f"{why}; `{command}` measures it{remark}"}
 

@@ -24,7 +24,6 @@ from trilane.arrays import F32, F64, I32, Ints
 from trilane.body.joints import JOINTS, LEFT_HAND, POSE_FEATURES, POSE_SIZE, RIGHT_HAND
 from trilane.errors import BadInputError
 from trilane.files import DAMAGED, npz_names, read_header, read_npz
-from trilane.unexpected_value import UnexpectedValue
 
 #: Range of heights from sole to crown, metres: from less than a newborn child's to more than any adult's.
 LEAST_HEIGHT_M, MOST_HEIGHT_M = 0.3, 3.0
@@ -32,15 +31,8 @@ USUAL_HEIGHT_M = 1.7
 UNITS_M = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "feet": 0.3048, "decimetres": 0.1}
 
 
-def check_height(height: float) -> None:
-    """Raise UnexpectedValue if `height`, metres, is not a person's. The remedy names the unit that would explain it."""
-    if LEAST_HEIGHT_M <= height <= MOST_HEIGHT_M:
-        return
-    found = f"a body {height:.4g} m high, along Y at rest"
-    raise UnexpectedValue(found, f"{LEAST_HEIGHT_M:g} to {MOST_HEIGHT_M:g} m", _height_remedy(height))
-
-
 def _height_remedy(height: float) -> str:
+    """Return how to fix a body of the wrong `height`, metres: by the unit that would explain it, if any."""
     fitting = {name: unit for name, unit in UNITS_M.items() if LEAST_HEIGHT_M <= height * unit <= MOST_HEIGHT_M}
     if not fitting:
         return "give its places in metres, Y up"
@@ -70,8 +62,14 @@ def read_pose_blend(path: Path, shape: tuple[int, int, int]) -> NDArray[np.float
 
 
 def _read_pose_blend(where: str, file: IO[bytes], shape: tuple[int, int, int]) -> NDArray[np.float32] | None:
-    dtype, order = _check_pose_blend_header(where, file, shape)
+    stored_shape, fortran, dtype = read_header(where, file)
+    if dtype.kind not in "fiu":
+        raise BadInputError(where, f"dtype {dtype}", "numbers")
+    if stored_shape != shape:
+        raise BadInputError(where, f"shape {stored_shape}", str(shape))
     count = math.prod(shape)
+    if count * dtype.itemsize > MAX_POSE_BLEND_BYTES:
+        raise BadInputError(where, f"shape {stored_shape} of {dtype}", f"at most {MAX_POSE_BLEND_BYTES} bytes")
     flat: NDArray[np.float32] | None = None
     for start in range(0, count, _CHUNK_ITEMS):
         items = min(_CHUNK_ITEMS, count - start)
@@ -89,20 +87,9 @@ def _read_pose_blend(where: str, file: IO[bytes], shape: tuple[int, int, int]) -
             raise BadInputError(where, "NaN or infinity", "finite numbers")
     if flat is None:
         return None
-    array = np.ascontiguousarray(flat.reshape(shape, order=order))
+    array = np.ascontiguousarray(flat.reshape(shape, order="F" if fortran else "C"))
     array.flags.writeable = False
     return array
-
-
-def _check_pose_blend_header(where: str, file: IO[bytes], shape: tuple[int, int, int]) -> tuple[np.dtype[Any], Any]:
-    stored_shape, fortran, dtype = read_header(where, file)
-    if dtype.kind not in "fiu":
-        raise BadInputError(where, f"dtype {dtype}", "numbers")
-    if stored_shape != shape:
-        raise BadInputError(where, f"shape {stored_shape}", str(shape))
-    if math.prod(shape) * dtype.itemsize > MAX_POSE_BLEND_BYTES:
-        raise BadInputError(where, f"shape {stored_shape} of {dtype}", f"at most {MAX_POSE_BLEND_BYTES} bytes")
-    return dtype, "F" if fortran else "C"
 
 
 EXPECTED = "a body file in the SMPL-X layout (.npz)"
@@ -286,10 +273,10 @@ def load_body(path: Path) -> Body:
     weights = weights_of_one(weights)
     shape_dirs, expression_dirs = _split_shape(path, _floats(path, arrays, "shapedirs"))
     template = _floats(path, arrays, "v_template")
-    try:
-        check_height(float(np.ptp(template[:, 1])))
-    except UnexpectedValue as error:
-        raise BadInputError.at(f"{path}[v_template]", error) from None
+    height = float(np.ptp(template[:, 1]))
+    if not LEAST_HEIGHT_M <= height <= MOST_HEIGHT_M:
+        found, expected = f"a body {height:.4g} m high, along Y at rest", f"{LEAST_HEIGHT_M:g} to {MOST_HEIGHT_M:g} m"
+        raise BadInputError(f"{path}[v_template]", found, expected, _height_remedy(height))
     return Body(
         source=str(path),
         v_template=template,
@@ -326,7 +313,7 @@ def _check_layout(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
                 if isinstance(side, str):
                     sizes.setdefault(side, size)
         wanted = tuple(sizes.get(str(side), side) if side != "*" else "*" for side in sides)
-        if not _matches(array.shape, wanted):
+        if len(array.shape) != len(wanted) or any(b not in ("*", a) for a, b in zip(array.shape, wanted, strict=True)):
             raise BadInputError(f"{path}[{key}]", f"shape {array.shape}", f"({', '.join(map(str, wanted))})")
     for side, limit in _LIMITS.items():
         if not 0 < sizes[side] <= limit:
@@ -339,10 +326,6 @@ def _instead_of_body(names: Collection[str]) -> str:
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
     motion = ": a motion, which `trilane run --motion` takes" if MOTION_KEYS & set(names) else ""
     return f"{listed}{more}{motion}"
-
-
-def _matches(shape: tuple[int, ...], wanted: tuple[int | str, ...]) -> bool:
-    return len(shape) == len(wanted) and all(b in ("*", a) for a, b in zip(shape, wanted, strict=True))
 
 
 def _floats(path: Path, arrays: dict[str, NDArray[Any]], key: str) -> F32:

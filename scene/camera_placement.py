@@ -63,11 +63,6 @@ class Way:
         return np.asarray(self.places[i] + (self.places[j] - self.places[i]) * fraction)
 
 
-def way_cycle_s(mover: Mover) -> float:
-    """Return the time, seconds, after which the way of `mover` repeats; if it does not repeat, the motion's length."""
-    return mover.motion.duration_s * (2 if mover.motion.wrap is Wrap.BOUNCE else 1)
-
-
 def way_of(mover: Mover, body: ShapedBody) -> Way:
     """Return the smoothed way of the pelvis of `mover`, whose body is `body`."""
     motion = mover.motion
@@ -194,12 +189,10 @@ def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies
     `scene`: its background, picture size and camera keys are used.
     `movers`: avatars of the scene. `bodies`: their bodies, in the same order.
     """
-    camera = PlacedCamera(path, np.eye(3), np.zeros(3), np.eye(3), ())
-    if scene.camera.place == "none":
-        return camera
-    if path.recorded:
+    if path.recorded and scene.camera.place == "auto":
         return _placed(path, scene, movers, bodies)
-    return _going_along(camera, scene, movers, bodies)
+    camera = PlacedCamera(path, np.eye(3), np.zeros(3), np.eye(3), ())
+    return camera if scene.camera.place == "none" else _going_along(camera, scene, movers, bodies)
 
 
 def _going_along(
@@ -237,8 +230,11 @@ def _judged(path: CameraPath, movers: Sequence[Mover], ways: Sequence[Way]) -> F
     The moments cover one cycle, and contain the moment at which each way is farthest from the origin. If a motion holds
     its end, one cycle of the camera after that end is covered too.
     """
-    after = [path.duration_s if mover.motion.wrap is Wrap.HOLD else 0.0 for mover in movers]
-    cycles = (way_cycle_s(mover) + more for mover, more in zip(movers, after, strict=True))
+    times = {Wrap.BOUNCE: 2, Wrap.LOOP: 1, Wrap.HOLD: 1}
+    cycles = (
+        mover.motion.duration_s * times[mover.motion.wrap] + path.duration_s * (mover.motion.wrap is Wrap.HOLD)
+        for mover in movers
+    )
     cycle_s = max(path.duration_s, JUDGED_EVERY_S, *cycles)
     even = np.arange(0.0, cycle_s, max(JUDGED_EVERY_S, cycle_s / MOST_JUDGED))
     farthest = [way.times_s[np.linalg.norm(way.places, axis=1).argmax()] for way in ways]
@@ -274,10 +270,7 @@ def _placed(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Seq
 
 
 def _far(places: F64, points: F64, spec: CameraSpec) -> tuple[float, tuple[str, ...]]:
-    """Return (distance of the far clip plane, metres, that cuts off none of `points`; a note if it is increased).
-
-    `places` (N, 3): positions of the camera. `points` (F, P, 3): points of the bodies, in the same world.
-    """
+    """Return (distance of the far clip plane, metres, that cuts off none of `points`; a note if it is increased)."""
     corners = points.reshape(-1, 3)
     low, high = np.minimum(places.min(axis=0), corners.min(axis=0)), np.maximum(places.max(axis=0), corners.max(axis=0))
     needed = min(BEYOND * float(np.linalg.norm(high - low)), MAX_DEPTH_RATIO * spec.near_m)
@@ -300,9 +293,6 @@ def _from_the_middle(path: CameraPath) -> tuple[CameraPath, F64, F64]:
 
 
 def _tilt_deg(path: CameraPath, times: F64) -> float:
-    """Return the angle, degrees, by which the camera is tilted up to bring its median line of sight into SIGHT_DEG.
-
-    `times` (F,): moments of the median, seconds.
-    """
+    """Return the angle, degrees, by which the camera is tilted up to bring its median line of sight into SIGHT_DEG."""
     sight = float(np.median([np.degrees(np.arcsin(np.clip(-path.pose(float(t))[0][1, 2], -1, 1))) for t in times]))
     return float(np.clip(np.clip(sight, *SIGHT_DEG) - sight, -LARGEST_TILT_DEG, LARGEST_TILT_DEG))

@@ -76,7 +76,15 @@ def film_of(names: Sequence[str], fps: float) -> Film:
     """
     clock = _clock(names)
     if clock:
-        return _film_by_clock(clock)
+        times = tuple(time - clock[0] for time in clock)
+        steps = sorted(later - earlier for earlier, later in pairwise(times))
+        usual = median(steps)
+        rate = [f"{1 / usual:.4g}/s by the times that are their names"]
+        gaps = sum(step > GAP * usual for step in steps)
+        if gaps:
+            longest = f"{gaps} gap{'s' * (gaps > 1)}, the longest {1000 * steps[-1]:.0f} ms"
+            rate.append(f"{longest}: the picture before is held")
+        return Film(times, times[-1] + usual, tuple(rate), clock[0])
     numbers = _numbers(names)
     step = _step(numbers)
     frames = [(number - numbers[0]) // step for number in numbers] if step else list(range(len(names)))
@@ -96,17 +104,6 @@ def _clock(names: Sequence[str]) -> list[float]:
         if len(times) == len(stems) > 1 and EARLIEST_S < times[0] < times[-1] < LATEST_S:
             return times if all(earlier < later for earlier, later in pairwise(times)) else []
     return []
-
-
-def _film_by_clock(clock: Sequence[float]) -> Film:
-    times = tuple(time - clock[0] for time in clock)
-    steps = sorted(later - earlier for earlier, later in pairwise(times))
-    usual = median(steps)
-    rate = [f"{1 / usual:.4g}/s by the times that are their names"]
-    gaps = sum(step > GAP * usual for step in steps)
-    if gaps:
-        rate.append(f"{gaps} gap{'s' * (gaps > 1)}, the longest {1000 * steps[-1]:.0f} ms: the picture before is held")
-    return Film(times, times[-1] + usual, tuple(rate), clock[0])
 
 
 def _numbers(names: Sequence[str]) -> list[int]:
@@ -213,12 +210,7 @@ def filmed(path: CameraPath, footage: Footage | None, output: Shape) -> tuple[Ca
 def _over_all(
     path: CameraPath, footage: Footage, output: Shape, notes: tuple[str, ...]
 ) -> tuple[CameraPath, tuple[str, ...]]:
-    """Return (camera that filmed the whole footage, notes on the background).
-
-    The footage is a video, a picture, or pictures that are not matched to poses; the first picture's shape stands for
-    all.
-    `notes`: earlier notes. The other parameters are those of `filmed`.
-    """
+    """Return (camera that filmed the whole footage, notes on the background)."""
     camera, turn_notes = _turned(path, footage.stored[:1])
     camera = replace(camera, repeat_s=footage.period_s)
     return camera, (
@@ -234,11 +226,7 @@ def _over_all(
 
 
 def _turned(path: CameraPath, stored: tuple[Stored, ...]) -> tuple[CameraPath, tuple[str, ...]]:
-    """Return (`path` with the shape of each picture and the turns that make it fit the camera, notes).
-
-    No turns are set if all of them agree with the turns that the files state, and the path is not held.
-    `stored`: one picture for all samples of the path, or one for each.
-    """
+    """Return (`path` with the shape of each picture and the turns that make it fit the camera, notes)."""
     lenses = path.optics.lenses
     turns = tuple(
         _turn(lenses[k % len(lenses)], path.quarter, one, is_own=path.is_held) for k, one in enumerate(stored)

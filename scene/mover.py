@@ -121,11 +121,6 @@ def ground_rule(motion: Motion, ground: Ground) -> Rule:
     return "sequence" if motion.stance is None else "stance"
 
 
-def _sample_count(motion: Motion, rule: Rule) -> int:
-    dense = int(motion.duration_s * SAMPLES_PER_S) + 1
-    return min(max(len(motion.times_s), dense), MAX_SAMPLES[rule])
-
-
 def floor_lift(
     motion: Motion, skeleton: Skeleton, shape: BodyOutline, shift: F64, scale: float, rule: Rule, soles: BodyOutline
 ) -> tuple[F64, F64]:
@@ -140,32 +135,24 @@ def floor_lift(
     """
     if rule == "none":
         return np.zeros(1), np.zeros(1)
-    times_s = np.linspace(0.0, motion.duration_s, _sample_count(motion, rule))
+    dense = int(motion.duration_s * SAMPLES_PER_S) + 1
+    times_s = np.linspace(0.0, motion.duration_s, min(max(len(motion.times_s), dense), MAX_SAMPLES[rule]))
     poses, pelvises = motion.sample_all(times_s)
-    rows = [
+    heights = np.stack([
         # Copied, because the skeleton writes its next pose to the same buffer.
         skeleton.pose(pose, pelvis * scale + shift).matrices[:, 1].copy()
         for pose, pelvis in zip(poses, pelvises, strict=True)
-    ]
-    heights = np.stack(rows)
+    ])  # fmt: skip
     lowest = shape.lowest(heights)
     if rule == "frame":
         return times_s, -lowest
-    if rule == "stance" and motion.stance is not None:
-        stance = np.interp(times_s, motion.times_s, motion.stance)
-        return times_s, _lift_of_feet(soles.lowest(heights), lowest, stance)
-    return np.zeros(1), np.array([-np.percentile(lowest, LOWEST_PERCENTILE)])
-
-
-def _lift_of_feet(feet: F64, lowest: F64, stance: F64) -> F64:
-    """Return the lift (L,), metres, for the rule `stance`.
-
-    `feet`, `lowest` (L,): heights of the feet's and of the body's lowest point, metres. `stance` (L,): how much the
-    feet stand, 0 to 1.
-    """
-    usual = -float(np.average(feet, weights=stance)) if stance.any() else -np.percentile(lowest, LOWEST_PERCENTILE)
-    lift = usual + stance * (-feet - usual)
-    return np.maximum(lift, -lowest - DEEPEST_M)
+    usual = -float(np.percentile(lowest, LOWEST_PERCENTILE))
+    if rule != "stance" or motion.stance is None:
+        return np.zeros(1), np.array([usual])
+    stance, on_soles = np.interp(times_s, motion.times_s, motion.stance), soles.lowest(heights)
+    if stance.any():
+        usual = -float(np.average(on_soles, weights=stance))
+    return times_s, np.maximum(usual + stance * (-on_soles - usual), -lowest - DEEPEST_M)
 
 
 @dataclass(frozen=True)

@@ -297,11 +297,7 @@ def foreseen_changes(
 def _cheapest_way(
     shape: Shape, costs: Mapping[Shape, float], fits: Mapping[Shape, DenseLayout], price: float
 ) -> tuple[float, Shape]:
-    """Return the cost of the cheapest sequence that ends with `shape`, and the shape before `shape` in it.
-
-    `costs`: cost of the cheapest sequence that ends with each shape at the look before.
-    `fits`: layout in each shape. `price`: cost of a change of shape at the same density.
-    """
+    """Return the cost of the cheapest sequence that ends with `shape`, and the shape before `shape` in it."""
 
     def change(origin: Shape) -> float:
         if origin == shape:
@@ -415,10 +411,7 @@ def serves(shape: Shape, demand: Demand) -> bool:
 
 
 def _next(frames: Mapping[Demand, int], chosen: Sequence[Shape]) -> Shape | None:
-    """Return the shape to add to `chosen`; None if no further shape is worth it.
-
-    `frames`: number of frames with each demand.
-    """
+    """Return the shape to add to `chosen`; None if no further shape is worth it."""
     candidates = sorted({demand.ideal for demand in frames} - set(chosen))
     if not candidates:
         return None

@@ -80,7 +80,8 @@ def usable_samples(
     timed = readable & np.isfinite(times_s)
     broken = int(len(times_s) - timed.sum())
     indices = np.flatnonzero(timed)
-    increasing = indices[_strictly_increasing(times_s[indices])]
+    highest = np.maximum.accumulate(times_s[indices])
+    increasing = indices[np.diff(highest, prepend=-np.inf) > 0]
     late = len(indices) - len(increasing)
     first = f" (first: {place_of(int(np.flatnonzero(~timed)[0]))})" if broken else ""
     if not len(increasing) or 2 * len(increasing) < len(times_s):
@@ -95,14 +96,6 @@ def usable_samples(
     if late:
         notes.append(f"{late} samples with repeated or decreasing times left out")
     return increasing, (*notes, *_gap_notes(times_s[increasing]))
-
-
-def _strictly_increasing(times_s: F64) -> NDArray[np.bool_]:
-    """Return a mask (T,) of the times that are later than all times before them."""
-    highest = np.maximum.accumulate(times_s)
-    later = np.ones(len(times_s), dtype=bool)
-    later[1:] = times_s[1:] > highest[:-1]
-    return later
 
 
 def _gap_notes(times_s: F64) -> tuple[str, ...]:

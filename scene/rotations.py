@@ -148,16 +148,8 @@ def shortest_turn(source: ArrayLike, target: ArrayLike, fallback: ArrayLike = (1
     axis = np.cross(a, b)
     sine = float(np.linalg.norm(axis))
     if sine < 1e-9:
-        axis = _perpendicular_to(a, np.asarray(fallback, dtype=np.float64))
+        axis = np.asarray(fallback, dtype=np.float64)
+        axis = axis - (axis @ a) * a
+        if np.linalg.norm(axis) <= 1e-6:
+            axis = np.cross(a, np.eye(3)[np.abs(a).argmin()])
     return matrix_from_rotvec(normalised(axis) * np.arctan2(sine, a @ b))
-
-
-def _perpendicular_to(unit: F64, preferred: F64) -> F64:
-    """Return the part of `preferred` (3,) perpendicular to `unit` (3,).
-
-    If this part is 0, return any direction perpendicular to `unit`.
-    """
-    side = preferred - (preferred @ unit) * unit
-    if np.linalg.norm(side) > 1e-6:
-        return np.asarray(side)
-    return np.cross(unit, np.eye(3)[np.abs(unit).argmin()])

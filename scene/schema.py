@@ -408,7 +408,8 @@ def bad_input(where: str | Path, error: ValidationError) -> BadInputError:
     key = ".".join(str(part) for part in first["loc"])
     place = f"{where}: {key}" if key else str(where)
     if first["type"] == "extra_forbidden":
-        remedy = did_you_mean(str(first["loc"][-1]), _keys_beside(first["loc"])) or "correct its spelling or remove it"
+        near = did_you_mean(str(first["loc"][-1]), _table_of(first["loc"]).model_fields)
+        remedy = near or "correct its spelling or remove it"
         return BadInputError(place, "an unknown key", "a key of the scene schema", remedy)
     if first["type"] == "missing":
         return BadInputError(place, "nothing", "a value", "add the key")
@@ -421,10 +422,7 @@ def bad_input(where: str | Path, error: ValidationError) -> BadInputError:
 
 
 def _steps(first: Mapping[str, Any]) -> str:
-    """Return the conditions of a number that must be a multiple of a step, in words; "" for other errors.
-
-    `first`: one of pydantic's `errors()`.
-    """
+    """Return the conditions of a number that must be a multiple of a step, in words; "" for other errors."""
     if first["type"] not in IN_STEPS or not isinstance(first["loc"][-1], str):
         return ""
     limits = ("multiple_of", "ge", "le")
@@ -433,23 +431,10 @@ def _steps(first: Mapping[str, Any]) -> str:
 
 
 def _remedy(first: Mapping[str, Any]) -> str:
-    """Return how to fix a value, in words; "" when the expected value says it all.
-
-    `first`: one of pydantic's `errors()`.
-    """
+    """Return how to fix a value, in words; "" when the expected value says it all."""
     if first["type"] == "literal_error":
-        return did_you_mean(str(first["input"]), _choices(first["loc"]))
+        return did_you_mean(str(first["input"]), map(str, get_args(_field(first["loc"]).annotation)))
     return REASONS.get(".".join(map(str, first["loc"])), "") if first["type"] == "greater_than" else ""
-
-
-def _keys_beside(loc: tuple[int | str, ...]) -> list[str]:
-    """Return the keys that are allowed in the table of the key at `loc`, pydantic's path of a key."""
-    return list(_table_of(loc).model_fields)
-
-
-def _choices(loc: tuple[int | str, ...]) -> list[str]:
-    """Return the words that the key at `loc` allows; empty if it allows other values too."""
-    return [str(word) for word in get_args(_field(loc).annotation)]
 
 
 def _field(loc: tuple[int | str, ...]) -> FieldInfo:

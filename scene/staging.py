@@ -102,7 +102,8 @@ def staged_to_arrays(staged: Staged) -> Arrays:
     """Return `staged` as plain arrays by name, without Python objects. Arrays of `staged` are not copied."""
     arrays: Arrays = {"movers": np.array(len(staged.movers))}
     for index, mover in enumerate(staged.movers):
-        arrays |= {f"mover.{index}.{key}": value for key, value in _mover_arrays(mover).items()}
+        own = _arrays(mover.motion, MOTION) | _arrays(mover, MOVER) | {"wrap": np.array(WRAPS.index(mover.motion.wrap))}
+        arrays |= {f"mover.{index}.{key}": value for key, value in own.items()}
     arrays |= {f"camera.{key}": value for key, value in _camera_arrays(staged.camera).items()}
     return arrays
 
@@ -122,11 +123,6 @@ def _below(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Arrays:
 
 def _arrays(of: object, keys: Sequence[str]) -> Arrays:
     return {key: np.asarray(value) for key in keys if (value := getattr(of, key)) is not None}
-
-
-def _mover_arrays(mover: Mover) -> Arrays:
-    wrap = np.array(WRAPS.index(mover.motion.wrap))
-    return {**_arrays(mover.motion, MOTION), **_arrays(mover, MOVER), "wrap": wrap}
 
 
 def _mover(arrays: Arrays) -> Mover:
@@ -160,12 +156,10 @@ def _camera_arrays(camera: PlacedCamera) -> Arrays:
         "wrap": np.array(WRAPS.index(path.wrap)),
         **_arrays(camera, ("turn", "shift", "mount")),
         "ways": np.array(len(camera.ways)),
-        **{f"way.{index}.{key}": value for index, way in enumerate(camera.ways) for key, value in _way(way).items()},
+        **{f"way.{index}.times_s": way.times_s for index, way in enumerate(camera.ways)},
+        **{f"way.{index}.places": way.places for index, way in enumerate(camera.ways)},
+        **{f"way.{index}.wrap": np.array(WRAPS.index(way.wrap)) for index, way in enumerate(camera.ways)},
     }
-
-
-def _way(way: Way) -> Arrays:
-    return {"times_s": way.times_s, "places": way.places, "wrap": np.array(WRAPS.index(way.wrap))}
 
 
 def _camera(arrays: Arrays) -> PlacedCamera:
@@ -228,22 +222,16 @@ def require_person(
     if not staged.camera.path.recorded:
         return
     share, _ = _shares(staged.camera, scene, staged.movers, bodies)
-    if _is_enough(share):
+    if share >= ENOUGH:
         return
-    is_placed = scene.camera.place == "auto"
-    what = "the whole person" if is_placed else "a part of the person"
-    found = f"{what} in the picture in {share:.0%} of the run's frames"
-    where = " at the best place" if is_placed else " where it was recorded"
-    expected = f"at least {ENOUGH:.0%}"
-    for note in staged.notes:
+    what, where = ("the whole person", "at the best place")
+    if scene.camera.place != "auto":
+        what, where = ("a part of the person", "where it was recorded")
+    found = f"{what} in the picture in {share:.0%} of the run's frames {where}"
+    for note in (*staged.notes, f"camera: {found}; other axes, directions for up and units are tried"):
         say(note)
-    say(f"camera: {found}{where}; other axes, directions for up and units are tried")
     remedy = _remedy(scene, staged, bodies, base, footage)
-    raise BadInputError(f"camera {scene.camera.source}", f"{found}{where}", expected, f"{remedy}; {RUNS_ANYHOW}")
-
-
-def _is_enough(share: float) -> bool:
-    return share >= ENOUGH
+    raise BadInputError(f"camera {scene.camera.source}", found, f"at least {ENOUGH:.0%}", f"{remedy}; {RUNS_ANYHOW}")
 
 
 def _shares(
@@ -261,7 +249,7 @@ def _shares(
 
 def _remedy(scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], base: Path, footage: Footage | None) -> str:
     """Return a remedy in words: the key and value that show the person most, found by trying all variants."""
-    best, text = 0.0, ""
+    best, text = 0.0, "no single key would show it: check camera.axes, camera.up_axis and camera.metres_per_unit"
     for key, value in _variants(scene.camera, staged.camera.path, base):
         spec = scene.camera.model_copy(update={key: value})
         other = scene.model_copy(update={"camera": spec})
@@ -270,12 +258,11 @@ def _remedy(scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], base: Pa
         except BadInputError:
             continue
         share, height = _shares(place_camera(path, other, staged.movers, bodies), other, staged.movers, bodies)
-        if _is_enough(share) and share + HEIGHT_WEIGHT * height > best:
-            best, text = (
-                share + HEIGHT_WEIGHT * height,
-                f"camera.{key} = {_toml(value)} would show it in {share:.0%}, if it is true",
-            )
-    return text or "no single key would show it: check camera.axes, camera.up_axis and camera.metres_per_unit"
+        if share >= ENOUGH and share + HEIGHT_WEIGHT * height > best:
+            toml = f'"{value}"' if isinstance(value, str) else f"{value:g}"
+            best = share + HEIGHT_WEIGHT * height
+            text = f"camera.{key} = {toml} would show it in {share:.0%}, if it is true"
+    return text
 
 
 def _variants(spec: CameraSpec, path: CameraPath, base: Path) -> Iterator[tuple[str, Any]]:
@@ -287,16 +274,7 @@ def _variants(spec: CameraSpec, path: CameraPath, base: Path) -> Iterator[tuple[
         yield from (("axes", axes) for axes in LIKELY_AXES)
     if spec.up_axis == "auto":
         yield from (("up_axis", axis) for axis in UP)
-    unit = _metres_per_unit(spec, path, base)
-    yield from (("metres_per_unit", float(f"{unit * factor:.3g}")) for factor in FACTORS)
-
-
-def _metres_per_unit(spec: CameraSpec, path: CameraPath, base: Path) -> float:
-    """Return the metres per unit of the file with which `path` was read; 1 for a camera that stands still."""
     raw = load_camera(spec.model_copy(update={"metres_per_unit": 1.0}), base)
     length, own = (float(np.linalg.norm(np.ptp(one.places, axis=0))) for one in (path, raw))
-    return length / own if own > 0 else 1.0
-
-
-def _toml(value: str | float) -> str:
-    return f'"{value}"' if isinstance(value, str) else f"{value:g}"
+    unit = length / own if own > 0 else 1.0
+    yield from (("metres_per_unit", float(f"{unit * factor:.3g}")) for factor in FACTORS)

@@ -135,15 +135,6 @@ def seen_notes(camera: Camera, scene: Scene, movers: Sequence[Mover], bodies: Se
     return (", ".join(parts), *_hint(scene, seen.height[seen.nobody == 0], movers, frames / scene.fps))
 
 
-def _walked(movers: Sequence[Mover], times_s: F64) -> float:
-    """Return the largest extent, metres, of a mover's walk over the floor at `times_s` (F,).
-
-    The extent is the diagonal of the rectangle that the walk covers.
-    """
-    ways = [[mover.sample(float(t_s))[1] @ mover.world[:3, :3].T for t_s in times_s] for mover in movers]
-    return max(float(np.hypot(*np.ptp(np.array(way)[:, [0, 2]], axis=0))) for way in ways)
-
-
 def _hint(scene: Scene, heights: F64, movers: Sequence[Mover], times_s: F64) -> tuple[str, ...]:
     """Return a note when people are very small: either the walk is long, or the camera file has another unit.
 
@@ -153,7 +144,8 @@ def _hint(scene: Scene, heights: F64, movers: Sequence[Mover], times_s: F64) -> 
     if not is_placed or not len(heights) or np.median(heights) >= SMALL:
         return ()
     small = f"the person is only {np.median(heights):.1%} of the picture's height in the median, hard to find"
-    walked_m = _walked(movers, times_s)
+    ways = [[mover.sample(float(t_s))[1] @ mover.world[:3, :3].T for t_s in times_s] for mover in movers]
+    walked_m = max(float(np.hypot(*np.ptp(np.array(way)[:, [0, 2]], axis=0))) for way in ways)
     if walked_m >= FAR_WALK_M:
         return (
             f"{small}: the camera is set down where it sees a walk of {walked_m:.0f} m; start_s and end_s of the "
@@ -307,10 +299,7 @@ class PlaceJudge:
         return PlaceMerits(*np.concatenate(parts, axis=1))
 
     def _shown(self, places: F64) -> F64:
-        """Return an array (3, S) whose rows are the fields `whole`, `well` and `nearly` of `PlaceMerits`.
-
-        `places`: at most PLACES_AT_ONCE places (S, 3).
-        """
+        """Return an array (3, S) whose rows are the fields `whole`, `well` and `nearly` of `PlaceMerits`."""
         film = self._film
         turned = np.rint(facing(film, places) * (HEADINGS / (2 * np.pi))).astype(np.intp) % HEADINGS
         values = (places.astype(np.float32) @ self._along).reshape(len(places), ROWS, -1)
@@ -411,10 +400,8 @@ def _seeds(film: Filming) -> F64:
     points = np.concatenate([points, _looked_at(film)[None]])
     # The middle of the bodies is put at each point; they face the camera as if the origin were there.
     middles = (film.points.min(axis=1) + film.points.max(axis=1)) / 2
-    middle = np.repeat(middles[picked], len(x) * len(depths), axis=0)
-    middle = np.concatenate([middle, middles.mean(axis=0)[None]])
-    turned = (about(1, facing(film, points)) @ middle[:, :, None])[:, :, 0]
-    places = np.asarray(points - turned)
+    middle = np.concatenate([np.repeat(middles[picked], len(x) * len(depths), axis=0), middles.mean(axis=0)[None]])
+    places = np.asarray(points - (about(1, facing(film, points)) @ middle[:, :, None])[:, :, 0])
     places[:, 1] = np.minimum(places[:, 1], highest_floor(film))
     some = film.every(SEEDS_EVERY)
     return places[np.argsort(-_merits(some, PlaceJudge(some), places), kind="stable")]

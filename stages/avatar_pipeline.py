@@ -122,10 +122,15 @@ def measured_times(checked: Checked, cores: Sequence[CpuCore], rule: Placement, 
         for count in counts
     ]
     with _thrown_away(checked) as config:
-        first, *others = (
-            avatar_pipeline(config.model_copy(update={"units": _spinning(placement, len(cores))}), checked.assets)
-            for placement in (one, *variants)
-        )
+        pipelines = []
+        for placement in (one, *variants):
+            units = settings_of(placement)
+            for unit, settings in units.items():
+                # Threads spin if there are so many cores that no unit shares one.
+                spin = 1 < settings.threads <= len(cores) - len(UNITS) + 1
+                units[unit] = settings.model_copy(update={"spin": spin})
+            pipelines.append(avatar_pipeline(config.model_copy(update={"units": units}), checked.assets))
+        first, *others = pipelines
         frames = config.scene.frames
         spread = [number * frames // FRAMES for number in range(FRAMES)]
         return rehearse(first, others, spread, checked.assets, starter)
@@ -181,17 +186,6 @@ def _thrown_away(checked: Checked) -> Iterator[RunConfig]:
         height, width = one_shape(checked.config)
         scene = checked.config.scene.model_copy(update={"size": f"{height}x{width}"})
         yield checked.config.model_copy(update={"out_dir": Path(folder), "scene": scene, "shapes": ()})
-
-
-def _spinning(placement: Placement, cores: int) -> dict[str, Any]:
-    """Return each unit's settings in `placement`. Threads spin if there are so many cores that no unit shares one.
-
-    `cores`: number of available cores.
-    """
-    return {
-        unit: settings.model_copy(update={"spin": 1 < settings.threads <= cores - len(UNITS) + 1})
-        for unit, settings in settings_of(placement).items()
-    }
 
 
 def one_shape(config: RunConfig) -> Shape:

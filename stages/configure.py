@@ -24,9 +24,8 @@ from trilane.hw_profiles.host import asked_cores, fastest_runtime, rule_placemen
 from trilane.hw_profiles.profile_files import load_profile
 from trilane.machine import shortage
 from trilane.pipeline.memory import Assets
-from trilane.scene.footage import Footage
 from trilane.scene.schema import BUILT_IN_PREFIX, FILE_KEYS, Scene, find_scene, load_scene, located, scene_from
-from trilane.scene.staging import Staged, require_person, stage_scene
+from trilane.scene.staging import require_person, stage_scene
 from trilane.scene.tensor_budget import TensorBudget
 from trilane.stages.avatar_assets import AvatarData, load_avatar, networks_of_avatars, pack_assets
 from trilane.stages.config import NetworkCut, RunConfig
@@ -76,16 +75,17 @@ def requested_scene(options: RunOptions) -> Scene:
     are left out.
     """
     values = load_scene(find_scene(options.scene))
-    here = Path.cwd()
-    as_keys: dict[str, Callable[[str], Any]] = {
-        "picture": _picture,
-        "background": lambda text: located(text, here),
-        "camera": lambda text: _camera(values["camera"], located(text, here)),
-    }
-    for name, value in options:
-        key = KEYS.get(name, name)
-        if key in Scene.model_fields and value is not None:
-            values[key] = as_keys[name](value) if name in as_keys else value
+    here, camera = Path.cwd(), values["camera"]
+    keys = {KEYS.get(name, name): value for name, value in options if value is not None}
+    values |= {key: value for key, value in keys.items() if key in Scene.model_fields}
+    if options.camera is not None:
+        source = located(options.camera, here)
+        dropped = FILE_KEYS if source.startswith(BUILT_IN_PREFIX) else ("format",)
+        values["camera"] = {key: value for key, value in camera.items() if key not in dropped} | {"source": source}
+    if options.background is not None:
+        values["background"] = located(options.background, here)
+    if options.picture is not None:
+        values["output"] = _picture(options.picture)
     first = dict(values["avatars"][0])
     if options.motion is not None:
         first |= {"motion": located(options.motion, here), "up_axis": "auto", "units": "auto"}
@@ -93,15 +93,6 @@ def requested_scene(options: RunOptions) -> Scene:
         first["bundle"] = located(options.avatar, here)
     values["avatars"] = [first, *values["avatars"][1:]]
     return scene_from(COMMAND_LINE, values)
-
-
-def _camera(values: Mapping[str, Any], source: str) -> dict[str, Any]:
-    """Return the keys `values` of a scene's camera after `source` has replaced its source.
-
-    For a built-in camera, all of FILE_KEYS are left out; for a file, only the format.
-    """
-    dropped = FILE_KEYS if source.startswith(BUILT_IN_PREFIX) else ("format",)
-    return {key: value for key, value in values.items() if key not in dropped} | {"source": source}
 
 
 def _picture(text: str) -> dict[str, int]:
@@ -137,7 +128,11 @@ def configure(
         )
     asked = asked_cores(options.cores)
     runtime, reason = requested_runtime(options.runtime)
-    footage = _footage(scene)
+    footage = None
+    if scene.background != ROOM:
+        from trilane.stages.gpu.background import survey  # it is slow to import, and seldom needed here
+
+        footage = survey(Path(scene.background), scene.fps)
     bundles = {spec.bundle: load_bundle(spec.bundle) for spec in scene.avatars}
     avatars = {bundle.folder.absolute(): load_avatar(bundle) for bundle in bundles.values()}
     folders = tuple(bundles[spec.bundle].folder.absolute() for spec in scene.avatars)
@@ -147,7 +142,10 @@ def configure(
     staged = stage_scene(scene, bodies, Path.cwd(), footage)
     if needs_person:
         require_person(scene, staged, bodies, Path.cwd(), footage, say)
-    _check_pictures(scene, staged)
+    if footage is not None:
+        from trilane.stages.gpu.background import check_pictures
+
+        check_pictures(Path(scene.background), scene.fps, scene.frames, staged.camera.path)
     cuts = requested_cuts(options.split, list(networks.values()))
     unit, why = skinning_unit(options.skinning, gl)
     own = max(network.shape[1] * network.shape[2] for network in networks.values())
@@ -213,30 +211,10 @@ def requested_cuts(texts: Sequence[str], networks: Sequence[NetworkFile]) -> tup
     return tuple(cuts)
 
 
-def _footage(scene: Scene) -> Footage | None:
-    """Return the facts of the background of `scene`; None for the room. Raises BadInputError."""
-    if scene.background == ROOM:
-        return None
-    from trilane.stages.gpu.background import survey  # it is slow to import, and seldom needed here
-
-    return survey(Path(scene.background), scene.fps)
-
-
-def _check_pictures(scene: Scene, staged: Staged) -> None:
-    """Raise BadInputError if a picture of the background that the run shows cannot be decoded."""
-    if scene.background != ROOM:
-        from trilane.stages.gpu.background import check_pictures
-
-        check_pictures(Path(scene.background), scene.fps, scene.frames, staged.camera.path)
-
-
 def _accuracy(avatars: Sequence[tuple[AvatarData, int]], drawn: DrawnAs) -> dict[str, Any]:
     """Return the result of `accuracy_of` for each avatar, by its name.
 
     If several avatars have the same name, the key also contains the folder.
-
-    `avatars`: pairs of an avatar and the number of avatars that share its tensor.
-    `drawn`: how the run draws avatars.
     """
     bundles = [(avatar.bundle, sharing) for avatar, sharing in avatars]
     names = Counter(bundle.manifest.name for bundle, _ in bundles)

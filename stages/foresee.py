@@ -215,15 +215,7 @@ def _foreseen(
     networks: Sequence[int],
     room: tuple[int, int],
 ) -> tuple[tuple[Shape, ...], tuple[tuple[int, Shape], ...]]:
-    """Return (further shapes to prepare, changes of the tensor's shape with them); larger shapes need fewer changes.
-
-    `looks`: examined frames.
-    `output`: (height, width) of the picture.
-    `shapes`: shapes that are prepared anyway.
-    `budget`: budget of the tensors.
-    `networks`: network of each avatar; empty if one paints all.
-    `room`: (most further shapes, most pixels of all of them together).
-    """
+    """Return (further shapes to prepare, changes of the tensor's shape with them); larger shapes need fewer changes."""
     most = budget.most_of(max(len(look.rects) for look in looks))
     larger = larger_shapes(shapes, most)
     while True:

@@ -5,7 +5,6 @@ Rule: all numbers are rounded to fixed steps, so the file is small and the same 
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,7 +42,8 @@ def build_body() -> dict[str, NDArray[Any]]:
 
 def _file_arrays(vertices: F64, weights: F64, j_regressor: F64, source: AnnyMesh) -> dict[str, NDArray[Any]]:
     count = len(weights)
-    nose = np.flatnonzero((source.faces == np.argmax(_nose_score(vertices[0], weights))).any(axis=1))[:1]
+    ahead = np.where(weights[:, JOINT_INDEX["head"]] > 0.5, vertices[0][:, 2], -np.inf)
+    nose = np.flatnonzero((source.faces == np.argmax(ahead)).any(axis=1))[:1]
     floats = {
         "v_template": vertices[0],
         "shapedirs": np.moveaxis(vertices[1:], 0, 2),
@@ -65,10 +65,6 @@ def _file_arrays(vertices: F64, weights: F64, j_regressor: F64, source: AnnyMesh
     }
     arrays: dict[str, NDArray[Any]] = {key: value.astype(np.float32) for key, value in floats.items()}
     return arrays | {key: value.astype(np.uint32) for key, value in integers.items()}
-
-
-def _nose_score(vertices: F64, weights: F64) -> F64:
-    return np.asarray(np.where(weights[:, JOINT_INDEX["head"]] > 0.5, vertices[:, 2], -np.inf))
 
 
 def relaxed_hand(bend: int) -> F64:
@@ -282,12 +278,7 @@ def _mesh_of(model: Any, shown: NDArray[np.bool_]) -> AnnyMesh:
 def _rest(
     model: Any, used: NDArray[np.int64], phenotypes: dict[str, F64], actions: dict[str, float]
 ) -> tuple[F64, F64]:
-    """Return (vertices followed by joints (B, V + 55, 3), finger ends (B, 10, 3)) in anny's rest pose; metres, Y up.
-
-    `used`: indices (V,) of the vertices to return.
-    `phenotypes`: values (B,) of B persons, by the phenotype's name.
-    `actions`: strength of each facial action, by the action's name.
-    """
+    """Return (vertices followed by joints (B, V + 55, 3), finger ends (B, 10, 3)) in anny's rest pose; metres, Y up."""
     import torch
 
     tensors = {name: torch.as_tensor(value) for name, value in phenotypes.items()}
@@ -306,10 +297,7 @@ def _y_up(points: F64) -> F64:
 
 
 def _principal_components(model: Any, used: NDArray[np.int64]) -> F64:
-    """Return the first principal components (BETAS, V + 55, 3) of random adults, scaled to one standard deviation.
-
-    `used`: indices (V,) of the vertices to return.
-    """
+    """Return the first principal components (BETAS, V + 55, 3) of random adults, scaled to one standard deviation."""
     random = np.random.default_rng(0)
     drawn = {name: random.uniform(low, high, SAMPLES) for name, (low, high) in ADULTS.items()}
     population = _rest(model, used, drawn, {})[0].reshape(SAMPLES, -1)
@@ -385,7 +373,7 @@ def _pose_arm(rotations: F64, joints: F64, side: str, out: F64, ends: dict[str, 
         return np.asarray(joints[JOINT_INDEX[f"{side}_{name}"]])
 
     upper = align(at("elbow") - at("shoulder"), out)
-    hand = _hand_rotation(at, out)
+    hand = frame(out, _FRONT) @ frame(at("middle1") - at("wrist"), at("index1") - at("pinky1")).T
     fore = align(at("wrist") - at("elbow"), out)
     fore = about(out, _FOREARM_TWIST * _twist(hand @ fore.T, out)) @ fore
     chosen = {"collar": power(upper, _COLLAR_LIFT), "shoulder": upper, "elbow": fore, "wrist": hand}
@@ -396,19 +384,11 @@ def _pose_arm(rotations: F64, joints: F64, side: str, out: F64, ends: dict[str, 
         rotations[JOINT_INDEX[f"{side}_{name}"]] = rotation
 
 
-def _hand_rotation(at: Callable[[str], F64], out: F64) -> F64:
-    along = at("middle1") - at("wrist")
-    across = at("index1") - at("pinky1")
-    return frame(out, _FRONT) @ frame(along, across).T
-
-
 def _flat(hand: F64, segment: F64, finger: str) -> F64:
     """Return the rotation (3, 3) of a segment of a finger into the T pose.
 
     The segment turns with the hand, and then by the smallest rotation that makes it horizontal. A segment of the thumb
     turns only with the hand.
-
-    `hand`: rotation (3, 3) of the hand. `segment`: vector (3,) along the segment. `finger`: name of the finger.
     """
     turned = hand @ segment
     return hand if finger == "thumb" else align(turned, turned - _UP * (turned @ _UP)) @ hand

@@ -278,8 +278,9 @@ def clothing_layers(body: BodyArrays, landmarks: Landmarks, look: Look = DEFAULT
     ]
     normals = [vertex_normals(sheet.vertices, sheet.faces) for sheet in sheets]
     lights = _lights(sheets, normals)
+    eyeball = landmarks.eyeball.astype(np.float64)
     return [
-        Layer(*sheet, normal, light, _mark(sheet.material, landmarks, len(sheet.vertices)))
+        Layer(*sheet, normal, light, eyeball if sheet.material == "skin" else np.zeros(len(light)))
         for sheet, normal, light in zip(sheets, normals, lights, strict=True)
     ]
 
@@ -319,10 +320,7 @@ def nearest(points: F64, vertices: F64, count: int = 8) -> NDArray[np.int64]:
 
 
 def _lights(sheets: list[_Sheet], normals: list[F64]) -> list[F64]:
-    """Return the share (N,) of ambient light that reaches the vertices of each sheet past all sheets.
-
-    `normals`: vertex normals (N,3) of each sheet.
-    """
+    """Return the share (N,) of ambient light that reaches the vertices of each sheet past all sheets."""
     vertices = np.vstack([sheet.vertices for sheet in sheets])
     areas = np.concatenate([vertex_areas(sheet.vertices, sheet.faces) for sheet in sheets])
     step = -(-len(vertices) // EMITTERS)
@@ -339,10 +337,6 @@ def _lights(sheets: list[_Sheet], normals: list[F64]) -> list[F64]:
         )
         lights.append(Smoother(sheet.faces, len(sheet.vertices)).smooth(raw, 3))
     return lights
-
-
-def _mark(name: str, landmarks: Landmarks, count: int) -> F64:
-    return np.asarray(landmarks.eyeball, np.float64) if name == "skin" else np.zeros(count)
 
 
 # The garments that are shells of the body: the vertices that each garment may cover, and how far it stands off.

@@ -316,7 +316,10 @@ def phases(groups: list[ShapeGroup], settings: TrainingSettings, count: int) -> 
     small = [math.prod(group.shape) < SMALL_PIXELS for group in groups]
     whole_from = math.ceil(settings.batches.full_body_from * count)
     switch = min(math.ceil(settings.small_until * count), whole_from)
-    of_small = [label if each or not any(small) else _none(label) for label, each in zip(labels, small, strict=True)]
+    of_small = [
+        label if each or not any(small) else np.full_like(label, LEFT_OUT)
+        for label, each in zip(labels, small, strict=True)
+    ]
     of_whole = [np.where(_whole(group), label, LEFT_OUT) for group, label in zip(groups, labels, strict=True)]
     found = [Phase(0, switch, of_small), Phase(switch, whole_from, labels), Phase(whole_from, count, of_whole)]
     for phase in found:
@@ -363,7 +366,3 @@ def _labels(groups: list[ShapeGroup], settings: TrainingSettings) -> list[NDArra
 
 def _whole(group: ShapeGroup) -> NDArray[np.bool_]:
     return np.isin(group.band, WHOLE_BANDS)
-
-
-def _none(label: NDArray[np.int64]) -> NDArray[np.int64]:
-    return np.full_like(label, LEFT_OUT)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sparse
 from numpy.typing import NDArray
+from scipy.ndimage import binary_dilation
 from scipy.sparse.linalg import eigsh, splu
 from scipy.spatial import cKDTree
 
@@ -110,14 +111,7 @@ def used_texels(body: BodyArrays, side: int, margin: int) -> NDArray[np.bool_]:
     `side`: side of the texture in texels.
     """
     _, known = lay_out(np.zeros((len(body.vertices), 1)), body.faces, body.uv, body.uv_faces, side)
-    for _ in range(margin):
-        grown = known.copy()
-        grown[1:] |= known[:-1]
-        grown[:-1] |= known[1:]
-        grown[:, 1:] |= known[:, :-1]
-        grown[:, :-1] |= known[:, 1:]
-        known = grown
-    return known
+    return np.asarray(binary_dilation(known, iterations=margin)) if margin else known
 
 
 # Smooth fields on the body's surface. Most channels of the neural texture begin with them.
@@ -134,7 +128,8 @@ def eigenfunctions(vertices: F64, faces: Ints, count: int) -> F64:
     `vertices`: (V,3), at rest. `faces`: (F,3) indices of vertices.
     """
     laplacian, mass = cotangent_laplacian(vertices, faces)
-    part = _largest_part(laplacian)
+    _, label = sparse.csgraph.connected_components(laplacian, directed=False)
+    part = np.flatnonzero(label == np.bincount(label).argmax())
     inner = laplacian[part][:, part]
     values, vectors = eigsh(inner, k=count + 1, M=sparse.diags(mass[part]), sigma=-1e-3, v0=np.ones(len(part)))
     vectors = vectors[:, np.argsort(values)][:, 1:]
@@ -170,11 +165,6 @@ def cotangent_laplacian(vertices: F64, faces: Ints) -> tuple[Any, F64]:
     return laplacian, mass
 
 
-def _largest_part(laplacian: Any) -> NDArray[np.int64]:
-    _, label = sparse.csgraph.connected_components(laplacian, directed=False)
-    return np.flatnonzero(label == np.bincount(label).argmax())
-
-
 # Lays values of a mesh's vertices out as an image in texture space.
 #
 # Rule: a texel on a face is interpolated from the face's corners. `fill_gaps` and `fill_beside` fill all other texels.
@@ -197,7 +187,8 @@ def lay_out(values: F64, faces: Ints, uv: F64, uv_faces: Ints, side: int) -> tup
     low = np.maximum(np.floor(corners.min(axis=1)).astype(np.int64), 0)
     high = np.minimum(np.ceil(corners.max(axis=1)).astype(np.int64) + 1, side)
     width, height = np.maximum(high - low, 0).T
-    around = np.where(np.abs(_double_areas(corners)) < LEAST_AREA, 0, width * height)
+    (bx, by), (cx, cy) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
+    around = np.where(np.abs(bx * cy - cx * by) < LEAST_AREA, 0, width * height)
     parts = np.flatnonzero(np.diff(np.cumsum(around) // TEXELS_AT_ONCE)) + 1
     for part in np.split(np.arange(len(faces)), parts):
         face = np.repeat(part, around[part])
@@ -258,19 +249,8 @@ def _pulled(total: F64, weight: F64) -> F64:
     return np.where(weight > 0, mean, coarse)
 
 
-def _double_areas(corners: F64) -> F64:
-    """Return twice the signed area (F,) of triangles (F,3,2)."""
-    (bx, by), (cx, cy) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
-    return np.asarray(bx * cy - cx * by)
-
-
 def _barycentric(corners: F64, counts: Ints, x: Ints, y: Ints) -> tuple[F64, F64, F64]:
-    """Return the three barycentric weights, (N,) each, of points in their faces.
-
-    `corners`: corners (F,3,2) of the faces.
-    `counts`: (F,), number of successive points that belong to each face.
-    `x`, `y`: coordinates (N,) of the points.
-    """
+    """Return the three barycentric weights, (N,) each, of points in their faces."""
     (bx, by), (cx, cy) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
     area = np.where(counts > 0, bx * cy - cx * by, 1.0)
     px, py = x - np.repeat(corners[:, 0, 0], counts), y - np.repeat(corners[:, 0, 1], counts)

@@ -236,16 +236,10 @@ def backgrounds(count: int, shape: Shape, rng: np.random.Generator) -> F32:
     return np.stack([background(str(kind), shape, rng) for kind in rng.choice(list(KINDS), count)])
 
 
-def _noise(shape: Shape, rng: np.random.Generator) -> F32:
-    return rng.random((*shape, 3), np.float32)
-
-
 def _scenery(shape: Shape, rng: np.random.Generator) -> F32:
     """Return a random part (h,w,3) of a random scene, mirrored and with its channels in another order at random.
 
     Scenes wrap at their edges.
-
-    `shape`: (h, w).
     """
     scene = scenes()[int(rng.integers(SCENES))]
     rows, columns = ((int(rng.integers(SIDE)) + np.arange(side)) % SIDE for side in shape)
@@ -257,7 +251,7 @@ def _scenery(shape: Shape, rng: np.random.Generator) -> F32:
 KINDS: dict[str, Callable[[Shape, np.random.Generator], F32]] = {
     "black": lambda shape, _: np.zeros((*shape, 3), np.float32),
     "white": lambda shape, _: np.ones((*shape, 3), np.float32),
-    "noise": _noise,
+    "noise": lambda shape, rng: rng.random((*shape, 3), np.float32),
     "scenery": _scenery,
 }
 

@@ -72,20 +72,16 @@ def byte_texture(
     `person`: number of the person in `avatar`.
     """
     body = body_arrays(shaped)
-    levels = avatar.levels(person)
-    images = [_finished(level.detach()[0].permute(1, 2, 0).numpy(), unseen, body) for level in levels]
+    images = []
+    for level in avatar.levels(person):
+        image = level.detach()[0].permute(1, 2, 0).numpy()
+        if unseen is not None and unseen.any():
+            image = _without_holes(image, unseen, body)
+        images.append(image * used_texels(body, image.shape[0], TEXEL_MARGIN)[..., None])
     largest = np.max([np.abs(image).max(axis=(0, 1)) for image in images], axis=0)
     scale = np.maximum(largest, 1e-6) / INT8_MAX
     texture, *smaller = (np.round(image / scale).astype(np.int8) for image in images)
     return texture, scale.astype(np.float32), pack_levels(smaller) if smaller else None
-
-
-def _finished(image: NDArray[Any], unseen: Mask | None, body: BodyArrays) -> NDArray[Any]:
-    """Return `image` (S,S,C) with `unseen` texels filled, and with 0 in texels that the body does not use."""
-    if unseen is not None and unseen.any():
-        image = _without_holes(image, unseen, body)
-    finished: NDArray[Any] = image * used_texels(body, image.shape[0], TEXEL_MARGIN)[..., None]
-    return finished
 
 
 def _without_holes(image: NDArray[Any], unseen: Mask, body: BodyArrays) -> F64:
@@ -261,10 +257,7 @@ def held_out_views(renderer: SampleRenderer, bundle: Bundle, views: int) -> list
 
 
 def _tensors(renderer: SampleRenderer, bundle: Bundle, sample: Callable[[int], Sample], wanted: int) -> Iterator[F32]:
-    """Yield `wanted` inputs (H,W,C) of the network of `bundle`, of samples with a tensor of `CALIBRATION_SHAPE`.
-
-    `sample`: function that returns sample 0, 1, 2, ...; samples with another tensor shape are skipped.
-    """
+    """Yield `wanted` inputs (H,W,C) of the network of `bundle`, of samples with a tensor of `CALIBRATION_SHAPE`."""
     levels = levels_of(bundle)
     found = (one for one in map(sample, count()) if one.crop.shape == CALIBRATION_SHAPE)
     for _, one in zip(range(wanted), found, strict=False):

@@ -170,8 +170,6 @@ class Corners:
         """Return one pair for each point of UV where an edge of the whole mesh crosses an edge of a level.
 
         Pairs are (`corners`, `shares`) as in `Pairs`. Edges that cross at an end of one of them have no pair here.
-
-        `edges`: edges (E,2) of the level, indices of corners.
         """
         a, b, c, d = (self.uv[ends] for ends in (*self.edges.T, *edges.T))
         row, number = _neighbours((np.minimum(a, b), np.maximum(a, b)), (np.minimum(c, d), np.maximum(c, d)))
@@ -188,8 +186,6 @@ class Corners:
         """Return (pairs of `corners` (M,) with the nearest points of chords in UV, distances (M,) of the pairs in UV).
 
         Only chords in the same UV chart count. Pairs are (`corners`, `shares`) as in `Pairs`.
-
-        `chords`: edges (K,2) at the seams of the level, indices of corners.
         """
         if not len(corners):
             return (np.zeros((0, 5), np.int64), np.zeros((0, 5))), np.zeros(0)
@@ -330,10 +326,7 @@ def _edges(triangles: I64) -> tuple[I64, NDArray[np.intp]]:
 
 
 def _neighbours(first: tuple[F64, F64], second: tuple[F64, F64]) -> tuple[I64, I64]:
-    """Return the pairs of boxes that share a cell of the texture: (indices (M,) of `first`, indices (M,) of `second`).
-
-    `first`, `second`: (lowest u and v (K,2), highest u and v (K,2)) of K boxes; K may differ between the two.
-    """
+    """Return the boxes that share a cell of the texture: indices (M,) of `first`, indices (M,) of `second`."""
     row, cell = _cells(*first)
     other, its_cell = _cells(*second)
     order = np.argsort(its_cell, kind="stable")

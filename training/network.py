@@ -9,6 +9,7 @@ import io
 import math
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Self
 
 import numpy as np
@@ -214,13 +215,9 @@ class MobileFeatures(nn.Module):
         return features
 
 
-def _mobile(spec: MobileEncoder) -> Callable[[int, Scale, Norm], nn.Module]:
-    return lambda c_in, scale, norm: MobileFeatures(spec, c_in, scale, norm)
-
-
 ENCODERS: dict[str, Callable[[int, Scale, Norm], nn.Module]] = {
     "resnet18": ResNet18,
-    **{name: _mobile(spec) for name, spec in MOBILE_ENCODERS.items()},
+    **{name: partial(MobileFeatures, spec) for name, spec in MOBILE_ENCODERS.items()},
 }
 
 
@@ -411,7 +408,7 @@ class _OneHead(nn.Module):
     def __init__(self, network: UNet) -> None:
         super().__init__()
         self.network = network
-        heads = [_fused(head) for head in (network.colour, network.mask)]
+        heads = [(fuse_conv_bn_eval(head[0], head[1]), head[3]) for head in (network.colour, network.mask)]
         c = heads[0][0].in_channels
         self.first = nn.Conv2d(c, 2 * c, 3, 1, 1)
         self.second = nn.Conv2d(2 * c, 4, 3, 1, 1)
@@ -426,10 +423,6 @@ class _OneHead(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         features = self.network.features(x)
         return torch.sigmoid(self.second(torch.relu(self.first(features))))
-
-
-def _fused(head: nn.Sequential) -> tuple[nn.Conv2d, nn.Conv2d]:
-    return fuse_conv_bn_eval(head[0], head[1]), head[3]
 
 
 def export_onnx(network: UNet, height: int, width: int) -> onnx.ModelProto:

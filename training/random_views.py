@@ -80,7 +80,8 @@ def random_view(rng: np.random.Generator, band: str, joints: F64) -> View:
     fov = np.radians(rng.uniform(*FOV_DEG))
     distance = max(framed / (2 * np.tan(fov / 2)), NEAREST_M)
     fov = 2 * np.arctan(framed / (2 * distance))
-    yaw, pitch = rng.uniform(-np.pi, np.pi), np.radians(_pitch(rng))
+    low, high = PITCH_DEG
+    yaw, pitch = rng.uniform(-np.pi, np.pi), np.radians(rng.triangular(low, 5.0, high))
     back = np.array([np.sin(yaw) * np.cos(pitch), np.sin(pitch), np.cos(yaw) * np.cos(pitch)])
     aspect = SCREENS[rng.integers(len(SCREENS))]
     off = 0.18 * framed * np.clip(rng.standard_normal(3), -1.5, 1.5)
@@ -116,11 +117,6 @@ def perspective(fov_y: float, aspect: float, near: float = NEAR_M, far: float = 
     matrix[0, 0], matrix[1, 1], matrix[3, 2] = f / aspect, f, -1.0
     matrix[2, 2], matrix[2, 3] = (far + near) / (near - far), 2 * far * near / (near - far)
     return matrix
-
-
-def _pitch(rng: np.random.Generator) -> float:
-    low, high = PITCH_DEG
-    return float(rng.triangular(low, 5.0, high))
 
 
 # The crop of a sample: the pipeline's crop rectangle, shape bucket and projection for one body in one view.
@@ -265,14 +261,18 @@ def random_pose(rng: np.random.Generator) -> F64:
     The root leans but does not turn about Y, because random cameras turn about the body.
     """
     pose = np.zeros((JOINTS, 3))
-    ATTITUDES[_pick(rng, WEIGHTS)](pose, rng)
+    share = np.array(list(WEIGHTS.values()))
+    attitude = list(WEIGHTS)[int(rng.choice(len(WEIGHTS), p=share / share.sum()))]
+    ATTITUDES[attitude](pose, rng)
     for name, deviation in JITTER_DEG.items():
         pose[JOINT_INDEX[name]] += np.radians(deviation) * np.clip(rng.standard_normal(3), -2.0, 2.0)
     pose[JOINT_INDEX["right_eye"]] = pose[JOINT_INDEX["left_eye"]]
     pose[0] += np.radians((6, 0, 4)) * rng.standard_normal(3)
     for side in SIDES:
         _curl_hand(pose, side, rng)
-        _keep_limits(pose, side)
+        knee, elbow = JOINT_INDEX[f"{side}_knee"], JOINT_INDEX[f"{side}_elbow"]
+        pose[knee, 0] = np.clip(pose[knee, 0], 0.0, np.radians(135))
+        pose[elbow, 1] = -SIDES[side] * np.clip(-SIDES[side] * pose[elbow, 1], 0.0, np.radians(140))
     return pose
 
 
@@ -373,16 +373,3 @@ def _curl_hand(pose: F64, side: str, rng: np.random.Generator) -> None:
             pose[JOINT_INDEX[f"{side}_{finger}{part}"]] = np.radians(turn)
     for part in (1, 2, 3):
         pose[JOINT_INDEX[f"{side}_thumb{part}"]] = np.radians((6.0, -sign * 8.0, 0.0)) * rng.standard_normal()
-
-
-def _keep_limits(pose: F64, side: str) -> None:
-    knee, elbow = JOINT_INDEX[f"{side}_knee"], JOINT_INDEX[f"{side}_elbow"]
-    pose[knee, 0] = np.clip(pose[knee, 0], 0.0, np.radians(135))
-    bend = -SIDES[side] * pose[elbow, 1]
-    pose[elbow, 1] = -SIDES[side] * np.clip(bend, 0.0, np.radians(140))
-
-
-def _pick(rng: np.random.Generator, weights: dict[str, float]) -> str:
-    names = list(weights)
-    share = np.array([weights[name] for name in names])
-    return names[int(rng.choice(len(names), p=share / share.sum()))]

@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 import psutil
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from trilane.errors import BadInputError, MissingPartError, package_line, reason
@@ -87,10 +86,7 @@ def steps(
 
 
 def _step(state: TrainingState, stream: Iterator[Batch], settings: TrainingSettings, frozen: bool) -> dict[str, float]:
-    """Do one step by the mean gradient of the next batches, and return the means of their loss terms, by name.
-
-    `frozen`: whether the running statistics of batch norms stay fixed.
-    """
+    """Do one step by the mean gradient of the next batches, and return the means of their loss terms, by name."""
     options, avatar = settings.optimiser, state.avatar
     state.optimiser.zero_grad(set_to_none=True)
     sums: dict[str, float] = {}
@@ -398,11 +394,7 @@ def load_state(state: TrainingState, path: Path) -> None:
         other = sorted(name for name in wanted.keys() | found.keys() if wanted.get(name) != found.get(name))
         raise BadInputError(path, f"{other[0]} {found.get(other[0], 'missing')}", EXPECTED, REMEDY)
     state.step = int(arrays.pop("step"))
-    _fill(state.tensors(), arrays)
-
-
-def _fill(tensors: dict[str, Tensor], arrays: dict[str, NDArray[np.generic]]) -> None:
-    for name, value in tensors.items():
+    for name, value in state.tensors().items():
         value.data.copy_(torch.from_numpy(arrays[name]))
 
 

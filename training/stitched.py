@@ -71,11 +71,7 @@ def _ring(foot: F64, height: float, margin: float) -> F64:
 
 
 def _stitch(rings: int, capped: bool) -> NDArray[np.int64]:
-    """Return the faces (F,3) between consecutive rings, and a fan that closes the first ring.
-
-    `rings`: number of rings of ANGLES vertices; the centres of the first and last ring follow as two vertices.
-    `capped`: whether a second fan closes the last ring.
-    """
+    """Return the faces (F,3) between consecutive rings, and a fan that closes the first ring."""
     here = np.arange(ANGLES)
     after = (here + 1) % ANGLES
     faces = [_walls(rings)]

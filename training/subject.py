@@ -123,7 +123,10 @@ def captured_subject(folder: Path, threads: int, report: Callable[[str], None]) 
     report(f"{len(kept)} frames of {len(capture)} to train on; held out: {len(held_out)}, with bad fits: {len(bad)}")
     for number in kept:
         coverage.add(np.unpackbits(drawn[number]).astype(bool).reshape(coverage.used.shape))
-    report(_unseen_line(coverage))
+    regions = coverage.never_seen()
+    among = f", among them all of {', '.join(regions)}" if regions else ""
+    share = f"{1 - coverage.share():.1%} of the body's texels are seen by no frame{among}"
+    report(f"{share}: filled from seen ones, along the surface")
     names = {"held_out": held_out, "bad": bad}
     facts = {
         "body": CAPTURED,
@@ -159,14 +162,6 @@ def _checked(capture: Capture, threads: int) -> tuple[list[CheckedFrame], TexelC
         frames.append(frame)
         drawn.append(np.packbits(coverage.drawn(uv, mask)))
     return frames, coverage, drawn
-
-
-def _unseen_line(coverage: TexelCoverage) -> str:
-    """Return a line about the share of texels that no frame shows, and the regions that are never seen."""
-    regions = coverage.never_seen()
-    names = f", among them all of {', '.join(regions)}" if regions else ""
-    share = f"{1 - coverage.share():.1%} of the body's texels are seen by no frame{names}"
-    return f"{share}: filled from seen ones, along the surface"
 
 
 # How far a person's clothes and hair stand off the body: offsets of the body's vertices, measured at the masks'
@@ -351,10 +346,7 @@ def _ends(values: F64) -> tuple[F64, NDArray[np.bool_]]:
 
 
 def _medians(number: Ints, value: F64, weight: F64, count: int) -> tuple[F64, F64]:
-    """Return the weighted median (V,) of each vertex's values, 0 without values, and the number (V,) of values.
-
-    `number`: vertex of each value, (N,). `value`, `weight`: (N,). `count`: number V of vertices.
-    """
+    """Return the weighted median (V,) of each vertex's values, 0 without values, and the number (V,) of values."""
     order = np.lexsort((value, number))
     number, value, weight = number[order], value[order], weight[order]
     total = np.bincount(number, weights=weight, minlength=count)

@@ -144,14 +144,22 @@ def train_avatar(places: TrainingPlaces, asked: TrainingSettings, listener: List
     listener.say(f"trains on {device_words(chosen_device(settings.device), settings.threads)}")
     if settings.loss.perceptual:
         listener.say(f"perceptual loss: {'MS-SSIM' if vgg is None else f'features of VGG-16 in {places.vgg}'}")
-    people = [_prepared(subject, own, settings, listener) for subject, own in _subjects(places, settings, listener)]
+    people = []
+    for subject, own in _subjects(places, settings, listener):
+        own.work.mkdir(parents=True, exist_ok=True)
+        raised = _raised(subject, own, settings, listener)
+        _draw_samples(raised, own, settings, listener)
+        people.append(Trained(raised, own))
     groups = _groups(people)
     torch.manual_seed(settings.seed)
     avatar = _first_avatar(people, places, settings)
     settings = _with_steps(avatar, groups, settings, vgg, listener)
     write_bytes(places.work / NAME, settings_text(settings).encode())
     state = first_state(avatar, settings, vgg)
-    losses = {"before": _loss_before(state, places, groups)}
+    before = places.work / LOSS_BEFORE
+    if not (places.work / STATE).exists():  # a resumed training has the file
+        write_bytes(before, json.dumps(probe_loss(state, groups)).encode())
+    losses = {"before": float(json.loads(read_text(before, "the loss before this training")))}
     _train(state, people, groups, places, settings, listener)
     state.average.cpu()
     if settings.bytes_from < 1 and not settings.keep_network:
@@ -205,14 +213,6 @@ def _subjects(
         alone = len(settings.looks) == 1
         own = places if alone else replace(places, out=places.out / look, work=places.work / look, name=look)
         yield clothed_subject(dressed_body(body, look, own.work), settings.threads, look), own
-
-
-def _prepared(subject: Subject, places: TrainingPlaces, settings: TrainingSettings, listener: Listener) -> Trained:
-    """Return `subject` with its offsets, after its samples are drawn."""
-    places.work.mkdir(parents=True, exist_ok=True)
-    subject = _raised(subject, places, settings, listener)
-    _draw_samples(subject, places, settings, listener)
-    return Trained(subject, places)
 
 
 def _groups(people: Sequence[Trained]) -> list[ShapeGroup]:
@@ -388,14 +388,6 @@ def _train(
             save_state(state, path)
             saved = time.monotonic()
     save_state(state, path)
-
-
-def _loss_before(state: TrainingState, places: TrainingPlaces, groups: list[ShapeGroup]) -> float:
-    """Return the loss before the first step; a resumed training reads it from the work folder."""
-    path = places.work / LOSS_BEFORE
-    if not (places.work / STATE).exists():
-        write_bytes(path, json.dumps(probe_loss(state, groups)).encode())
-    return float(json.loads(read_text(path, "the loss before this training")))
 
 
 def _measure(places: TrainingPlaces, subject: Subject, settings: TrainingSettings) -> dict[str, Any]:

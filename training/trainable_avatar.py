@@ -230,9 +230,20 @@ SAVED_WEIGHTS = "weights that this network's training saved"
 
 def load_network(network: UNet, path: Path) -> UNet:
     """Load the weights in a file of `save_network` into `network`, and return `network`. Raises BadInputError."""
-    weights = _read_weights(path)
+    try:
+        with np.load(path, allow_pickle=False) as arrays:
+            saved = {name: torch.from_numpy(arrays[name]) for name in arrays.files}
+    except (OSError, ValueError, KeyError) as error:
+        raise BadInputError(path, reason(error).splitlines()[0], SAVED_WEIGHTS) from error
     prefix = "network."
-    _fill(network, {k.removeprefix(prefix): v.float() for k, v in weights.items() if k.startswith(prefix)}, path)
+    weights = {k.removeprefix(prefix): v.float() for k, v in saved.items() if k.startswith(prefix)}
+    try:
+        missing, unexpected = network.load_state_dict(weights, strict=False)
+    except RuntimeError as error:
+        raise BadInputError(path, str(error).splitlines()[-1].strip(), SAVED_WEIGHTS) from error
+    missing = [name for name in missing if not name.endswith("num_batches_tracked")]
+    if missing or unexpected:
+        raise BadInputError(path, f"no {missing[0]}" if missing else f"also {unexpected[0]}", SAVED_WEIGHTS)
     return network
 
 
@@ -251,28 +262,6 @@ def save_network(avatar: TrainableAvatar, path: Path) -> None:
     halves = {name: value.astype(np.float16) for name, value in weights.items() if value.dtype.kind == "f"}
     with write_atomically(path) as draft, draft.open("wb") as file:
         np.savez_compressed(file, **halves)
-
-
-def _read_weights(path: Path) -> dict[str, Tensor]:
-    try:
-        with np.load(path, allow_pickle=False) as arrays:
-            return {name: torch.from_numpy(arrays[name]) for name in arrays.files}
-    except (OSError, ValueError, KeyError) as error:
-        raise BadInputError(path, reason(error).splitlines()[0], SAVED_WEIGHTS) from error
-
-
-def _fill(module: nn.Module, weights: dict[str, Tensor], path: Path) -> None:
-    """Load `weights` into `module`. Only `num_batches_tracked` may be missing.
-
-    Raises BadInputError about `path` for other weights than those of `module`.
-    """
-    try:
-        missing, unexpected = module.load_state_dict(weights, strict=False)
-    except RuntimeError as error:
-        raise BadInputError(path, str(error).splitlines()[-1].strip(), SAVED_WEIGHTS) from error
-    missing = [name for name in missing if not name.endswith("num_batches_tracked")]
-    if missing or unexpected:
-        raise BadInputError(path, f"no {missing[0]}" if missing else f"also {unexpected[0]}", SAVED_WEIGHTS)
 
 
 # Recovers a float network from an avatar's integer network, to continue training if only the avatar was kept.
@@ -457,10 +446,17 @@ class ByteGrid:
 
     def weights(self, network: UNet) -> dict[str, Tensor]:
         """Return the rounded weights of all convolutions, by name."""
-        return {
-            f"{name}.weight": _rounded_weight(conv.weight, _folded_scale(conv, norm), bool(self.alike))
-            for name, conv, norm in convolutions(network)
-        }
+        rounded = {}
+        for name, conv, norm in convolutions(network):
+            scale = torch.ones(1, device=conv.weight.device)
+            if norm is not None:
+                assert norm.running_var is not None
+                scale = norm.weight.detach() / torch.sqrt(norm.running_var + norm.eps)
+            with torch.no_grad():
+                by_channel = scale[:, None, None, None]
+                change = rounded_weights(conv.weight * by_channel, bool(self.alike)) / by_channel - conv.weight
+            rounded[f"{name}.weight"] = conv.weight + change.nan_to_num(posinf=0.0, neginf=0.0)
+        return rounded
 
     def _stored(self, x: Tensor, place: int) -> Tensor:
         if not self.active:
@@ -501,21 +497,6 @@ def rounded_weights(folded: Tensor, alike: bool) -> Tensor:
     return torch.round(folded / unit) * unit
 
 
-def _rounded_weight(weight: Tensor, scale: Tensor, alike: bool) -> Tensor:
-    """Return `weight` (O,I,h,w) changed so that its product with the norm's `scale` (O,) is rounded."""
-    with torch.no_grad():
-        by_channel = scale[:, None, None, None]
-        change = rounded_weights(weight * by_channel, alike) / by_channel - weight
-    return weight + change.nan_to_num(posinf=0.0, neginf=0.0)
-
-
-def _folded_scale(conv: nn.Conv2d, norm: nn.BatchNorm2d | None) -> Tensor:
-    if norm is None:
-        return torch.ones(1, device=conv.weight.device)
-    assert norm.running_var is not None
-    return norm.weight.detach() / torch.sqrt(norm.running_var + norm.eps)
-
-
 def convolutions(network: UNet) -> Iterator[tuple[str, nn.Conv2d, nn.BatchNorm2d | None]]:
     """Yield (name, convolution, batch norm behind it or None) of each convolution of `network`."""
     named = list(network.named_modules())
@@ -542,10 +523,7 @@ def _places(network: UNet) -> Iterator[str]:
 
 
 def _modules_of(tensor: str) -> tuple[str, ...]:
-    """Return the names of the places of a `ByteGrid` that store the exported `tensor`.
-
-    `tensor`: name by the exporter, such as `/a/b.0/b.0.1/Conv_output_0`.
-    """
+    """Return the names of the places of a `ByteGrid` that store the exported `tensor`."""
     if tensor in NAMED:
         return NAMED[tensor]
     name, operator = module_of(tensor), tensor.rpartition("/")[2]

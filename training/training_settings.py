@@ -148,7 +148,9 @@ def with_usual(values: dict[str, Any], where: str | Path) -> dict[str, Any]:
     """
     start, name = values.get("start", "default"), values.get("loss")
     usual = (NEW if start == "new" else TRAINED) | (_of_loss(name, where) if isinstance(name, str) else {})
-    if start == "new" and _is_short(values):
+    minutes = values.get("minutes")
+    is_short = "steps" not in values and isinstance(minutes, int | float) and minutes < SHORT_MINUTES
+    if start == "new" and is_short:
         usual |= SHORT
     given = {key: value for key, value in values.items() if key != "loss" or not isinstance(name, str)}
     return usual | {key: _over(usual.get(key), value) for key, value in given.items()}
@@ -158,11 +160,6 @@ def _of_loss(name: str, where: str | Path) -> dict[str, Any]:
     if name not in LOSSES:
         raise BadInputError(f"{where}: loss", repr(name), f"one of {', '.join(LOSSES)}", did_you_mean(name, LOSSES))
     return LOSSES[name]
-
-
-def _is_short(values: dict[str, Any]) -> bool:
-    minutes = values.get("minutes")
-    return "steps" not in values and isinstance(minutes, int | float) and minutes < SHORT_MINUTES
 
 
 def _minutes(minutes: float) -> float:

@@ -214,7 +214,10 @@ def validate(
             "made_with": _made_with(plan, renderer),
             "size": plan.size,
             "per_band": plan.per_band,
-            "held_out": {Path(name).name: _origin(name) for name in plan.held_out},
+            "held_out": {
+                Path(name).name: ("built in" if name.startswith("builtin:") else f"sha256 {sha256_of([Path(name)])}")
+                for name in plan.held_out
+            },
             **_arranged(figures, plan.runtimes, float_network.name if float_network is not None else ""),
         }
     )
@@ -239,10 +242,7 @@ def _made_with(plan: ValidationPlan, renderer: SampleRenderer) -> MadeWith:
 
 
 def _arranged(figures: Mapping[str, dict[str, Any]], runtimes: tuple[str, ...], float_network: str) -> dict[str, Any]:
-    """Return the figures of the painters under the keys of `Validation`.
-
-    `figures`: summary of each painter's errors, by the painter's name. `float_network`: name of the float network.
-    """
+    """Return the figures of the painters under the keys of `Validation`."""
     first, *others = runtimes
     own = figures[first]
     arranged: dict[str, Any] = {
@@ -258,11 +258,6 @@ def _arranged(figures: Mapping[str, dict[str, Any]], runtimes: tuple[str, ...], 
             band: round(by_band[band] - psnr, 2) for band, psnr in own["psnr_db_by_band"].items()
         }
     return arranged
-
-
-def _origin(motion: str) -> str:
-    """Return the origin of a motion: `built in`, or `sha256` and the digest of its file."""
-    return "built in" if motion.startswith("builtin:") else f"sha256 {sha256_of([Path(motion)])}"
 
 
 # The image error by size of body and tensor: the same views, painted at several tensor sizes.
@@ -353,10 +348,7 @@ def shown(image: U8, painted: Crop, seen: Crop) -> U8:
 
 
 def _read(rows: F64, painted: Crop, seen: Crop, element: int) -> F64:
-    """Return the lines of the crop `seen`, read from the lines `rows` of the crop `painted`.
-
-    `element`: row of the projection that the lines follow: 0 for columns, 1 for rows.
-    """
+    """Return the lines of the crop `seen`, read from the lines `rows` of the crop `painted`."""
     old, new = painted.projection, seen.projection
     scale = old[element, element] / new[element, element]
     shift = (old[element, 2] - scale * new[element, 2]) / old[3, 2] * (1 if element == 0 else -1)

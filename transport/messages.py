@@ -204,13 +204,12 @@ def _unpack_rest(data: bytes | memoryview, expected: type) -> Any:
         rest: Any = msgpack.unpackb(data)
     except (ValueError, msgpack.UnpackException) as error:
         raise MessageError(f"not msgpack: {error}") from None
-    if not (_are_metrics(rest) if expected is dict else type(rest) is expected):
+    is_fit = type(rest) is expected
+    if is_fit and expected is dict:  # the metrics of a job
+        is_fit = all(type(key) is str and type(value) in (int, float) for key, value in rest.items())
+    if not is_fit:
         raise MessageError(f"found {str(rest)[:80]!r}, expected {expected.__name__}")
     return rest
-
-
-def _are_metrics(rest: Any) -> bool:
-    return type(rest) is dict and all(type(key) is str and type(value) in (int, float) for key, value in rest.items())
 
 
 PACKETS = 16  # messages that a pipe holds; each takes a page of the 64 KiB that Linux gives a pipe

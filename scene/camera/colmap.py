@@ -310,10 +310,7 @@ def _read(folder: Path, ending: str) -> tuple[dict[int, ColmapCamera], list[Colm
 def _lenses(
     where: Path, views: Sequence[ColmapImage], cameras: Mapping[int, ColmapCamera]
 ) -> tuple[tuple[Lens, ...], tuple[str, ...]]:
-    """Return (one lens for all views or one for each, without distortion; notes on the distortion).
-
-    `where`: file of images, for messages. Raises BadInputError when the camera of a view does not exist.
-    """
+    """Return (one lens for all views or one for each, without distortion; notes on the distortion)."""
     for image in views:
         if image.camera not in cameras:
             raise BadInputError(f"{where}: {image.name}", f"camera {image.camera}", "a camera of the model")

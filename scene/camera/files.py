@@ -152,13 +152,9 @@ def detect(path: Path, up_axis: str = AUTO, axes: str = AUTO) -> Guess:
         raise BadInputError(path, "an array of NumPy", "a text or a folder", OF_ARRAY.format(name=path))
     if path.name in COLMAP_FILES and model_in(path.parent) is not None:
         return Guess("colmap", "a file of a COLMAP model")
-    if path.suffix.lower() == ".json" or read_text(path, EXPECTED).lstrip()[:1] == "{":
-        return _of_json(path)
-    return _of_table(path, layout_of(path, EXPECTED), up_axis, axes)
-
-
-def _of_json(path: Path) -> Guess:
     text = read_text(path, EXPECTED)
+    if path.suffix.lower() != ".json" and text.lstrip()[:1] != "{":
+        return _of_table(path, layout_of(path, EXPECTED), up_axis, axes)
     if '"frames"' not in text and '"poses"' in text:
         return Guess("record3d", "JSON with `poses` and no `frames`")
     return Guess("nerf", "it is JSON")
@@ -198,7 +194,9 @@ def _of_table(path: Path, layout: TableLayout, up_axis: str, axes: str) -> Guess
         scalar_first = layout.names.index("qw") < layout.names.index("qx")
         reason = f"column names with the quaternion's scalar {'first' if scalar_first else 'last'}"
         return Guess("euroc" if scalar_first and layout.is_ns else "tum", reason)
-    _require_pose(path, layout)
+    if any(name in layout.names for name in ("qw", "qx", "qy", "qz")):
+        missing = ", ".join(name for name in POSE if name not in layout.names)
+        raise BadInputError(path, f"column names without {missing}", f"names of {', '.join(POSE)} in any order")
     if columns in (MATRIX, MATRIX + 1):
         return _of_matrices(path, head_of(path, columns, EXPECTED), up_axis, axes)
     if columns >= TUM_COLUMNS and layout.has_commas and layout.is_ns:
@@ -210,13 +208,6 @@ def _of_table(path: Path, layout: TableLayout, up_axis: str, axes: str) -> Guess
         return Guess("tum", f"{columns} columns: the quaternion's scalar is taken to be last")
     counts = f"{TUM_COLUMNS} (TUM, EuRoC), {MATRIX} (KITTI) or {MATRIX + 1} (ARKit), or column names"
     raise BadInputError(path, f"{columns} columns", counts, OTHERS.get(columns, ""))
-
-
-def _require_pose(path: Path, layout: TableLayout) -> None:
-    """Raise BadInputError if the column names of `layout` include a part of a quaternion, but not the whole pose."""
-    if any(name in layout.names for name in ("qw", "qx", "qy", "qz")):
-        missing = ", ".join(name for name in POSE if name not in layout.names)
-        raise BadInputError(path, f"column names without {missing}", f"names of {', '.join(POSE)} in any order")
 
 
 def _require_clock(path: Path, numbers: F64, others: Iterable[int]) -> None:
@@ -345,7 +336,7 @@ def _signs(matrices: F64, up_axis: str, times: F64 | None) -> dict[str, tuple[st
     along = _along(turns, places)
     is_upright = bool(abs(mean[:, 0] @ gravity) > max(UPRIGHT, *map(abs, own_up.values())))
     starts = np.abs(turns[0] - np.eye(3)).max() < EXACT and np.abs(places[0]).max() < EXACT
-    has_time = times is not None
+    has_time, (least, most) = times is not None, OF_A_DEVICE_S
     is_up = has_time and own_up[ups[-1]] > LEAST_UP_COSINE
     # For a phone whose lower end points down, which is its X: how steeply the view along -Z goes down. The view along
     # +Z then goes up as steeply.
@@ -354,7 +345,7 @@ def _signs(matrices: F64, up_axis: str, times: F64 | None) -> dict[str, tuple[st
         "kitti": {
             "which begin at the origin without a turn, as KITTI's": starts,
             "which move along +Z, as KITTI's": along > ALONG,
-            "which look at one point along +Z, as KITTI's": _meet(turns @ OPENGL_FROM_OPTICAL, places),
+            "which look at one point along +Z, as KITTI's": _missed(turns @ OPENGL_FROM_OPTICAL, places) < MOST_MISSED,
             "which look down along +Z, as KITTI's": downwards < -LEAST_SKYWARDS,
             f"whose Y is down where {' or '.join(ups).upper()} is up, as KITTI's": (
                 min(own_up.values()) < -UPRIGHT and not is_upright
@@ -365,10 +356,11 @@ def _signs(matrices: F64, up_axis: str, times: F64 | None) -> dict[str, tuple[st
         },
         "arkit": {
             "which move along -Z, as ARKit's": along < -ALONG,
-            "which look at one point along -Z, as ARKit's": _meet(turns, places),
+            "which look at one point along -Z, as ARKit's": _missed(turns, places) < MOST_MISSED,
             "which look down along -Z, as ARKit's": downwards > LEAST_SKYWARDS,
             "of a device held upright, as ARKit's": is_upright and not has_time,
-            "with times of a device's clock, as ARKit's": times is not None and _is_of_device(times),
+            "with times of a device's clock, as ARKit's": times is not None
+            and any(least < times[0] * SECONDS[unit] < most for unit in units_of(times) if unit in SECONDS),
             f"whose Y is up where {ups[0].upper()} is up, as ARKit's": own_up[ups[0]] > UPRIGHT and not is_upright,
             f"with times and {ups[-1].upper()} up, as ARKit's": is_up,
         },
@@ -377,28 +369,14 @@ def _signs(matrices: F64, up_axis: str, times: F64 | None) -> dict[str, tuple[st
 
 
 def _along(turns: F64, places: F64) -> float:
-    """Return the mean cosine, weighted by length, between the steps of `places` (N, 3) and Z of the cameras `turns`.
-
-    `turns` (N, 3, 3): camera to world. The result is 0 for fewer than LEAST_ROWS cameras.
-    """
+    """Return the mean cosine, weighted by length, between the steps of `places` (N, 3) and Z of the cameras `turns`."""
     steps = np.diff(places, axis=0)
     length = float(np.linalg.norm(steps, axis=1).sum())
     return float((steps * turns[:-1, :, 2]).sum()) / length if length > 0 and len(turns) >= LEAST_ROWS else 0.0
 
 
-def _meet(turns: F64, places: F64) -> bool:
-    """Return whether the cameras go round a point and look at this point.
-
-    `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes.
-    """
-    return _missed(turns, places) < MOST_MISSED
-
-
 def _missed(turns: F64, places: F64) -> float:
-    """Return by how much lines of sight miss the point that the cameras go round, as a share of its distance.
-
-    The result is infinite if there is no such point. `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes.
-    """
+    """Return by how much lines of sight miss the point that the cameras go round, as a share of its distance."""
     point = meeting_point(turns, places) if len(turns) >= LEAST_ROWS else None
     if point is None:
         return math.inf
@@ -406,12 +384,6 @@ def _missed(turns: F64, places: F64) -> float:
     along = (towards * ahead).sum(axis=1)
     missed = np.linalg.norm(towards - along[:, None] * ahead, axis=1)
     return float(np.median(missed) / np.median(along)) if np.median(along) > LEAST_AWAY else math.inf
-
-
-def _is_of_device(times: F64) -> bool:
-    """Return whether `times` (N,) may count from when a device was switched on; times of recordings begin at 0."""
-    least, most = OF_A_DEVICE_S
-    return any(least < times[0] * SECONDS[unit] < most for unit in units_of(times) if unit in SECONDS)
 
 
 def _require_one_order(path: Path, numbers: F64, names: tuple[str, ...], axes: F64) -> None:
@@ -469,12 +441,7 @@ def _has_digits(numbers: F64) -> bool:
 
 
 def _astray(turns: F64, places: F64) -> float:
-    """Return how far cameras look away from where they go or from a point that they go round, the less of both.
-
-    A result below 1 means that the cameras look where they go, or at such a point. The result is infinite if there are
-    too few cameras.
-    `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes.
-    """
+    """Return how far cameras look away from where they go or from a point that they go round; below 1 they do not."""
     if len(places) < LEAST_LED:
         return math.inf
     return min((1 + _along(turns, places)) / (1 - ALONG), _missed(turns, places) / MOST_MISSED)
@@ -508,10 +475,7 @@ OPENGL_KINDS = ("arkit", "nerf", "record3d")
 
 
 def _read(kind: str, path: Path, spec: CameraSpec) -> RawCamera:
-    """Return the content of `path`, a file of the format `kind`, in the axes of its poses. `spec`: camera of the scene.
-
-    Raises BadInputError, also when the scene states a unit of times for a file without times.
-    """
+    """Return the content of `path`, a file of the format `kind`, in the axes of its poses. Raises BadInputError."""
     if kind in _TABLES:
         return _TABLES[kind](path, TableClock(spec.rate_hz, spec.time_unit))
     if spec.time_unit != AUTO:
@@ -521,23 +485,11 @@ def _read(kind: str, path: Path, spec: CameraSpec) -> RawCamera:
 
 
 def _axes(kind: str, stated: str) -> F64:
-    """Return the directions of the camera's OpenGL axes, as columns (3, 3), in the coordinates of a pose.
-
-    `kind`: format of the file. `stated`: axes of its poses by the scene; `auto` for those of the format.
-    """
+    """Return the directions of the camera's OpenGL axes, as columns (3, 3), in the coordinates of a pose."""
     axes = axes_of(stated)
     if axes is None:
         return np.eye(3) if kind in OPENGL_KINDS else OPENGL_FROM_OPTICAL
     return np.array(axes, dtype=np.float64)  # row k is the direction of the pose's axis k, in the camera's axes
-
-
-def _with_opengl_axes(raw: RawCamera, kind: str, stated: str) -> RawCamera:
-    """Return `raw`, a file of the format `kind` as its reader returned it, with OpenGL axes.
-
-    `stated`: axes of the file's poses by the scene; `auto` for those of the format.
-    """
-    said = () if stated == AUTO else (f"axes of a pose: {stated}, as given",)
-    return replace(raw, turns=raw.turns @ _axes(kind, stated), notes=(*raw.notes, *said))
 
 
 #: Axes of the poses of robots and drones.
@@ -545,11 +497,7 @@ BODY_AXES = "forward-left-up"
 
 
 def _require_camera(path: Path, raw: RawCamera, kind: str, spec: CameraSpec) -> None:
-    """Raise BadInputError if the poses of `raw` more likely belong to a vehicle's body than to a camera.
-
-    `raw`: file of the format `kind` as its reader returned it. Nothing is checked if the scene states axes or up, or if
-    the poses of the format have OpenGL axes.
-    """
+    """Raise BadInputError if the poses of `raw` more likely belong to a vehicle's body than to a camera."""
     if spec.axes != AUTO or spec.up_axis != AUTO or kind in OPENGL_KINDS:
         return
     turns = raw.turns[np.isfinite(raw.turns).all(axis=(1, 2))]
@@ -580,7 +528,9 @@ def load_camera(spec: CameraSpec, base: Path) -> CameraPath:
     with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # non-finite values are left out later
         raw = _read(guess.kind, path, spec)
         _require_camera(path, raw, guess.kind, spec)
-        camera = path_from_recording(_with_opengl_axes(raw, guess.kind, spec.axes), str(path), spec)
+        said = () if spec.axes == AUTO else (f"axes of a pose: {spec.axes}, as given",)
+        turns = raw.turns @ _axes(guess.kind, spec.axes)
+        camera = path_from_recording(replace(raw, turns=turns, notes=(*raw.notes, *said)), str(path), spec)
     reason = guess.reason or "as given"
     taken = f"taken for {camera.detected.format}: {reason}"
     return replace(camera, notes=(*camera.notes, taken), detected=replace(camera.detected, reason=reason))

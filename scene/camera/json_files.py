@@ -104,28 +104,17 @@ def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
 
 
 def _nerf_lenses(path: Path, content: Mapping[str, Any], frames: Sequence[Any]) -> tuple[tuple[Lens, ...], str]:
-    """Return (one lens for all views, or one for each if any view has its own keys; source of the lenses in words).
-
-    `content`: the file's object. `frames`: its views.
-    """
-    _check_models(path, (content, *frames))
+    """Return (one lens for all views, or one for each if any view has its own keys; source of the lenses in words)."""
+    for keys in (content, *frames):
+        model = str(keys.get("camera_model", ""))
+        if any(word in model.upper() for word in NO_LENS):
+            raise BadInputError(f"{path}: camera_model", model[:40], "a pinhole or fisheye camera", NO_LENS_REMEDY)
     if not any(key in frame for frame in frames if isinstance(frame, dict) for key in LENS_KEYS):
         lens, source = _nerf_lens(path, content, "")
         return (lens,), source
     own = [_nerf_lens(path, {**content, **frame}, f"frames[{k}].") for k, frame in enumerate(frames)]
     sources = dict.fromkeys(source for _, source in own)
     return tuple(lens for lens, _ in own), f"{' or '.join(sources)}, frame by frame"
-
-
-def _check_models(path: Path, tables: Sequence[Mapping[str, Any]]) -> None:
-    """Raise BadInputError if a camera of the file is no perspective camera.
-
-    `tables`: the file's object and its frames.
-    """
-    for keys in tables:
-        model = str(keys.get("camera_model", ""))
-        if any(word in model.upper() for word in NO_LENS):
-            raise BadInputError(f"{path}: camera_model", model[:40], "a pinhole or fisheye camera", NO_LENS_REMEDY)
 
 
 def _distortion(
@@ -187,10 +176,7 @@ def _is_singular(matrix: NDArray[np.float64]) -> bool:
 
 
 def _nerf_lens(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, str]:
-    """Return (lens of a view or of the file, its source in words).
-
-    `content`: keys of the lens. `of`: prefix of the keys in messages, such as `frames[3].`; "" for the file.
-    """
+    """Return (lens of a view or of the file, its source in words)."""
     lens, source = _measured(path, content, of)
     return checked_lens(f"{path}: {of.rstrip('.')}" if of else path, lens), source
 
@@ -215,11 +201,7 @@ def _measured(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, st
 def _by_angle(
     width: float | None, height: float | None, angle_x: float | None, angle_y: float | None
 ) -> tuple[Lens, str]:
-    """Return (lens of a file without focal lengths, source of its angles in words).
-
-    `width`, `height`: size of the picture, pixels. `angle_x`, `angle_y`: fields of view, radians. Each is None if the
-    file does not state it.
-    """
+    """Return (lens of a file without focal lengths, source of its angles in words); None is not stated."""
     angles = {"camera_angle_x": angle_x, "camera_angle_y": angle_y}
     source = f"by {' and '.join(f'`{key}`' for key, value in angles.items() if value)}"
     if not (angle_x or angle_y):
@@ -235,10 +217,7 @@ def _by_angle(
 
 
 def _number(where: str, value: Any, key: str) -> float | None:
-    """Return `value`, a positive number or None. Raises BadInputError about `where` for any other value.
-
-    `key`: key of the value; an angle must be below pi.
-    """
+    """Return `value`, a positive number or None. Raises BadInputError about `where` for any other value."""
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not (math.isfinite(value) and value > 0):

@@ -274,24 +274,15 @@ class Stand:
         return np.tile(self.place, (len(phase), 1))
 
 
-ORBITS = {
+#: Built-in cameras by name.
+BUILTIN: dict[str, Orbit | Descent | Stand] = {
     "orbit": Orbit("whole person, going round, coming nearer", (0.0, 0.93, 0.0), 1.35, 3.9, 3.4, 28.0, 20.0),
     "static": Orbit("whole person, standing still", (0.0, 0.93, 0.0), 1.30, 3.8, 3.8, 0.0, 20.0),
     "closeup": Orbit(HEAD_AND_SHOULDERS, (0.0, 1.50, 0.0), 1.58, 1.15, 0.95, 16.0, 12.0),
     "far": Orbit("whole person, far off", (0.0, 1.00, 0.0), 1.60, 10.0, 8.0, 10.0, 20.0),
-}
-
-
-#: Built-in cameras by name.
-BUILTIN: dict[str, Orbit | Descent | Stand] = {
-    **ORBITS,
     "top-to-floor": Descent("whole person, from above down to the floor", (0.0, 0.90, 0.0), 3.9, 80.0, 0.12, 12.0),
     "wayside": Stand("beside the way of one who walks along z", (-0.1, 1.05, -2.5), (0.9, 1.45, 1.9)),
 }
-
-
-def _pace(camera: Orbit | Descent | Stand) -> str:
-    return "fixed" if isinstance(camera, Stand) else f"{camera.period_s:g} s a cycle"
 
 
 def load_builtin(name: str, spec: CameraSpec) -> CameraPath | None:
@@ -306,7 +297,8 @@ def load_builtin(name: str, spec: CameraSpec) -> CameraPath | None:
     times = np.arange(count + 1) / RATE_HZ
     places = camera.places(2 * np.pi * times / camera.period_s)
     fov = FOV_Y_DEG if spec.fov_y_deg is None else spec.fov_y_deg
-    notes = (f"built in: {camera.what}, {_pace(camera)}, field of view {fov:g} degrees high",)
+    pace = "fixed" if isinstance(camera, Stand) else f"{camera.period_s:g} s a cycle"
+    notes = (f"built in: {camera.what}, {pace}, field of view {fov:g} degrees high",)
     quats = quat_from_matrix(axes_towards(places, np.array(camera.target)))
     optics = one_lens(fov, spec.near_m, spec.far_m)
     return CameraPath(

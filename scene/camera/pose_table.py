@@ -234,11 +234,7 @@ def _plain(name: str) -> str:
 def _unit_of(
     path: Path, columns: tuple[ColumnName, ...], holding: tuple[str, ...], units: Mapping[str, float], key: str
 ) -> str:
-    """Return the unit, a key of `units`, that the columns with a content in `holding` state; "" if they state no unit.
-
-    `key`: key of the scene that states the unit instead, for messages. Raises BadInputError when a unit is unknown, or
-    when the names state different units.
-    """
+    """Return the unit, a key of `units`, that the columns with a content in `holding` state; "" if none."""
     of = [column for column in columns if column.holds in holding]
     found = [SPELLINGS.get(column.unit.lower(), column.unit) for column in of]
     for column, unit in zip(of, found, strict=True):
@@ -248,13 +244,10 @@ def _unit_of(
                 path, f"the column name `{column.text}`", known, f"remove the unit there, and set {key}"
             )
     if len(set(found)) > 1:
-        both = " and ".join(f"`{column.text}`" for column in (of[0], of[_first_other(found)]))
+        other = next(column for column, unit in zip(of, found, strict=True) if unit != found[0])
+        both = f"`{of[0].text}` and `{other.text}`"
         raise BadInputError(path, f"the column names {both}", "one unit for all three", f"remove them, and set {key}")
     return found[0] if found else ""
-
-
-def _first_other(found: Sequence[str]) -> int:
-    return next(k for k, unit in enumerate(found) if unit != found[0])
 
 
 def elapsed(times: NDArray[np.float64]) -> tuple[NDArray[np.float64], float]:
@@ -408,20 +401,16 @@ EVEN, UNEVEN, LEAST_OF_A_CLOCK = 0.01, 0.5, 8
 class PoseTable:
     """The poses of a table with quaternions.
 
-    `times_s` (N,): times from 0.
     `turns` (N, 3, 3), `places` (N, 3): rotations and positions, with the file's axes and unit.
-    `time`: unit of the file's times. `rate`: rate for notes, such as `, 30/s`.
     `order`: source of the order of columns, in words.
     `names`: content of each column of `table`.
     `began_s`: time 0 in seconds since 1970; None if the file's times are not those of a clock.
     `lengths`: unit of the positions by the column names; "" if they state no unit.
     """
 
-    times_s: F64
+    times: ColumnTimes
     turns: F64
     places: F64
-    time: str
-    rate: str
     order: str
     names: Sequence[str]
     table: NumberTable
@@ -455,22 +444,10 @@ def read_pose_table(
     times = times_of(path, time, clock.stated(path, layout.unit))
     quats = np.column_stack([qw, qx, qy, qz])
     _require_quats(path, quats, table)
-    turns = matrix_from_quat(normalised(quats))
-    places = np.column_stack([x, y, z])
+    turns, places = matrix_from_quat(normalised(quats)), np.column_stack([x, y, z])
     if not layout.has_pose:
         _require_times(path, time, places)
-    return PoseTable(
-        times.since_s,
-        turns,
-        places,
-        times.unit,
-        times.rate,
-        order,
-        names,
-        table,
-        _began(time, times.unit),
-        layout.lengths,
-    )
+    return PoseTable(times, turns, places, order, names, table, _began(time, times.unit), layout.lengths)
 
 
 class MatrixTable(NamedTuple):
@@ -532,20 +509,14 @@ def _require_times(path: Path, times: F64, places: F64) -> None:
 
 
 def _worst_step(column: F64) -> float:
-    """Return the largest deviation of the steps of `column` (N,) from their median, as a share of the median.
-
-    The result is infinite if the column does not grow.
-    """
+    """Return the largest deviation of the steps of `column` (N,) from their median, as a share of the median."""
     steps = np.diff(column)
     median = float(np.median(steps))
     return float(np.abs(steps - median).max() / median) if median > 0 and np.isfinite(steps).all() else math.inf
 
 
 def _began(times: F64, unit: str) -> float | None:
-    """Return the first finite time of `times` in seconds since 1970; None if the times are not those of a clock.
-
-    `unit`: unit of `times`, a key of TIME_UNITS or FRAMES.
-    """
+    """Return the first finite time of `times` in seconds since 1970; None if the times are not those of a clock."""
     finite = times[np.isfinite(times)]
     if unit not in TIME_UNITS or not len(finite) or not _since_1970(float(finite[0]), unit):
         return None

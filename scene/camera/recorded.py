@@ -103,10 +103,7 @@ def metres_per_unit(
 
 
 def _looked_at_height(turns: F64, places: F64, fov_y_deg: float) -> float | None:
-    """Return the height, in units of the map, that the pictures show at the point where the cameras look.
-
-    The result is None without such a point. The parameters are those of `metres_per_unit`.
-    """
+    """Return the height, in units of the map, that the pictures show at the point where the cameras look."""
     distance = looked_at_from(turns, places)
     return None if distance is None else float(2 * np.tan(np.radians(fov_y_deg) / 2) * distance)
 
@@ -119,10 +116,7 @@ def _speed(places: F64, times_s: F64) -> float:
 
 
 def _fitting(turns: F64, places: F64, fov_y_deg: float) -> tuple[float, str]:
-    """Return (metres per unit of the map, reason in words), from the path's shape and the lines of sight alone.
-
-    `fov_y_deg`: field of view over the picture's height, degrees.
-    """
+    """Return (metres per unit of the map, reason in words), from the path's shape and the lines of sight alone."""
     height = _looked_at_height(turns, places, fov_y_deg)
     if height is not None:
         return PERSON_M / SHARE / height, f"a person fills {SHARE:.0%} of the picture's height where the cameras look"
@@ -256,19 +250,13 @@ def find_upright(turns: F64, usual: str, is_levelled: bool, stated: str = AUTO) 
     expected = usual if stated == AUTO else stated
     guesses = _guesses(turns, expected, LEVELLED if is_levelled else ANY_WORLD, stated)
     if not guesses:
-        return Upright(np.array(UP[expected]), 0, f"{expected.upper()} up, {_why_without(stated)}")
+        unknown = "usual for the format; the pictures show no horizon to tell it by"
+        return Upright(np.array(UP[expected]), 0, f"{expected.upper()} up, {'as given' if stated != AUTO else unknown}")
     best = min(guesses, key=lambda guess: guess.price)
-    of_first = OF_FIRST if best.name and not is_levelled and _is_of_first(turns, best) else ""
+    first = turns[0]
+    has_first_axes = min(first[0, 0], abs(first[1, 1]), first[:, 1] @ best.up) > AS_FIRST
+    of_first = OF_FIRST if best.name and not is_levelled and len(turns) > 1 and has_first_axes else ""
     return Upright(best.up, best.quarter, _note(best, usual, stated) + _rival(best, guesses, stated) + of_first)
-
-
-def _is_nadir(turns: F64, usual: str, most_deg: float) -> bool:
-    """Return whether a camera looks straight down along the axis `usual`, within `most_deg` degrees.
-
-    If the map has the axes of the first picture, the result is False: such a camera looks ahead along an axis.
-    """
-    is_of_first = np.abs(np.diag(turns[0])).min() > AS_FIRST
-    return bool(turns[:, :, 2].mean(axis=0) @ UP[usual] > np.cos(np.radians(most_deg)) and not is_of_first)
 
 
 def price_of(turns: F64, usual: str) -> float:
@@ -293,11 +281,10 @@ def is_of_body(turns: F64, of_body: F64, usual: str) -> bool:
     cost less by NEAR.
     `usual`: axis that is usually up in the format.
     """
-    cheapest = [
+    camera, body = (
         min(_guesses(one, usual, ANY_WORLD, AUTO), key=lambda guess: guess.price, default=None)
         for one in (turns, of_body)
-    ]
-    camera, body = cheapest
+    )
     if camera is None or body is None or not camera.quarter or body.quarter or {camera.name, body.name} != {usual}:
         return False
     skywards, ahead = (-float(one[:, :, 2].mean(axis=0) @ UP[usual]) for one in (turns, of_body))
@@ -312,29 +299,13 @@ def _guesses(turns: F64, expected: str, prices: _Prices, stated: str) -> list[_G
         for quarter in range(4)
         if (price := _price(turns, np.array(up), quarter)) is not None
     ]
-    if stated == AUTO and _is_nadir(turns, expected, prices.nadir_deg):
+    looks_down = turns[:, :, 2].mean(axis=0) @ UP[expected] > np.cos(np.radians(prices.nadir_deg))
+    # A camera in whose map the first picture has the axes looks ahead along an axis.
+    if stated == AUTO and looks_down and np.abs(np.diag(turns[0])).min() <= AS_FIRST:
         guesses.append(_Guess(expected, np.array(UP[expected]), 0, prices.nadir, is_nadir=True))
     if stated != AUTO or prices.between is None:
         return guesses
     return guesses + _between(turns, prices.between)
-
-
-def _is_of_first(turns: F64, best: _Guess) -> bool:
-    """Return whether the world has the axes of the first picture, and the up of `best` points to this picture's top.
-
-    Both OpenGL axes and optical axes of the picture count. The world of a SLAM map has these axes. If there is only one
-    picture, the result is False.
-
-    `turns` (N, 3, 3): camera axes of the pictures, in OpenGL's convention.
-    `best`: the guess at up.
-    """
-    first = turns[0]
-    is_unturned = abs(first[0, 0]) > AS_FIRST and abs(first[1, 1]) > AS_FIRST
-    return len(turns) > 1 and bool(is_unturned and first[0, 0] > 0 and first[:, 1] @ best.up > AS_FIRST)
-
-
-def _why_without(stated: str) -> str:
-    return "as given" if stated != AUTO else "usual for the format; the pictures show no horizon to tell it by"
 
 
 def _ups_and_rights(turns: F64, quarter: int) -> tuple[F64, F64]:
@@ -344,10 +315,7 @@ def _ups_and_rights(turns: F64, quarter: int) -> tuple[F64, F64]:
 
 
 def _price(turns: F64, up: F64, quarter: int) -> float | None:
-    """Return the cost of a guess by horizons and lines of sight; None if it turns the pictures upside down or sideways.
-
-    `turns` (N, 3, 3): camera axes. `up` (3,): guessed up. `quarter`: guessed number of quarter turns of the pictures.
-    """
+    """Return the cost of a guess by horizons and views; None if it turns the pictures upside down or sideways."""
     ups, rights = _ups_and_rights(turns, quarter)
     cosine = float((ups @ up).mean())
     if cosine <= LEAST_UP_COSINE:
@@ -357,12 +325,7 @@ def _price(turns: F64, up: F64, quarter: int) -> float | None:
 
 
 def _between(turns: F64, dearer: float) -> list[_Guess]:
-    """Return one guess whose up direction may be between the axes; [] if this guess is not believed.
-
-    This direction is most nearly perpendicular to the right axes of all pictures, so the horizons are most nearly
-    level.
-    `dearer`: additional cost of the guess.
-    """
+    """Return the guess at the direction most nearly perpendicular to all right axes; [] if it is not believed."""
     ups, rights = _ups_and_rights(turns, 0)
     spread, directions = np.linalg.eigh(rights.T @ rights / len(rights))
     direction = directions[:, 0] if (ups @ directions[:, 0]).mean() >= 0 else -directions[:, 0]
@@ -411,18 +374,16 @@ def times_without(turns: F64, rate_hz: float | None) -> tuple[F64, str]:
     `turns` (N, 3, 3): camera axes, OpenGL or optical. `rate_hz`: views a second by the scene; None if the scene does
     not say. Without a rate, views that are less than FILM_STEP_DEG apart are a film, and other views are stills.
     """
-    rate, how = _rate(turns) if rate_hz is None else (rate_hz, f"{rate_hz:g} a second as given")
-    return np.arange(len(turns)) / rate, how
-
-
-def _rate(turns: F64) -> tuple[float, str]:
     ahead = turns[:, :, 2]
     cosine = np.clip((ahead[1:] * ahead[:-1]).sum(axis=1), -1, 1)
     finite = cosine[np.isfinite(cosine)]
     step = float(np.degrees(np.median(np.arccos(finite)))) if len(finite) else 0.0
-    if step > FILM_STEP_DEG:
-        return 1.0, f"stills {step:.0f} degrees apart, 1 a second"
-    return FILM_RATE_HZ, f"{FILM_RATE_HZ:g} a second assumed"
+    rate, how = FILM_RATE_HZ, f"{FILM_RATE_HZ:g} a second assumed"
+    if rate_hz is not None:
+        rate, how = rate_hz, f"{rate_hz:g} a second as given"
+    elif step > FILM_STEP_DEG:
+        rate, how = 1.0, f"stills {step:.0f} degrees apart, 1 a second"
+    return np.arange(len(turns)) / rate, how
 
 
 #: A matrix counts as a rotation if the entries of |R^T R - 1| are below this.
@@ -528,10 +489,7 @@ def _in_metres(raw: RawCamera, where: str, spec: CameraSpec) -> tuple[F64, Camer
 
 
 def _optics(raw: RawCamera, usable: NDArray[np.intp], quarter: int, spec: CameraSpec) -> tuple[Optics, str]:
-    """Return (lenses of the poses with the indices `usable`, source of the lenses in words).
-
-    The lenses are those of the picture after `quarter` quarter turns.
-    """
+    """Return (lenses of the poses with the indices `usable`, source of the lenses in words)."""
     if spec.fov_y_deg is not None:
         optics = one_lens(spec.fov_y_deg, spec.near_m, spec.far_m)
         return optics, f"field of view {spec.fov_y_deg:.4g} degrees high, as given"

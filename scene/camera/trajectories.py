@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -95,12 +94,7 @@ def load_kitti(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
 
 
 def _kitti_times(path: Path, read: MatrixTable, clock: TableClock) -> tuple[F64, str]:
-    """Return (times of the poses (N,), seconds; their source in words).
-
-    The source is the file, `times.txt`, the scene or the usual rate.
-
-    Raises BadInputError when `times.txt` has another number of times than there are poses.
-    """
+    """Return (times of the poses (N,), seconds; their source in words). Raises BadInputError."""
     if read.times is not None and read.times.unit != FRAMES:
         return read.times.since_s, f"by the times of the file, in {read.times.unit}"
     beside = path.with_name(KITTI_TIMES)
@@ -115,10 +109,7 @@ def _kitti_times(path: Path, read: MatrixTable, clock: TableClock) -> tuple[F64,
 
 
 def _counted(path: Path, clock: TableClock) -> TableClock:
-    """Return the clock of poses without times, which counts frames.
-
-    Raises BadInputError when the scene states a unit of times.
-    """
+    """Return the clock of poses without times, which counts frames."""
     if clock.unit not in (AUTO, FRAMES):
         found = f'camera.time_unit = "{clock.unit}" with poses without times'
         raise BadInputError(path, found, "times in the file", "remove it, or set camera.rate_hz")
@@ -140,14 +131,14 @@ def load_tum(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
     Format: https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats.
     """
     poses = read_pose_table(path, clock, TUM_NAMES, TUM)
-    order = "" if poses.order == USUAL else f", columns {poses.order}"
-    time = "" if poses.time == "s" else f", time in {poses.time}"
-    notes = (f"TUM trajectory, {len(poses.times_s)} poses{poses.rate}{time}{order}, optical axes, camera to world",)
+    times, order = poses.times, "" if poses.order == USUAL else f", columns {poses.order}"
+    time = "" if times.unit == "s" else f", time in {times.unit}"
+    notes = (f"TUM trajectory, {len(poses.turns)} poses{times.rate}{time}{order}, optical axes, camera to world",)
     lens = ((KINECT,), "usual for a Kinect")
     reason = f"{TUM_COLUMNS} columns of numbers"
     detected = Detected("TUM trajectory", reason, unit="m", rate="by the times of the file")
     return RawCamera(
-        poses.times_s,
+        times.since_s,
         poses.turns,
         poses.places,
         "z",
@@ -187,12 +178,15 @@ def load_euroc(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
         numbers = _sensor(sensor)
         to_body = numbers["data"].reshape(4, 4)
         turns, places = turns @ to_body[:3, :3], places + turns @ to_body[:3, 3] / LENGTH_UNITS[poses.lengths or "m"]
-        lens, source = checked_lens(sensor, _sensor_lens(numbers)), f"by {EUROC_SENSOR}"
-        how = (f"poses of the body, brought to the camera by {EUROC_SENSOR}", *_sensor_distortion(lens, numbers))
-    notes = (f"EuRoC poses, {len(poses.times_s)}{poses.rate}, time in {poses.time}, columns {poses.order}", *how)
+        own = of_opencv(*(float(value) for key in ("resolution", "intrinsics") for value in numbers[key]))
+        lens, source = checked_lens(sensor, own), f"by {EUROC_SENSOR}"
+        bent = dict(zip(("k1", "k2", "p1", "p2"), map(float, numbers["distortion_coefficients"]), strict=True))
+        how = (f"poses of the body, brought to the camera by {EUROC_SENSOR}", *distortion_note([Bent(lens, bent)]))
+    times = poses.times
+    notes = (f"EuRoC poses, {len(turns)}{times.rate}, time in {times.unit}, columns {poses.order}", *how)
     detected = Detected("EuRoC poses", "times in ns and commas", unit="m", rate="by the times of the file")
     return RawCamera(
-        poses.times_s,
+        times.since_s,
         turns,
         places,
         "z",
@@ -206,22 +200,8 @@ def load_euroc(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
     )
 
 
-def _sensor_lens(numbers: Mapping[str, F64]) -> Lens:
-    width, height = (float(value) for value in numbers["resolution"])
-    fx, fy, cx, cy = (float(value) for value in numbers["intrinsics"])
-    return of_opencv(width, height, fx, fy, cx, cy)
-
-
-def _sensor_distortion(lens: Lens, numbers: Mapping[str, F64]) -> tuple[str, ...]:
-    keys = ("k1", "k2", "p1", "p2")
-    return distortion_note([Bent(lens, dict(zip(keys, map(float, numbers["distortion_coefficients"]), strict=True)))])
-
-
 def _sensor(path: Path) -> dict[str, F64]:
-    """Return the numbers of a `sensor.yaml` by key of SENSOR_KEYS. In the file, each value is a list in brackets.
-
-    Raises BadInputError when numbers are missing or not plausible.
-    """
+    """Return the numbers of a `sensor.yaml` by key of SENSOR_KEYS. In the file, each value is a list in brackets."""
     text = "\n".join(line.split("#", 1)[0] for line in read_text(path, "a EuRoC sensor.yaml").splitlines())
     numbers = {}
     for key, count in SENSOR_KEYS.items():
@@ -256,11 +236,12 @@ def load_stray(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
     file = path / STRAY_FILE if path.is_dir() else path
     poses = read_pose_table(file, clock, STRAY_NAMES, STRAY, may_have_more=True)
     lenses, source = _stray_lenses(file, poses)
-    time = "" if poses.time == "s" else f", time in {poses.time}"
-    notes = (f"Stray Scanner, {len(poses.times_s)} poses{poses.rate}{time}, optical axes, camera to world",)
+    times = poses.times
+    time = "" if times.unit == "s" else f", time in {times.unit}"
+    notes = (f"Stray Scanner, {len(poses.turns)} poses{times.rate}{time}, optical axes, camera to world",)
     detected = Detected("Stray Scanner odometry", "its column names", unit="m", rate="by the times of the file")
     return RawCamera(
-        poses.times_s,
+        times.since_s,
         poses.turns,
         poses.places,
         "y",

@@ -136,8 +136,9 @@ class Walker:
         toe_off, strike = self._pitches(old, new)
         next_off = self._pitches(new, self._print(after, swings[(k + 2) % len(swings)]))[0]
         phase = local / air
+        in_air = local < air
         pitch = np.where(
-            local < air,
+            in_air,
             toe_off + (strike - toe_off) * smooth_step(phase * 1.1),
             strike * (1 - smooth_step((local - air) / self.plant_s))
             + next_off * smooth_step(1 - (until_next - local) / self.roll_s) ** 1.5,
@@ -148,11 +149,8 @@ class Walker:
         landed = self._ankle(np.array(new), np.array([strike]))
         rise = (0.04 + 0.07 * abs(toe_off)) * np.sin(np.pi * np.clip(phase, 0, 1) ** 0.7)
         flying = lifted + (landed - lifted) * smooth_step(phase)[:, None] + rise[:, None] * np.array([0.0, 1.0, 0.0])
-        planted = self._ankle(np.array(new), pitch)
-        in_air = local < air
-        ankle = np.where(in_air[:, None], flying, planted)
-        table = np.column_stack([ankle, heading, pitch, ~in_air])
-        return local < until_next, table
+        ankle = np.where(in_air[:, None], flying, self._ankle(np.array(new), pitch))
+        return local < until_next, np.column_stack([ankle, heading, pitch, ~in_air])
 
     def _print(self, swing: Swing, after: Swing) -> tuple[float, float, float]:
         """Return the footprint between swing `swing` and the next swing `after`, as (x, z, heading).
@@ -167,10 +165,7 @@ class Walker:
 
     @staticmethod
     def _pitches(old: tuple[float, float, float], new: tuple[float, float, float]) -> tuple[float, float]:
-        """Return the pitch at toe-off (heel up) and at heel strike (toes up), radians; both grow with the stride.
-
-        `old`, `new`: footprints before and after the swing.
-        """
+        """Return the pitch at toe-off (heel up) and at heel strike (toes up), radians; both grow with the stride."""
         ahead = np.array([np.sin(new[2]), np.cos(new[2])]) @ (np.array(new[:2]) - np.array(old[:2]))
         size = float(np.clip(ahead / 0.9, 0.0, 1.0))
         return 0.12 + 0.55 * size, -0.28 * size
@@ -205,8 +200,7 @@ def solve_leg(build: Build, side: int, hip: F64, pelvis: F64, foot: FootTrack) -
     lateral = (about(1, foot.heading)[:, :, 0] + pelvis[:, :, 0]) / 2
     turn = _frame(to_ankle, lateral) @ np.swapaxes(_frame(reach, np.array([1.0, 0.0, 0.0])), -1, -2)
     sole = about(1, foot.heading) @ about(0, foot.pitch)
-    hip_local = np.swapaxes(pelvis, -1, -2) @ turn
-    return hip_local, knee, np.swapaxes(turn @ knee, -1, -2) @ sole
+    return np.swapaxes(pelvis, -1, -2) @ turn, knee, np.swapaxes(turn @ knee, -1, -2) @ sole
 
 
 def _knee_angle(thigh: F64, shin: F64, distance: F64) -> F64:
@@ -233,7 +227,7 @@ ELBOW_EASE = 0.22
 UPPER_ARM = (-0.80, -0.38, 0.30)
 FOREARM = (-0.22, 0.95, 0.22)
 WAVE_REACH = 0.42
-#: Curl of the three joints of a relaxed finger, radians.
+#: Curl of the three joints of each relaxed finger, radians, in SMPL-X order.
 CURL = {
     "index": (0.22, 0.32, 0.18),
     "middle": (0.30, 0.38, 0.22),
@@ -270,7 +264,7 @@ def waving_arm(wave: F64) -> tuple[F64, F64, F64]:
 
 def relaxed_hands(side: int) -> F64:
     """Return axis-angle (15, 3) of the fingers of one relaxed hand, in SMPL-X order. `side`: +1 left, -1 right."""
-    fingers = [[(0.0, 0.0, -side * angle) for angle in CURL[name]] for name in ("index", "middle", "pinky", "ring")]
+    fingers = [[(0.0, 0.0, -side * angle) for angle in curl] for curl in CURL.values()]
     thumb = [(0.1, -side * 0.15, 0.0), (0.0, side * 0.1, 0.0), (0.0, side * 0.12, 0.0)]
     return np.array([*fingers, thumb]).reshape(15, 3)
 
@@ -338,7 +332,7 @@ def walk_wave_turn() -> Motion:
 def there_and_back() -> Motion:
     """Return the motion, fifteen seconds long, of a person who walks five metres along z, turns and walks back."""
     times = np.arange(int(FAR_PERIOD_S * RATE_HZ)) / RATE_HZ
-    walker = Walker(BUILD, _far_route, far_swings(), FAR_PERIOD_S)
+    walker = Walker(BUILD, lambda at: _along_z(at, -FAR_M / 2, FAR_WALKS, FAR_TURNS), far_swings(), FAR_PERIOD_S)
     left, right = walker.foot(1, times), walker.foot(-1, times)
     return _closed(times, *_body(times, left, right, wave=False), "walks five metres, turns and walks back")
 
@@ -356,8 +350,17 @@ def far_swings() -> tuple[Swing, ...]:
 def idle() -> Motion:
     """Return the motion, eight seconds long, of a person who stands, breathes, shifts the weight and looks about."""
     times = np.arange(8 * RATE_HZ) / RATE_HZ
-    tracks = [_standing(side, len(times)) for side in (1, -1)]
-    poses, places = _body(times, tracks[0], tracks[1], wave=False, shift_m=0.018 * np.sin(np.pi * times / 4))
+    count, apart, height = len(times), BUILD.feet_apart, BUILD.ankle_height
+    left, right = (
+        FootTrack(
+            np.tile([side * apart / 2, height, 0.0], (count, 1)),
+            np.full(count, 0.1 * side),
+            np.zeros(count),
+            np.ones(count),
+        )
+        for side in (1, -1)
+    )
+    poses, places = _body(times, left, right, wave=False, shift_m=0.018 * np.sin(np.pi * times / 4))
     poses[:, JOINT_INDEX["head"], 1] += 0.12 * np.sin(np.pi * times / 4 + 0.6)
     return _closed(times, poses, places, "stands")
 
@@ -377,12 +380,9 @@ BUILTIN: dict[str, Callable[[], Motion]] = {
 
 
 def _closed(times: F64, poses: F64, places: F64, what: str) -> Motion:
-    """Return a motion that loops, because its last frame equals its first. `what`: words for the note.
-
-    `times` (T,): seconds. `poses` (T, 55, 3): axis-angle. `places` (T, 3): positions of the pelvis, metres.
-    """
+    """Return a motion that loops, because its last frame equals its first. `what`: words for the note."""
     times = np.append(times, len(times) / RATE_HZ)
-    poses, places = np.concatenate([poses, poses[:1]]), np.concatenate([places, places[:1]])
+    poses, places = (np.concatenate([values, values[:1]]) for values in (poses, places))
     notes = (f"built in: {what}, {RATE_HZ} frames/s",)
     return Motion(times, poses, places, None, notes, Wrap.LOOP, BUILD.leg_m, False)
 
@@ -391,15 +391,8 @@ def _route(times: F64) -> tuple[F64, F64, F64]:
     return _along_z(times, START_Z_M, WALKS, TURNS)
 
 
-def _far_route(times: F64) -> tuple[F64, F64, F64]:
-    return _along_z(times, -FAR_M / 2, FAR_WALKS, FAR_TURNS)
-
-
 def _along_z(times: F64, start_m: float, walks: Changes, turns: Changes) -> tuple[F64, F64, F64]:
-    """Return (x, z, heading) at `times` (T,) of a route along z that begins at `start_m`, metres; x is 0.
-
-    `walks`, `turns`: tables of the changes of z, metres, and of the heading, radians.
-    """
+    """Return (x, z, heading) at `times` (T,) of a route along z that begins at `start_m`, metres; x is 0."""
     z = start_m + sum(far * _eased((times - start) / (end - start)) for start, end, far in walks)
     heading = sum(angle * smooth_step((times - start) / (end - start)) for start, end, angle in turns)
     return np.zeros_like(times), np.asarray(z), np.asarray(heading)
@@ -418,24 +411,12 @@ def _eased(x: F64) -> F64:
     return np.where(s < ramp, start, np.where(s > 1 - ramp, end, middle))
 
 
-def _standing(side: int, count: int) -> FootTrack:
-    ankle = np.tile([side * BUILD.feet_apart / 2, BUILD.ankle_height, 0.0], (count, 1))
-    return FootTrack(ankle, np.full(count, 0.1 * side), np.zeros(count), np.ones(count))
-
-
 def _body(
     times: F64, left: FootTrack, right: FootTrack, wave: bool = True, shift_m: F64 | float = 0.0
 ) -> tuple[F64, F64]:
-    """Return poses (T, 55, 3) and pelvis positions (T, 3) of a body on two feet.
-
-    `times` (T,): seconds in the cycle.
-    `left`, `right`: tracks of the feet.
-    `wave`: whether the right arm waves.
-    `shift_m`: shift of the pelvis to its left, metres, (T,) or one number.
-    """
+    """Return poses (T, 55, 3) and pelvis positions (T, 3) of a body on two feet. `shift_m`: shift to its left."""
     heading = blurred_heading(left, right)
-    ahead = _along(heading, left.ankle - right.ankle)
-    stride = blurred(ahead, 3)
+    stride = blurred(_along(heading, left.ankle - right.ankle), 3)
     weight = blurred(left.load - right.load, 7)
     pace = blurred(np.abs(_along(heading, _velocity(left) + _velocity(right))) / 2, 8)
     pelvis_yaw = -0.22 * stride
@@ -475,38 +456,19 @@ def _along(heading: F64, vectors: F64) -> F64:
 def _pelvis_place(
     left: FootTrack, right: FootTrack, heading: F64, pelvis: F64, weight: F64, shift_m: F64 | float
 ) -> F64:
-    """Return pelvis positions (T, 3): between the feet, shifted to the loaded foot, low enough for both legs to reach.
-
-    `left`, `right`: tracks of the feet.
-    `heading` (T,): heading of the pelvis, radians.
-    `pelvis` (T, 3, 3): rotations of the pelvis.
-    `weight` (T,): 1 with all weight on the left foot, -1 on the right.
-    `shift_m`: further shift to the left, metres.
-    """
+    """Return pelvis positions (T, 3): between the feet, over the loaded foot, low enough for both legs to reach."""
     between = blurred((left.ankle + right.ankle) / 2, 7)
     aside = 0.028 * weight + shift_m
     place = between + np.column_stack([np.cos(heading) * aside, 0 * aside, -np.sin(heading) * aside])
     place[:, 0] += 0.02 * np.sin(heading)
     place[:, 2] += 0.02 * np.cos(heading)
-    heights = [_height_within_reach(side, foot, place, pelvis) for side, foot in ((1, left), (-1, right))]
-    low = np.minimum(*heights)
-    place[:, 1] = blurred(_eroded(low, 6), 4)
+    low = np.minimum(*(_height_within_reach(side, foot, place, pelvis) for side, foot in ((1, left), (-1, right))))
+    place[:, 1] = blurred(np.min([np.roll(low, k) for k in range(-6, 7)], axis=0), 4)
     return place
 
 
-def _eroded(values: F64, reach: int) -> F64:
-    """Return the minimum (T,) of cyclic `values` (T,) over `reach` samples on either side."""
-    return np.asarray(np.min([np.roll(values, k) for k in range(-reach, reach + 1)], axis=0))
-
-
 def _height_within_reach(side: int, foot: FootTrack, place: F64, pelvis: F64) -> F64:
-    """Return the greatest pelvis height (T,), metres, at which the leg reaches its ankle.
-
-    `side`: +1 left, -1 right.
-    `foot`: track of the foot.
-    `place` (T, 3): positions of the pelvis; only x and z count.
-    `pelvis` (T, 3, 3): rotations of the pelvis.
-    """
+    """Return the greatest pelvis height (T,), metres, at which the leg reaches; `place` gives x and z."""
     hip = pelvis @ BUILD.side(BUILD.hip, side)
     flat = foot.ankle - place - hip
     level = np.hypot(flat[:, 0], flat[:, 2])
@@ -514,14 +476,7 @@ def _height_within_reach(side: int, foot: FootTrack, place: F64, pelvis: F64) ->
 
 
 def _trunk(poses: F64, times: F64, pelvis_yaw: F64, weight: F64, pace: F64) -> None:
-    """Set spine, neck and head in `poses`: shoulders turn against the hips; the body leans with the pace and breathes.
-
-    `poses` (T, 55, 3): changed in place.
-    `times` (T,): seconds in the cycle.
-    `pelvis_yaw` (T,): yaw of the hips, radians.
-    `weight` (T,): 1 with all weight on the left foot, -1 on the right.
-    `pace` (T,): speed of the feet, m/s.
-    """
+    """Set spine, neck and head: shoulders turn against the hips; the body leans with the pace and breathes."""
     breath = np.sin(2 * np.pi * times / (times[-1] + times[1]) * round(times[-1] / 3.6))
     for name, share in (("spine1", 0.25), ("spine2", 0.35), ("spine3", 0.4)):
         joint = poses[:, JOINT_INDEX[name]]
@@ -535,41 +490,27 @@ def _trunk(poses: F64, times: F64, pelvis_yaw: F64, weight: F64, pace: F64) -> N
 
 
 def _arms(poses: F64, times: F64, stride: F64, wave: bool) -> None:
-    """Set arms and hands in `poses`: they swing against the legs; the right arm waves if `wave` is set.
-
-    `poses` (T, 55, 3): changed in place.
-    `times` (T,): seconds in the cycle.
-    `stride` (T,): distance by which the left foot is ahead of the right, metres.
-    """
+    """Set arms and hands in `poses`: they swing against the legs; the right arm waves if `wave` is set."""
     lag = np.roll(stride, 3)
-    up = _wave_weight(times) if wave else np.zeros_like(times)
+    start, raised, lower, down = WAVE_S
+    rise, fall = smooth_step((times - start) / (raised - start)), smooth_step((times - lower) / (down - lower))
+    up = (rise - fall) * wave
     for side, name in ((1, "left"), (-1, "right")):
-        shoulder, elbow, wrist = hanging_arm(side, 0.6 * side * lag)
+        arm: tuple[F64, ...] = hanging_arm(side, 0.6 * side * lag)
         if side < 0 and wave:
-            raised = waving_arm(np.sin(2 * np.pi * WAVES_PER_S * (times - WAVE_S[1])))
-            shoulder, elbow, wrist = (
-                _between(low, high, up) for low, high in zip((shoulder, elbow, wrist), raised, strict=True)
-            )
-        _set(poses, f"{name}_shoulder", shoulder)
-        _set(poses, f"{name}_elbow", elbow)
-        _set(poses, f"{name}_wrist", wrist)
+            waving = waving_arm(np.sin(2 * np.pi * WAVES_PER_S * (times - raised)))
+            arm = tuple(_between(low, high, up) for low, high in zip(arm, waving, strict=True))
+        for joint, turn in zip(("shoulder", "elbow", "wrist"), arm, strict=True):
+            _set(poses, f"{name}_{joint}", turn)
         poses[:, JOINT_INDEX[f"{name}_collar"], 2] = -0.06 * side
         first = JOINT_INDEX[f"{name}_index1"]
         open_hand = up if side < 0 else np.zeros_like(up)
-        curl = relaxed_hands(side) * (1 - 0.75 * open_hand)[:, None, None]
-        poses[:, first : first + 15] = curl
-    collar = poses[:, JOINT_INDEX["right_collar"]]
-    collar[:, 2] -= 0.18 * up
-
-
-def _wave_weight(times: F64) -> F64:
-    start, up, lower, down = WAVE_S
-    return np.asarray(smooth_step((times - start) / (up - start)) - smooth_step((times - lower) / (down - lower)))
+        poses[:, first : first + 15] = relaxed_hands(side) * (1 - 0.75 * open_hand)[:, None, None]
+    poses[:, JOINT_INDEX["right_collar"], 2] -= 0.18 * up
 
 
 def _between(low: F64, high: F64, weight: F64) -> F64:
-    start, end = quat_from_matrix(low), quat_from_matrix(high)
-    return matrix_from_quat(slerp(start, end, weight))
+    return matrix_from_quat(slerp(quat_from_matrix(low), quat_from_matrix(high), weight))
 
 
 def _set(poses: F64, joint: str, turn: F64) -> None:

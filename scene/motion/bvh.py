@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -164,7 +164,10 @@ class _Hierarchy:
             if word == "JOINT":
                 open_joints.append(self._joint(parent=open_joints[-1]))
             elif word == "END":
-                self._tip(self.joints[open_joints[-1]])
+                self.words.want("SITE")
+                self.words.want("{")
+                self.joints[open_joints[-1]].tip = self.words.offset()
+                self.words.want("}")
             elif word == "CHANNELS":
                 self._channels(self.joints[open_joints[-1]])
             else:
@@ -177,12 +180,6 @@ class _Hierarchy:
         self.words.want("{")
         self.joints.append(BvhJoint(name, parent, self.words.offset()))
         return len(self.joints) - 1
-
-    def _tip(self, joint: BvhJoint) -> None:
-        self.words.want("SITE")
-        self.words.want("{")
-        joint.tip = self.words.offset()
-        self.words.want("}")
 
     def _channels(self, joint: BvhJoint) -> None:
         count = self.words.number()
@@ -203,8 +200,8 @@ def load_bvh(path: Path) -> Bvh:
     """
     lines = read_text(path, EXPECTED).splitlines()
     start = next((k for k, line in enumerate(lines) if line.strip().upper() == "MOTION"), len(lines))
-    words = _Words(path, [(k + 1, word) for k, line in enumerate(lines[:start]) for word in line.split()])
-    hierarchy = _Hierarchy(words)
+    words = [(number, word) for number, line in enumerate(lines[:start], 1) for word in line.split()]
+    hierarchy = _Hierarchy(_Words(path, words))
     hierarchy.read()
     if start == len(lines):
         raise BadInputError(f"{path}, line {len(lines)}", "the end of the file", "a line MOTION")
@@ -284,22 +281,14 @@ def leading_t_pose(tracks: Tracks, trunk: F64) -> tuple[int, tuple[str, ...]]:
         return 0, ()
     bones = np.array([tracks.bone(*pair) for pair in pairs])
     moved = np.flatnonzero(angle_between(bones, bones[:, :1]).max(axis=0) > STILL)
-    if not len(moved) or not _in_t(tracks, trunk, bones)[0]:
+    left = tracks.across("hip")
+    expected = np.array([left, -left, left, -left, -trunk, -trunk, -trunk, -trunk])[:, 0]
+    if not len(moved) or not (angle_between(bones[:, 0], expected) < IN_T).all():
         return 0, ()
     first = int(moved[0])
     if angle_between(bones[:, first], bones[:, first - 1]).max() < JUMP:
         return 0, ("begins in a T pose and moves on from it; `start_s` leaves it out",)
     return first, (f"a T pose before the motion, which jumps away from it: left out, {first} of the frames",)
-
-
-def _in_t(tracks: Tracks, trunk: F64, bones: F64) -> NDArray[np.bool_]:
-    """Return a mask (T,) of the frames in which the body is in a T pose. `trunk` (T, 3): vector along the trunk.
-
-    `bones` (8, T, 3): vectors along the bones of CHAINS.
-    """
-    left = tracks.across("hip")
-    expected = np.array([left, -left, left, -left, -trunk, -trunk, -trunk, -trunk])
-    return np.asarray((angle_between(bones, expected) < IN_T).all(axis=0))
 
 
 LEAST_LENGTH = 1e-6
@@ -336,11 +325,13 @@ def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MA
     partners = sorted(JOINT_INDEX[name] for name in index_of)
     hands = sum(index >= 25 for index in partners)
     rate = 1 / bvh.frame_time_s
+    missing = ", ".join(name for name in BODY_JOINTS if name not in index_of)
+    no_partner = f"{missing}: no partner, so they follow their parents; `{STATED}` of the avatar names partners"
     notes = (
         f"BVH, {len(bvh.joints)} joints named as in {dialect}, {len(bvh.frames)} frames at {rate:.4g}/s",
         f"units: {unit} (leg of {leg * unit_m:.2f} m)",
         f"{len(index_of)} joints have a partner, {hands} of them in the hands",
-        *_without_partner(index_of),
+        *([no_partner] if missing else []),
         *of_roots,
         *how,
         *of_t_pose,
@@ -355,14 +346,6 @@ def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MA
         among_all(values, readable)[start:] for values in (poses, places * unit_m, feet_of(tracks) * unit_m)
     )
     return RawMotion(times[start:], poses, places, None, "y", notes, leg * unit_m, detected, UPS, feet)
-
-
-def _without_partner(index_of: Collection[str]) -> tuple[str, ...]:
-    """Return a note on the joints of the body, apart from hands, that are not in `index_of`."""
-    missing = [name for name in BODY_JOINTS if name not in index_of]
-    if not missing:
-        return ()
-    return (f"{', '.join(missing)}: no partner, so they follow their parents; `{STATED}` of the avatar names partners",)
 
 
 def _person(
@@ -409,12 +392,9 @@ def tracks_of(bvh: Bvh, index_of: dict[str, int]) -> tuple[Tracks, NDArray[np.bo
     turns, places = turns[readable], places[readable]
     named = {name: places[:, index] for name, index in index_of.items()}
     least = LEAST_TIP * leg_length(Tracks(named)) if len(places) else 0.0
-    tips = {name: _tip(bvh, index, turns, places, least) for name, index in index_of.items()}
-    return Tracks(
-        named,
-        {name: turns[:, index] for name, index in index_of.items()},
-        {name: tip for name, tip in tips.items() if tip is not None},
-    ), readable
+    ends = ((name, _tip(bvh, index, turns, places, least)) for name, index in index_of.items())
+    tips = {name: tip for name, tip in ends if tip is not None}
+    return Tracks(named, {name: turns[:, index] for name, index in index_of.items()}, tips), readable
 
 
 def _tip(bvh: Bvh, index: int, turns: F64, places: F64, least: float) -> F64 | None:

@@ -74,10 +74,7 @@ def places_in(array: NDArray[Any]) -> F64 | None:
 
 
 def _sound(places: F64) -> NDArray[np.bool_]:
-    """Return a mask (T,) of the frames in which all bones have a person's lengths, nearly equal in all frames.
-
-    `places`: positions (T, 22, 3).
-    """
+    """Return a mask (T,) of the frames of `places` (T, 22, 3) whose bones have a person's rigid lengths."""
     with np.errstate(all="ignore"):
         bones = _bones(places)
         usual = np.nanmedian(bones, axis=0) if np.isfinite(bones).any(axis=0).all() else np.zeros(len(_ENDS))
@@ -88,17 +85,12 @@ def _sound(places: F64) -> NDArray[np.bool_]:
             and _within(likeness[_TRUNK], LIKE_A_SPINE)
             and _within(usual[_LEFT] / usual[_RIGHT], LIKE_THE_OTHER)
         )
-        if not alike:
-            return np.zeros(len(places), dtype=bool)
         rigid = ((bones < RIGID * usual) & (bones > usual / RIGID)).all(axis=1)
-        return np.asarray(rigid & _upright_parts(places))
+        return np.asarray(alike & rigid & _upright_parts(places))
 
 
 def _upright_parts(places: F64) -> NDArray[np.bool_]:
-    """Return a mask (T,) of the frames in which the hips are apart and the trunk is not folded.
-
-    `places`: positions (T, 22, 3).
-    """
+    """Return a mask (T,) of the frames of `places` with hips apart and an unfolded trunk."""
     at = {name: places[:, index] for index, name in enumerate(NAMES)}
 
     def way(*names: str) -> F64:
@@ -129,11 +121,12 @@ def motion_of_places(source: str, places: F64, units: str, rest: F64) -> RawMoti
     sound = _sound(places)
     tracks = Tracks({name: places[sound, index] for index, name in enumerate(NAMES)})
     unit, unit_m = unit_of(leg_length(tracks), units)
+    leg_m = leg_length(tracks) * unit_m
     poses, pelvis, how = retarget(tracks, rest)
     rate = f"{RATE_HZ:g} frames/s, as HumanML3D has them"
     notes = (
         f"places of 22 joints {source}, as of HumanML3D, {len(places)} frames, {rate}: their distances are a person's",
-        f"units: {unit} (leg of {leg_length(tracks) * unit_m:.2f} m)",
+        f"units: {unit} (leg of {leg_m:.2f} m)",
         "turns are made from the places; how limbs twist follows from their bend, the head follows the neck",
         *how,
         "betas: none in the format",
@@ -143,7 +136,6 @@ def motion_of_places(source: str, places: F64, units: str, rest: F64) -> RawMoti
     )
     poses, pelvis, feet = (among_all(values, sound) for values in (poses, pelvis * unit_m, feet_of(tracks) * unit_m))
     times = np.arange(len(places)) / RATE_HZ
-    leg_m = leg_length(tracks) * unit_m
     return RawMotion(times, poses, pelvis, None, "y", notes, leg_m, detected, UPS, feet)
 
 

@@ -166,7 +166,9 @@ def match_names(path: Path, names: list[str], joint_map: Mapping[str, str] = NO_
         index_of.setdefault(plain(name), index)
     matches = {family: _by_table(table, index_of) for family, table in DIALECTS.items()}
     best = max(matches, key=lambda family: (not _missing(matches[family], stated), len(matches[family])))
-    found = _overruled(matches[best], stated)
+    taken = set(stated.values())
+    found = {name: index for name, index in matches[best].items() if name not in stated and index not in taken}
+    found |= {name: index for name, index in stated.items() if index is not None}
     missing = _missing(found, {})
     if missing:
         raise BadInputError(
@@ -184,10 +186,7 @@ def _missing(found: Mapping[str, int], stated: Mapping[str, int | None]) -> list
 
 
 def _stated(path: Path, names: list[str], target: str, source: str) -> int | None:
-    """Return the index of the joint whose name is `source`, or has the same `plain` name; None if `source` is "".
-
-    `target`: SMPL-X joint that `source` is to be matched to. Raises BadInputError when the file has no such joint.
-    """
+    """Return the index of the joint whose name is `source`, or has the same `plain` name; None if `source` is ""."""
     if not source:
         return None
     if source in names:
@@ -212,13 +211,3 @@ def _by_table(table: Mapping[str, str], index_of: Mapping[str, int]) -> dict[str
     if named is not None and named not in found.values():
         found.setdefault("pelvis", named)
     return found
-
-
-def _overruled(found: Mapping[str, int], stated: Mapping[str, int | None]) -> dict[str, int]:
-    """Return the matches `found`, overridden by `stated`.
-
-    A match of `found` is dropped if `stated` has its SMPL-X joint or its joint of the file.
-    """
-    taken = set(stated.values())
-    kept = {target: index for target, index in found.items() if target not in stated and index not in taken}
-    return kept | {target: index for target, index in stated.items() if index is not None}

@@ -291,7 +291,9 @@ def motion_from_recording(raw: RawMotion, where: str, up_axis: str) -> Motion:
         where, raw.times_s, _readable(raw.poses, shift), broken_as=_broken_as(raw.poses, shift)
     )
     times, poses, shift = raw.times_s[usable], raw.poses[usable], shift[usable]
-    _check_angles(poses, where)
+    largest = float(np.abs(poses).max())
+    if largest > MAX_ANGLE_RAD:
+        raise BadInputError(where, f"an angle of {largest:.3g}", "axis-angle in radians", "convert degrees to radians")
     roots = matrix_from_rotvec(poses[:, 0])
     up, how, doubt = _up_axis(poses, None if raw.translation is None else shift, raw, up_axis)
     turn = UPRIGHT[up]
@@ -331,18 +333,8 @@ def _broken_as(poses: F64, shift: F64) -> str:
     return " or ".join(found) or "without a time"
 
 
-def _check_angles(poses: F64, where: str) -> None:
-    largest = float(np.abs(poses).max())
-    if largest > MAX_ANGLE_RAD:
-        raise BadInputError(where, f"an angle of {largest:.3g}", "axis-angle in radians", "convert degrees to radians")
-
-
 def _up_axis(poses: F64, places: F64 | None, raw: RawMotion, stated: str) -> tuple[str, str, tuple[str, ...]]:
-    """Return (axis that is up, reason in words, a note if another axis may be up).
-
-    `poses` (T, 55, 3), `places` (T, 3): poses, and positions of the pelvis if recorded, of the usable frames.
-    `stated`: axis by the scene, or `auto`.
-    """
+    """Return (axis that is up, reason in words, a note if another axis may be up)."""
     if stated != "auto":
         return stated, "as given", ()
     mean = matrix_from_rotvec(poses[:, 0])[:, :, 1].mean(axis=0)

@@ -37,7 +37,6 @@ MAX_SIDES = 32
 ARRAYS = "save its arrays with NumPy where it was made: numpy.savez(FILE, poses=..., trans=..., mocap_frame_rate=...)"
 #: Names of numeric dtypes as NumPy writes them: byte order, kind, and number of bytes.
 _NUMBERS = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248])")
-_OBJECT = "O"
 _ORDERS = ("<", ">", "|", "=")
 
 
@@ -72,11 +71,8 @@ class _Kind:
         return np.dtype(name)
 
 
-class _Mark:
-    """A mark on the stack, above which a run of values begins."""
-
-
-_MARK = _Mark()
+#: A mark on the stack, above which a run of values begins.
+_MARK = object()
 
 
 @dataclass
@@ -95,12 +91,7 @@ class _Reader:
 
     def since_mark(self) -> list[Any]:
         """Remove the values above the last mark, and the mark, from the stack. Return the values."""
-        values: list[Any] = []
-        while True:
-            value = self.stack.pop()
-            if value is _MARK:
-                return values[::-1]
-            values.append(value)
+        return list(iter(self.stack.pop, _MARK))[::-1]
 
     def bytes_of(self, raw: Any) -> bytes:
         """Return `raw` if it is bytes, or the bytes for which Python 2 and older protocols wrote the text `raw`.
@@ -143,7 +134,11 @@ def _run(data: bytes) -> Any:
             return reader.stack.pop()
         if count >= MAX_OPERATIONS:
             raise UnexpectedValue(f"more than {MAX_OPERATIONS} values", "arrays of numbers", ARRAYS)
-        _OPERATIONS.get(operation.name, _refuse(operation.name))(reader, value)
+        operate = _OPERATIONS.get(operation.name)
+        if operate is None:
+            expected = "a pickle of numbers, text, lists, dicts and arrays"
+            raise UnexpectedValue(f"the operation {operation.name}", expected, ARRAYS)
+        operate(reader, value)
     raise UnexpectedValue("no readable pickle (it has no end)", "the arrays of a motion", ARRAYS)
 
 
@@ -160,26 +155,11 @@ def wanted(value: Any, kind: type, what: str) -> Any:
     return value
 
 
-def _refuse(name: str) -> Callable[[_Reader, Any], None]:
-    def refuse(_reader: _Reader, _value: Any) -> None:
-        raise UnexpectedValue(f"the operation {name}", "a pickle of numbers, text, lists, dicts and arrays", ARRAYS)
-
-    return refuse
-
-
 # --- operations ---
-
-
-def _ignore(reader: _Reader, value: Any) -> None:
-    """Do nothing, for an operation that does not change values."""
 
 
 def _push(reader: _Reader, value: Any) -> None:
     reader.stack.append(value)
-
-
-def _push_bytes(reader: _Reader, value: Any) -> None:
-    reader.stack.append(bytes(value))
 
 
 def _make(make: Callable[[], Any]) -> Callable[[_Reader, Any], None]:
@@ -197,34 +177,14 @@ def _gather(make: Callable[[list[Any]], Any]) -> Callable[[_Reader, Any], None]:
     return lambda reader, _value: reader.stack.append(make(reader.since_mark()))
 
 
-def _append(reader: _Reader, _value: Any) -> None:
-    item = reader.stack.pop()
-    _extend(reader.stack[-1], [item])
+def _extend(reader: _Reader, items: list[Any]) -> None:
+    if not isinstance(reader.stack[-1], Foreign):
+        wanted(reader.stack[-1], list, "a list").extend(items)
 
 
-def _append_all(reader: _Reader, _value: Any) -> None:
-    items = reader.since_mark()
-    _extend(reader.stack[-1], items)
-
-
-def _extend(target: Any, items: list[Any]) -> None:
-    if not isinstance(target, Foreign):
-        wanted(target, list, "a list").extend(items)
-
-
-def _set_item(reader: _Reader, _value: Any) -> None:
-    value, key = reader.stack.pop(), reader.stack.pop()
-    _update(reader.stack[-1], [key, value])
-
-
-def _set_items(reader: _Reader, _value: Any) -> None:
-    items = reader.since_mark()
-    _update(reader.stack[-1], items)
-
-
-def _update(target: Any, items: list[Any]) -> None:
-    if not isinstance(target, Foreign):
-        wanted(target, dict, "a dict").update(_dict_of(items))
+def _update(reader: _Reader, items: list[Any]) -> None:
+    if not isinstance(reader.stack[-1], Foreign):
+        wanted(reader.stack[-1], dict, "a dict").update(_dict_of(items))
 
 
 def _dict_of(items: list[Any]) -> dict[str, Any]:
@@ -233,31 +193,10 @@ def _dict_of(items: list[Any]) -> dict[str, Any]:
     return {key: value for key, value in zip(keys, items[1::2], strict=True) if type(key) is str}
 
 
-def _pop(reader: _Reader, _value: Any) -> None:
-    reader.stack.pop()
-
-
-def _pop_mark(reader: _Reader, _value: Any) -> None:
-    reader.since_mark()
-
-
-def _memoise(reader: _Reader, _value: Any) -> None:
-    reader.memo[len(reader.memo)] = reader.stack[-1]
-
-
 def _put(reader: _Reader, value: Any) -> None:
     if not 0 <= value < MAX_INDEX:
         raise ValueError("an index of a value that no file needs")
     reader.memo[value] = reader.stack[-1]
-
-
-def _get(reader: _Reader, value: Any) -> None:
-    reader.stack.append(reader.memo[value])
-
-
-def _global(reader: _Reader, value: Any) -> None:
-    module, _, name = value.partition(" ")
-    reader.stack.append(_named(module, name))
 
 
 def _stack_global(reader: _Reader, _value: Any) -> None:
@@ -283,8 +222,7 @@ def _reduce(reader: _Reader, _value: Any) -> None:
 
 def _new_object(reader: _Reader, _value: Any) -> None:
     reader.stack.pop()
-    kind = reader.stack.pop()
-    reader.stack.append(Foreign(wanted(kind, Foreign, "a class").name))
+    reader.stack.append(wanted(reader.stack.pop(), Foreign, "a class"))
 
 
 def _build(reader: _Reader, _value: Any) -> None:
@@ -314,7 +252,7 @@ def _array(reader: _Reader, shape: Any, kind: Any, fortran: Any, raw: Any) -> ND
     if len(sides) > MAX_SIDES or any(type(side) is not int or side < 0 for side in sides):
         raise ValueError("a shape that none can have")
     kind = wanted(kind, _Kind, "a type")
-    if kind.code.startswith(_OBJECT):
+    if kind.code.startswith("O"):
         return wanted(raw, list, "objects")  # type: ignore[no-any-return]
     dtype, data = kind.dtype(), reader.bytes_of(raw)
     if math.prod(sides) * dtype.itemsize != len(data):
@@ -324,7 +262,7 @@ def _array(reader: _Reader, shape: Any, kind: Any, fortran: Any, raw: Any) -> ND
 
 def _blank_array(_reader: _Reader, arguments: tuple[Any, ...]) -> Any:
     kind = arguments[0]
-    return StoredArray() if kind == Foreign("numpy.ndarray") else Foreign(wanted(kind, Foreign, "a class").name)
+    return StoredArray() if kind == Foreign("numpy.ndarray") else wanted(kind, Foreign, "a class")
 
 
 def _kind(_reader: _Reader, arguments: tuple[Any, ...]) -> _Kind:
@@ -366,10 +304,6 @@ def _dict(reader: _Reader, arguments: tuple[Any, ...]) -> dict[str, Any]:
     return _dict_of([item for pair in pairs for item in pair[:2]])
 
 
-def _of_class(_reader: _Reader, arguments: tuple[Any, ...]) -> Foreign:
-    return Foreign(wanted(arguments[0], Foreign, "a class").name)
-
-
 _BUILDERS: dict[str, Callable[[_Reader, tuple[Any, ...]], Any]] = {
     "numpy._core.multiarray._reconstruct": _blank_array,
     "numpy._core.multiarray.scalar": _scalar,
@@ -380,19 +314,22 @@ _BUILDERS: dict[str, Callable[[_Reader, tuple[Any, ...]], Any]] = {
     "__builtin__.bytes": _no_bytes,
     "collections.OrderedDict": _dict,
     "collections.defaultdict": _dict,
-    "copyreg._reconstructor": _of_class,
-    "copy_reg._reconstructor": _of_class,
+    "copyreg._reconstructor": lambda _reader, arguments: wanted(arguments[0], Foreign, "a class"),
+    "copy_reg._reconstructor": lambda _reader, arguments: wanted(arguments[0], Foreign, "a class"),
 }
 
-_OPERATIONS: dict[str, Callable[[_Reader, Any], None]] = {
-    **dict.fromkeys(("PROTO", "FRAME"), _ignore),
+_OPERATIONS: dict[str, Callable[[_Reader, Any], object]] = {
+    **dict.fromkeys(("PROTO", "FRAME"), lambda _reader, _value: None),
     **dict.fromkeys(("INT", "LONG", "BININT", "BININT1", "BININT2", "LONG1", "LONG4", "FLOAT", "BINFLOAT"), _push),
     **dict.fromkeys(("STRING", "BINSTRING", "SHORT_BINSTRING"), _push),
     **dict.fromkeys(("UNICODE", "BINUNICODE", "SHORT_BINUNICODE", "BINUNICODE8"), _push),
-    **dict.fromkeys(("BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8"), _push_bytes),
+    **dict.fromkeys(
+        ("BINBYTES", "SHORT_BINBYTES", "BINBYTES8", "BYTEARRAY8"),
+        lambda reader, value: reader.stack.append(bytes(value)),
+    ),
     **dict.fromkeys(("PUT", "BINPUT", "LONG_BINPUT"), _put),
-    **dict.fromkeys(("GET", "BINGET", "LONG_BINGET"), _get),
-    "MEMOIZE": _memoise,
+    **dict.fromkeys(("GET", "BINGET", "LONG_BINGET"), lambda reader, value: reader.stack.append(reader.memo[value])),
+    "MEMOIZE": lambda reader, _value: _put(reader, len(reader.memo)),
     "NONE": _make(lambda: None),
     "NEWTRUE": _make(lambda: True),
     "NEWFALSE": _make(lambda: False),
@@ -406,13 +343,13 @@ _OPERATIONS: dict[str, Callable[[_Reader, Any], None]] = {
     "TUPLE1": _tuple_of(1),
     "TUPLE2": _tuple_of(2),
     "TUPLE3": _tuple_of(3),
-    "APPEND": _append,
-    "APPENDS": _append_all,
-    "SETITEM": _set_item,
-    "SETITEMS": _set_items,
-    "POP": _pop,
-    "POP_MARK": _pop_mark,
-    "GLOBAL": _global,
+    "APPEND": lambda reader, _value: _extend(reader, [reader.stack.pop()]),
+    "APPENDS": lambda reader, _value: _extend(reader, reader.since_mark()),
+    "SETITEM": lambda reader, _value: _update(reader, [reader.stack.pop(), reader.stack.pop()][::-1]),
+    "SETITEMS": lambda reader, _value: _update(reader, reader.since_mark()),
+    "POP": lambda reader, _value: reader.stack.pop(),
+    "POP_MARK": lambda reader, _value: reader.since_mark(),
+    "GLOBAL": lambda reader, value: reader.stack.append(_named(*value.partition(" ")[::2])),
     "STACK_GLOBAL": _stack_global,
     "REDUCE": _reduce,
     "NEWOBJ": _new_object,

@@ -8,6 +8,7 @@ follows its parent.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -127,7 +128,9 @@ def retarget(tracks: Tracks, joints: F64) -> tuple[F64, F64, tuple[str, ...]]:
         _arm(work, side)
     _feet(work, upward(tracks, trunk, stands))
     _head(work)
-    return _local(work.turns, tracks.frames), _pelvis_places(work, joints), (*_notes(work), *work.notes)
+    from_hips = joints[0] - rest.between("hip")[0]
+    places = tracks.between("hip") + turned(work.turns["pelvis"], from_hips * _scale(work))
+    return _local(work.turns, tracks.frames), places, (*_notes(work), *work.notes)
 
 
 def _leg(work: Retarget, side: str) -> None:
@@ -146,25 +149,20 @@ def _leg(work: Retarget, side: str) -> None:
 
 
 def _feet(work: Retarget, up: F64) -> None:
-    """Set the rotations of the feet in `work`: along the recorded feet, but with toes and heels above the floor.
-
-    `up` (3,): up direction of the recording.
-    """
+    """Set the rotations of the feet in `work`: along the recorded feet, but with toes and heels above the floor."""
     tracks = work.tracks
     feet = [foot for side in SIDES if (foot := _recorded_foot(work, side, up)) is not None]
     planted = [foot for foot in feet if foot.planted.any()]
     steeper, flat_by = _steeper(work, planted)
     floor = min((float(np.median(foot.height[foot.planted])) for foot in planted), default=0.0)
     for side in SIDES:
-        ankle, toes = f"{side}_ankle", f"{side}_foot"
-        work.turns[ankle] = work.turns[toes] = work.turns[f"{side}_knee"]
+        work.turns[f"{side}_ankle"] = work.turns[f"{side}_foot"] = work.turns[f"{side}_knee"]
     for foot in feet:
         ankle, toes = f"{foot.side}_ankle", f"{foot.side}_foot"
-        way = foot.above(floor, steeper, flat_by, up)
         shin = tracks.bone(f"{foot.side}_knee", ankle)
-        level = [(work.bone(ankle, f"{foot.side}_knee"), -unit(shin) * OF_LEAST_TWIST)]
-        level.append((UP, foot.planted[:, None] * up))
-        work.lay(ankle, work.bone(ankle, toes), way, level)
+        upright = (work.bone(ankle, f"{foot.side}_knee"), -unit(shin) * OF_LEAST_TWIST)
+        level = [upright, (UP, foot.planted[:, None] * up)]
+        work.lay(ankle, work.bone(ankle, toes), foot.above(floor, steeper, flat_by, up), level)
         work.turns[toes] = _levelled(work, toes, work.turns[ankle])
 
 
@@ -194,10 +192,6 @@ class _RecordedFoot:
         A foot that lies flat has the slope `ours` + `flat_by`. This slope limits how far toes may point down. If the
         ankle is higher by r, the limit's sine is larger by r / `length`, which puts the toes on the floor. A limit in
         the other direction does the same for the heel, which turns about the ankle.
-
-        `floor`: height of the ankle of a flat foot, metres.
-        `steeper`, `flat_by`: results of `_steeper`, radians.
-        `up` (3,): up direction of the recording.
         """
         if not steeper:
             return self.way
@@ -212,10 +206,7 @@ class _RecordedFoot:
 
 
 def _recorded_foot(work: Retarget, side: str, up: F64) -> _RecordedFoot | None:
-    """Return the recorded foot of a leg whose thigh and shin have rotations; None if its direction is unknown.
-
-    `side`: `left` or `right`. `up` (3,): up direction of the recording.
-    """
+    """Return the recorded foot of a leg whose thigh and shin have rotations; None if its direction is unknown."""
     way = _foot(work.tracks, side)
     if way is None:
         return None
@@ -288,28 +279,20 @@ def _levelled(work: Retarget, name: str, base: F64) -> F64:
 def _arm(work: Retarget, side: str) -> None:
     shoulder, elbow, wrist = (f"{side}_{part}" for part in ("shoulder", "elbow", "wrist"))
     tracks = work.tracks
-    bones = {start: _arm_bone(tracks, start, end) for start, end in ((shoulder, elbow), (elbow, wrist))}
-    upper, lower = bones.values()
+    bones = {}
+    for start, end in ((shoulder, elbow), (elbow, wrist)):
+        far = tracks.places.get(end, tracks.tips.get(start))
+        if far is not None and tracks.has(start):
+            bones[start, end] = far - tracks.places[start]
     bend: list[Evidence] = []
-    if upper is not None and lower is not None:
-        bend = [(-UP if side == "left" else UP, hinge(upper, lower))]
-    for (start, bone), end in zip(bones.items(), (elbow, wrist), strict=True):
-        if bone is not None:
-            work.lay(start, work.bone(start, end), bone, bend)
+    if len(bones) == 2:
+        bend = [(-UP if side == "left" else UP, hinge(*bones.values()))]
+    for pair in ((shoulder, elbow), (elbow, wrist)):
+        if pair in bones:
+            work.lay(pair[0], work.bone(*pair), bones[pair], bend)
         else:
-            work.turns[start] = work.above(start)
+            work.turns[pair[0]] = work.above(pair[0])
     _hand(work, side)
-
-
-def _arm_bone(tracks: Tracks, start: str, end: str) -> F64 | None:
-    """Return the vector (T, 3) of an arm's bone, from joint `start` to joint `end` or to the bone's end.
-
-    The result is None if the file lacks `start`, or has neither `end` nor the bone's end.
-    """
-    if not tracks.has(start):
-        return None
-    far = tracks.places.get(end, tracks.tips.get(start))
-    return None if far is None else far - tracks.places[start]
 
 
 def _hand(work: Retarget, side: str) -> None:
@@ -323,9 +306,12 @@ def _hand(work: Retarget, side: str) -> None:
         work.lay(wrist, work.bone(wrist, f"{side}_middle1"), recorded, _palm(work, side))
     else:
         work.turns[wrist] = work.above(wrist)
-    for finger in FINGERS:
-        for part in (1, 2, 3):
-            _finger(work, f"{side}_{finger}", part)
+    for finger, part in itertools.product(FINGERS, (1, 2, 3)):
+        name, end = f"{side}_{finger}{part}", f"{side}_{finger}{part + 1}"
+        if part < 3 and tracks.has(name, end):
+            work.turns[name] = swung(work.above(name), work.bone(name, end), tracks.bone(name, end))
+        else:
+            work.turns[name] = work.above(name)
 
 
 def _palm(work: Retarget, side: str) -> list[Evidence]:
@@ -338,14 +324,6 @@ def _palm(work: Retarget, side: str) -> list[Evidence]:
         if work.tracks.has(*names):
             return [(work.bone(*names), unit(work.tracks.bone(*names)))]
     return []
-
-
-def _finger(work: Retarget, finger: str, part: int) -> None:
-    name, end = f"{finger}{part}", f"{finger}{part + 1}"
-    if part < 3 and work.tracks.has(name, end):
-        work.turns[name] = swung(work.above(name), work.bone(name, end), work.tracks.bone(name, end))
-    else:
-        work.turns[name] = work.above(name)
 
 
 def _head(work: Retarget) -> None:
@@ -361,12 +339,6 @@ def _local(turns: dict[str, F64], frames: int) -> F64:
         above = turns[JOINT_NAMES[JOINT_PARENTS[index]]] if index else np.eye(3)
         poses[:, index] = rotvec_from_matrix(transposed(above) @ turns[name])
     return poses
-
-
-def _pelvis_places(work: Retarget, joints: F64) -> F64:
-    """Return positions (T, 3) of the avatar's pelvis that put the middle of its hips at the recorded middle."""
-    from_hips = joints[0] - work.rest.between("hip")[0]
-    return np.asarray(work.tracks.between("hip") + turned(work.turns["pelvis"], from_hips * _scale(work)))
 
 
 def _scale(work: Retarget) -> float:

@@ -270,7 +270,10 @@ def motion_of_frames(found: list[FoundTable], source: str) -> RawMotion:
     rows, who = _rows_of_person(found)
     numbers, how = _frame_numbers(found)
     order = [int(place) for place in np.argsort(numbers, kind="stable") if rows[place] >= 0]
-    turns = [_row_turns(found[place], rows[place]) for place in order]
+    turns = [
+        turns_in(f"{frame.where}[{ROMP_POSES}]", _rows_in(frame, ROMP_POSES)[row : row + 1], WHOLE)
+        for frame, row in ((found[place], rows[place]) for place in order)
+    ]
     places = [_row_place(found[place], rows[place]) for place in order]
     known = [place for place in places if place is not None]
     poses = np.concatenate([each.turns for each in turns])
@@ -332,10 +335,6 @@ def _rows_of_person(found: list[FoundTable]) -> tuple[list[int], str]:
     return [0 if count else -1 for count in counts], f"the first person of each frame is read{several}"
 
 
-def _row_turns(frame: FoundTable, row: int) -> JointTurns:
-    return turns_in(f"{frame.where}[{ROMP_POSES}]", _rows_in(frame, ROMP_POSES)[row : row + 1], WHOLE)
-
-
 def _row_place(frame: FoundTable, row: int) -> F64 | None:
     """Return the position (3,) of the person in row `row` of `frame`, metres, in the camera's coordinates.
 
@@ -387,13 +386,16 @@ def motion_of(where: str, source: str, values: Any, there: str = "") -> RawMotio
     places, place_notes = _places(layout, chosen, frames)
     kept = _measured(layout, chosen, frames)
     betas = _betas(layout, chosen)
+    who = [f"read from {printable(chosen.name)}"] if chosen.name else []
+    if len(found) > 1:
+        who = [f"{len(found)} persons in the file: {printable(chosen.name)}, the one with the most frames, is read"]
     notes = (
         f"{layout.name} {source} ({turns.whose}, {turns.columns} columns), {frames} frames at {rate:g}/s ({how})",
         f"hands: {hands_note(turns.turns)}",
         f"betas: {'none' if betas is None else len(betas)}",
         *place_notes,
         *turns.notes,
-        *_notes_on_persons(found, chosen),
+        *who,
         *((f"{int((~kept).sum())} frames that were not measured left out",) if not kept.all() else ()),
     )
     reason = " and ".join(f"`{key}`" for key in layout.needs)
@@ -509,9 +511,3 @@ def _betas(layout: ArrayLayout, found: FoundTable) -> F64 | None:
     if flat.size > MAX_BETAS or not np.isfinite(flat).all():
         raise BadInputError(where, f"{flat.size} values, some not finite or too many", "finite numbers")
     return flat
-
-
-def _notes_on_persons(found: list[FoundTable], chosen: FoundTable) -> tuple[str, ...]:
-    if len(found) == 1:
-        return (f"read from {printable(chosen.name)}",) if chosen.name else ()
-    return (f"{len(found)} persons in the file: {printable(chosen.name)}, the one with the most frames, is read",)

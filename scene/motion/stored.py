@@ -97,14 +97,10 @@ def tables_in(value: Any) -> Iterator[tuple[str, dict[str, Any]]]:
             seen.add(id(each))
             if isinstance(each, dict):
                 yield name, each
-            inner += [(f"{name}.{key}".removeprefix("."), plain(below)) for key, below in _items(each)]
+            pairs = each.items() if isinstance(each, dict) else enumerate(each)
+            may_have = ((key, below) for key, below in pairs if isinstance(below, dict | list | StoredArray))
+            inner += [(f"{name}.{key}".removeprefix("."), plain(below)) for key, below in may_have]
         level = inner
-
-
-def _items(value: dict[str, Any] | list[Any]) -> list[tuple[Any, Any]]:
-    """Return (key or list index, item) for those items of `value` that may contain a dict."""
-    pairs = value.items() if isinstance(value, dict) else enumerate(value)
-    return [(key, below) for key, below in pairs if isinstance(below, dict | list | StoredArray)]
 
 
 def array_of(value: Any) -> NDArray[Any] | None:

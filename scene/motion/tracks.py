@@ -211,8 +211,7 @@ def least_turns(source: F64, target: F64) -> F64:
     The quaternion of each is (1 + cos, cross product), normalised. Between opposite directions, the axis is any
     perpendicular one.
     """
-    a, b = unit(source), unit(target)
-    a, b = np.broadcast_arrays(a, b)
+    a, b = np.broadcast_arrays(unit(source), unit(target))
     axis, cosine = np.cross(a, b), (a * b).sum(axis=-1)
     opposite = cosine < -1 + TOO_SHORT**2
     if opposite.any():
@@ -261,11 +260,7 @@ def limb_turns(bone: F64, recorded: F64, carrier: F64, evidence: Sequence[Eviden
 
 
 def _twist(held: F64, axis: F64, laid: F64, evidence: Sequence[Evidence]) -> F64:
-    """Return the rotation (3, 3) about `axis` (3,) that brings the evidence closest to its recorded directions.
-
-    `held` (T, 3, 3): rotations before the twist. `laid` (3, 3): rotation that takes the rest bone to `axis`.
-    `evidence`: as in `limb_turns`.
-    """
+    """Return the rotation (3, 3) about `axis` (3,) that brings the evidence closest to its recorded directions."""
     cosine = sine = 0.0
     inside = transposed(held)
     for ours, theirs in evidence:
@@ -402,18 +397,11 @@ def _across_chest(tracks: Tracks, hips: F64, by_collars: bool) -> F64:
     """Return the left direction (T, 3) of the chest: along the collar joints, else the shoulders, else the hips."""
     if not tracks.has("left_shoulder", "right_shoulder"):
         return hips
-    shoulders = tracks.across("shoulder")
-    if by_collars and collars_apart(tracks):
-        return unit(tracks.across("collar"))
-    return unit(shoulders)
-
-
-def collars_apart(tracks: Tracks) -> bool:
-    """Return whether the recording has collar joints that are beside the spine, not in it."""
-    if not tracks.has("left_collar", "right_collar", "left_shoulder", "right_shoulder"):
-        return False
-    widths = [np.median(np.linalg.norm(tracks.across(part), axis=-1)) for part in ("collar", "shoulder")]
-    return bool(widths[0] > LEAST_COLLARS * widths[1])
+    part = "shoulder"
+    if by_collars and tracks.has("left_collar", "right_collar"):
+        collars, shoulders = (np.median(np.linalg.norm(tracks.across(of), axis=-1)) for of in ("collar", "shoulder"))
+        part = "collar" if collars > LEAST_COLLARS * shoulders else part
+    return unit(tracks.across(part))
 
 
 def pitch_in(frames: F64, vectors: F64) -> F64:
@@ -431,8 +419,7 @@ def turns_of_trunk(recorded: Trunk, rest: Trunk, stands: NDArray[np.bool_], own:
     """
     turns = {}
     for name, frames in recorded.frames.items():
-        ours = rest.frames[name]
-        offset = 0.0
+        ours, offset = rest.frames[name], 0.0
         if not own and stands.any():
             offset = float(np.median(pitch_in(frames, recorded.line)[stands]) - pitch_in(ours, rest.line)[0])
         turns[name] = frames @ about(0, offset) @ ours[0].T
@@ -505,6 +492,5 @@ def turns_of_neck(tracks: Tracks, rest: Tracks, chest: F64) -> F64:
     """
     if not tracks.has("neck", "head"):
         return chest
-    left = chest[:, :, 0]
     ours = frames_along(rest.bone("neck", "head"), np.array([[1.0, 0.0, 0.0]]), "up")
-    return np.asarray(frames_along(tracks.bone("neck", "head"), left, "up") @ ours[0].T)
+    return np.asarray(frames_along(tracks.bone("neck", "head"), chest[:, :, 0], "up") @ ours[0].T)

@@ -89,7 +89,12 @@ class OpenvinoEngine:
     def bound(self, inputs: Named, outputs: Named) -> Callable[[], object]:
         given = [(self._inputs[name], array) for name, array in inputs.items()]
         given += [(self._outputs[name], array) for name, array in outputs.items()]
-        pairs = [(port, self._openvino.Tensor(_writeable(array), shared_memory=True)) for port, array in given]
+        pairs = []
+        for port, array in given:
+            # OpenVINO takes only writeable arrays, even as inputs.
+            memory = memoryview((ctypes.c_char * array.nbytes).from_address(array.ctypes.data))
+            writeable = np.frombuffer(memory, array.dtype).reshape(array.shape)
+            pairs.append((port, self._openvino.Tensor(writeable, shared_memory=True)))
 
         def call() -> None:
             for port, tensor in pairs:
@@ -98,12 +103,6 @@ class OpenvinoEngine:
             self._request.wait()
 
         return call
-
-
-def _writeable(array: NDArray[Any]) -> NDArray[Any]:
-    """Return a writeable array on the same memory, because OpenVINO takes only writeable arrays, even as inputs."""
-    memory = (ctypes.c_char * array.nbytes).from_address(array.ctypes.data)
-    return np.frombuffer(memoryview(memory), array.dtype).reshape(array.shape)
 
 
 def engine_of(path: Path, runtime: str, shapes: Shapes, options: RuntimeOptions) -> LoadedNetwork:

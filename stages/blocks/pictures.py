@@ -82,18 +82,14 @@ class Preparation:
     def into(self, picture: U8, target: NDArray[Any]) -> None:
         """Write the input for `picture` (h,w,c) into `target`, which has the network's shape."""
         fitted = self._channelled(self._fitted(picture))
-        grid = target.reshape(self._grid_shape())
+        size = self._height, self._width
+        grid = target.reshape((*size, self._channels) if self._layout == NHWC else (self._channels, *size))
         if self._is_same:
             grid[...] = fitted if self._layout == NHWC else fitted.transpose(2, 0, 1)
             return
         for channel in range(self._channels):
             plane = grid[..., channel] if self._layout == NHWC else grid[channel]
             plane[...] = self._table[:, channel].take(fitted[..., channel])
-
-    def _grid_shape(self) -> tuple[int, int, int]:
-        if self._layout == NHWC:
-            return self._height, self._width, self._channels
-        return self._channels, self._height, self._width
 
     def _channelled(self, picture: U8) -> U8:
         """Return `picture` (h,w,c) with the number of channels that the network reads."""
@@ -128,10 +124,7 @@ _DEFAULTS: Final = {"mean": 0.0, "sd": 1.0}
 
 
 def _each(values: Sequence[float] | None, channels: int, other: float, where: str) -> NDArray[np.float64]:
-    """Return a value for each channel (channels,).
-
-    `other`: value of all channels if `values` is None. `where`: place of the stage in its file, for errors.
-    """
+    """Return a value for each channel (channels,)."""
     given = [other] if values is None else list(values)
     if len(given) not in (1, channels):
         expected = f"1 or {channels}, one for each channel"
@@ -140,10 +133,7 @@ def _each(values: Sequence[float] | None, channels: int, other: float, where: st
 
 
 def _layout(wanted: PortType, asked: str | None, where: str) -> tuple[str, tuple[int, int, int]]:
-    """Return (layout of a network's input, (height, width, channels) of the picture in it).
-
-    `wanted`: type of the input. `asked`: layout that the file states. `where`: place of the stage in its file.
-    """
+    """Return (layout of a network's input, (height, width, channels) of the picture in it)."""
     shape = wanted.shape[-3:]
     if len(wanted.shape) not in (3, 4):
         expected = "one that reads pictures, 1xCxHxW or 1xHxWxC"

@@ -82,24 +82,14 @@ class Outermost:
         return np.concatenate(found) if len(found) == len(sides) else None
 
     def _project(self, vertices: F32, camera: F64, reach: F64) -> F64:
-        """Compute the clip coordinates of `vertices`, and return the error bound of each coordinate (4,).
-
-        `camera`: matrix (4,4) to clip space.
-        `reach`: reach of a vertex's sphere along each clip coordinate (4,).
-        """
+        """Compute the clip coordinates of `vertices`, and return the error bound of each coordinate (4,)."""
         np.matmul(camera[:, :3].astype(np.float32), vertices.T, out=self._flat)
         self._flat += camera[:, 3:].astype(np.float32)
         furthest = max(float(vertices.max()), -float(vertices.min()))
         return np.asarray(8 * U * (np.abs(camera[:, :3]).sum(axis=1) * furthest + np.abs(camera[:, 3]) + reach))
 
     def _side(self, row: F32, reach: float, sign: int, slack: float) -> I64 | None:
-        """Return the indices of the vertices that may be outermost on one side; None if one may be off the screen.
-
-        `row`: clip coordinate x or y of each vertex (V,).
-        `reach`: reach of a vertex's sphere along this coordinate.
-        `sign`: 1 for the side with the lowest coordinates, -1 for the side with the highest.
-        `slack`: largest error of a quotient, twice.
-        """
+        """Return the indices of the vertices that may be outermost on one side; None if one may be off the screen."""
         scratch, least, most = self._scratch
         place = np.subtract(row, np.float32(reach), out=scratch) if sign > 0 else np.negative(row, out=scratch)
         if sign < 0:
@@ -370,8 +360,9 @@ class MeshBounds:
         for level in self._levels:
             touching, cut = self._sort_out(level, rows, view, seen)
             rows = join(level.parts, touching if level is self._levels[-1] else np.concatenate([touching, cut]))
-        self._add_vertices(rows, view, seen)
-        self._add_triangles(join(self._levels[-1].faces, cut), view, seen)
+        corners = self._project(self._faces[join(self._levels[-1].faces, cut)].ravel(), view).reshape(-1, 3, 4)
+        for points in (self._project(rows, view), _clip_near(corners, self._standoff * view.near_norm)):
+            seen.add(*_quotients(points, np.full(len(points), self._standoff), view))
         return seen.rect()
 
     def _rect_of_whole(self, vertices: NDArray[np.float32], view: _View) -> Rect | None:
@@ -391,8 +382,6 @@ class MeshBounds:
         """Return indices of (patches that may widen `seen`, patches that the near plane may cut).
 
         Each patch that is certainly visible widens `seen` by one point.
-
-        `rows`: indices of the patches of `level` to examine.
         """
         radius = level.size[rows] + (self._standoff + ROUNDING_M)
         radius += np.einsum("pj,j->p", level.give[rows], view.turned / np.sqrt(2.0))
@@ -409,26 +398,12 @@ class MeshBounds:
         return rows[front][seen.widened_by(low[front], high[front])], rows[cut]
 
     def _project(self, vertices: NDArray[np.integer[Any]], view: _View, blend: bool = True) -> F64:
-        """Return the clip coordinates (N,4) of vertices.
-
-        `vertices`: indices (N,).
-        `blend`: whether to add the pose blend shapes.
-        """
+        """Return the clip coordinates (N,4) of vertices."""
         rest = self._rest[vertices]
         if blend and self._blend is not None:
             rest[:, :3] += np.einsum("naf,f->na", self._blend[vertices], view.posed.feature)
         blended = blend_matrices(self._weights[vertices], view.per_joint).reshape(-1, 4, 4)
         return np.asarray(np.einsum("nab,nb->na", blended, rest))
-
-    def _add_vertices(self, vertices: I64, view: _View, seen: _Extent) -> None:
-        points = self._project(vertices, view)
-        seen.add(*_quotients(points, np.full(len(points), self._standoff), view))
-
-    def _add_triangles(self, faces: I64, view: _View, seen: _Extent) -> None:
-        """Clip triangles to the near plane, and widen `seen` by them. `faces`: indices of triangles."""
-        corners = self._project(self._faces[faces].ravel(), view).reshape(-1, 3, 4)
-        clipped = _clip_near(corners, self._standoff * view.near_norm)
-        seen.add(*_quotients(clipped, np.full(len(clipped), self._standoff), view))
 
 
 def _reach(shaped: ShapedBody, weights: F64, levels: list[Level]) -> float:
@@ -451,9 +426,6 @@ def _against_near(centres: F64, radius: F64, view: _View) -> tuple[Mask, Mask]:
     """Return two masks (N,): spheres wholly in front of the near plane and of W = 0, and spheres that cross it.
 
     A sphere in neither mask is not visible.
-
-    `centres`: clip coordinates of the centres (N,4).
-    `radius`: radius of each sphere (N,), metres.
     """
     near, far = centres[:, 3] + centres[:, 2], centres[:, 3] - centres[:, 2]
     within = far + radius * view.far_norm >= 0.0
@@ -466,9 +438,6 @@ def _quotients(points: F64, radius: F64, view: _View) -> tuple[F64, F64]:
 
     X, Y and W are linear in the point. Therefore each varies over a sphere by the radius times the norm of its matrix
     row.
-
-    `points`: clip coordinates of the centres (N,4).
-    `radius`: radius of each sphere (N,), metres.
     """
     reach = radius[:, None] * view.norms[:2]
     least = np.maximum(points[:, 3] - radius * view.norms[3], W_LEAST)[:, None]
@@ -478,11 +447,7 @@ def _quotients(points: F64, radius: F64, view: _View) -> tuple[F64, F64]:
 
 
 def _clip_near(triangles: F64, slack: float) -> F64:
-    """Return the clip coordinates (N,4) of corners in front of the near plane, and of points where edges cross it.
-
-    `triangles`: clip coordinates of the corners (F,3,4).
-    `slack`: distance by which the near plane is moved towards the camera, in clip coordinates.
-    """
+    """Return the clip coordinates (N,4) of corners in front of the near plane, and of points where edges cross it."""
     near = triangles[:, :, 2] + triangles[:, :, 3] + slack
     points = [triangles[near > 0.0]]
     for a, b in ((0, 1), (1, 2), (2, 0)):

@@ -29,7 +29,7 @@ from trilane.machine import moved_of_kept
 from trilane.pipeline.memory import Assets, ByteCounter
 from trilane.pipeline.stage import Skip, UnitContext
 from trilane.scene.camera_placement import steered
-from trilane.scene.crop import SCREEN, Rect, Stretch, cheapest_within, error_px, lay_out_apart, least_w, stretch_of
+from trilane.scene.crop import SCREEN, Rect, cheapest_within, error_px, lay_out_apart, least_w, stretch_of
 from trilane.scene.mover import Mover
 from trilane.scene.planner import FrameWork, HeldMesh, HeldShape, hold_mesh, plan_tensor, shown_by, work_of
 from trilane.stages.avatar_assets import bodies_drawn, distinct, mesh_levels_of, staged_of
@@ -86,14 +86,12 @@ class DrawnMesh:
 
     def __init__(self, shaped: ShapedBody, skins: bool, details: bool) -> None:
         self.shaped = shaped
-        self.skinners = self._skinners(details) if skins else []
+        self.skinners: list[FrameSkinner] = []
+        if skins and details:
+            self.skinners = [FrameSkinner(shaped, detail) for detail in DETAILS]
+        elif skins:
+            self.skinners = [FrameSkinner(shaped)] * len(DETAILS)
         self.moved_to_skin = [moved_of_kept(skinner.constant_bytes) for skinner in self.skinners]
-
-    def _skinners(self, details: bool) -> list[FrameSkinner]:
-        """Return a skinner for each level of detail; without `details`, the finest skinner for all levels."""
-        if not details:
-            return [FrameSkinner(self.shaped)] * len(DETAILS)
-        return [FrameSkinner(self.shaped, detail) for detail in DETAILS]
 
     def pose(self, posed: Posed, level: int, vertices: F32, moved: ByteCounter) -> F32:
         """Skin the body in pose `posed` into the beginning of `vertices`, and return this part of the array.
@@ -149,23 +147,15 @@ class ModelledBody:
             return DetailChoice(HeldMesh(0), FINEST, 0.0)
         w = least_w(posed, clip, self.detail.reach, self.detail.blend_m(posed))
         stretch = stretch_of(clip, output)
-        moved = [0.0, *(self._moved_m(level, posed, stretch, w) for level in self.levels)]
+        moved = [0.0]
+        for level in self.levels:
+            is_too_coarse = error_px(level.least_m, stretch, w) > self.budget_px  # in any pose
+            moved.append(level.least_m if is_too_coarse else level.metres(posed))
         mesh = hold_mesh([error_px(metres, stretch, w) for metres in moved], self.budget_px, before)
         details = self.detail.metres(posed) if self.details else [0.0]
         errors = [error_px(metres + moved[mesh.level], stretch, w) for metres in details]
-        level = cheapest_within(errors, self.budget_px)
-        return DetailChoice(mesh, level if self.details else FINEST, errors[level])
-
-    def _moved_m(self, level: MeshLevel, posed: Posed, stretch: Stretch, w: float) -> float:
-        """Return a bound on the error of `level`, metres, in the pose `posed`.
-
-        If the level's least error in any pose is already above the budget, that least error is returned.
-
-        `stretch`, `w`: stretch of the projection and clip coordinate W, which turn metres into pixels (`error_px`).
-        """
-        if error_px(level.least_m, stretch, w) > self.budget_px:
-            return level.least_m
-        return level.metres(posed)
+        chosen = cheapest_within(errors, self.budget_px)
+        return DetailChoice(mesh, chosen if self.details else FINEST, errors[chosen])
 
     def see(
         self, posed: Posed, clip: F64, output: Shape, vertices: F32 | None, moved: ByteCounter, choice: DetailChoice
@@ -208,15 +198,8 @@ class _Actor:
     skeleton: Skeleton
     body: ModelledBody
 
-    def is_off_screen(self, translation: F64, clip: F64) -> bool:
-        """Return whether the body is off the screen in every pose.
-
-        `translation`: place of the body (3,), before `mover.world` is applied.
-        """
-        return self.body.bounds.is_off_screen(self.pivot(translation), clip)
-
     def pivot(self, translation: F64) -> F64:
-        """Return the place of the body's root joint in the scene (3,). `translation`: as in `is_off_screen`."""
+        """Return the place of the body's root joint in the scene (3,). `translation`: place before `mover.world`."""
         return np.asarray(
             self.mover.world[:3, :3] @ (self.body.shaped.joints[0] + translation) + self.mover.world[:3, 3]
         )
@@ -332,14 +315,19 @@ class PoseStage:
         packet["media_time_s"] = t_s
         moved = [actor.mover.sample(t_s) for actor in self._actors]
         view, projection = self._view(t_s, moved), self._camera.projection(t_s, self._output)
-        _require_all_finite(view, moved, frame)
+        _require_finite(view, frame, "camera")
+        for index, (pose, translation) in enumerate(moved):
+            _require_finite(pose, frame, f"pose of avatar {index}")
+            _require_finite(translation, frame, f"place of avatar {index}")
         self._count(packet, view, moved)
         shown = shown_by([view, projection, *(array for pair in moved for array in pair)])
         work = self._work_of(shown, lambda: self._make(slot_out, frame, view, projection, moved))
         packet["work"] = work
         known = self._made.get(FrameWork.FULL if work is FrameWork.REUSE else work)
         if self._skips and known is not None and known.shown == shown:
-            _copy_same(known.header, packet)
+            for name in packet.dtype.names or ():
+                if name not in OF_THE_FRAME:
+                    packet[name] = known.header[name]
             self.plan = replace(known.plan, work=work)
         else:
             packet["picture"] = frame if work is FrameWork.FULL else -1
@@ -356,11 +344,7 @@ class PoseStage:
         self._moved.least += sampled + packet.nbytes
 
     def _view(self, t_s: float, moved: Sequence[tuple[F64, F64]]) -> F64:
-        """Return the matrix (4,4) from world to camera: the scene's camera, steered about the first avatar.
-
-        `t_s`: time in the scene, seconds.
-        `moved`: (pose, place) of each avatar.
-        """
+        """Return the matrix (4,4) from world to camera: the scene's camera, steered about the first avatar."""
         view = self._camera.sample(t_s)
         if self._window is None:
             return view
@@ -384,11 +368,7 @@ class PoseStage:
         return self._made[work].shown if work in self._made else None
 
     def _make(self, slot_out: int, frame: int, view: F64, projection: F64, moved: Sequence[tuple[F64, F64]]) -> bool:
-        """Fill the header of slot `slot_out` with camera and avatars, and return whether an avatar is visible.
-
-        `view`, `projection`: matrices (4,4) of `frame`.
-        `moved`: (pose, place) of each avatar in `frame`.
-        """
+        """Fill the header of slot `slot_out` with camera and avatars, and return whether an avatar is visible."""
         packet = self._slots[slot_out]
         packet["avatar_count"] = len(self._actors)
         packet["view"], packet["projection"] = view, projection
@@ -407,8 +387,6 @@ class PoseStage:
         """Set crop rectangles, `tensor_rect`s and the tensor's shape in the header `packet`.
 
         With nobody in view, the tensor has the smallest shape.
-
-        `seen`: pairs of an avatar's part of the header and its place on the screen.
         """
         if not seen:
             packet["tensor_shape"] = min(self._buckets, key=lambda shape: shape[0] * shape[1])
@@ -448,16 +426,10 @@ class PoseStage:
 
         An avatar that is far off the screen is not posed. An avatar that the last computed frame did not show is first
         searched by its patches, before it is skinned.
-
-        `actor`: body, motion and place of the avatar.
-        `avatar`: the avatar's part of the header.
-        `vertices`: array for its skinned vertices; None if the GPU unit skins.
-        `moved`: (pose, place) of each avatar.
-        `clip`: projection @ view (4,4).
         """
         pose, translation = moved[actor.index]
         avatar["avatar"], avatar["visible"] = actor.index, False
-        if actor.is_off_screen(translation, clip):
+        if actor.body.bounds.is_off_screen(actor.pivot(translation), clip):
             self._was_seen[actor.index] = False
             return None
         posed: Posed = actor.skeleton.pose(pose, translation, actor.mover.world)
@@ -491,20 +463,6 @@ def _metrics(plan: FramePlan, moved: ByteCounter) -> Mapping[str, float]:
         metrics["error_px"] = max(one.error_px for one in plan.seen.values())
         metrics["triangles"] = float(sum(one.triangles for one in plan.seen.values()))
     return metrics if plan.density is None else {**metrics, "density": plan.density}
-
-
-def _copy_same(source: NDArray[np.void], target: NDArray[np.void]) -> None:
-    """Copy the header `source` to `target`, without the fields OF_THE_FRAME."""
-    for name in source.dtype.names or ():
-        if name not in OF_THE_FRAME:
-            target[name] = source[name]
-
-
-def _require_all_finite(view: F64, moved: Sequence[tuple[F64, F64]], frame: int) -> None:
-    _require_finite(view, frame, "camera")
-    for index, (pose, translation) in enumerate(moved):
-        _require_finite(pose, frame, f"pose of avatar {index}")
-        _require_finite(translation, frame, f"place of avatar {index}")
 
 
 def _require_finite(values: NDArray[np.floating], frame: int, what: str) -> None:

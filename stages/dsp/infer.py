@@ -191,10 +191,7 @@ class InferStage:
         return bindings
 
     def _own(self, packet: Packet, number: int, channels: int) -> U8:
-        """Return the part of a slot that belongs to network `number`; the whole slot for an only network.
-
-        `channels`: channels of a pixel in this slot.
-        """
+        """Return the part of a slot that belongs to network `number`; the whole slot for an only network."""
         if len(self._networks) == 1:
             return packet.payload
         return network_parts(packet.payload, len(self._networks), self._shapes, channels)[number]
@@ -203,10 +200,8 @@ class InferStage:
         """Run each network that paints somebody in view, and return metrics.
 
         With nobody in view, transparent pictures are written. The metrics are `inferred`, the number of inferences, and
-        the
-        bytes moved. The least bytes are the networks' inputs and outputs, and their weights if these do not fit into
-        the
-        last-level cache.
+        the bytes moved. The least bytes are the networks' inputs and outputs, and their weights if these do not fit
+        into the last-level cache.
         """
         assert slot_in is not None and slot_out is not None
         pose, picture, moved = self._inputs[slot_in].header, self._outputs[slot_out].payload, self._moved
@@ -219,7 +214,10 @@ class InferStage:
         height, width = pose["tensor_shape"].tolist()
         numbers = np.unique(self._painters[is_seen]).tolist()
         for number in numbers:
-            bound = self._binding((number, (height, width), slot_in, slot_out), frame)
+            bound = self._bindings.get((number, (height, width), slot_in, slot_out))
+            if bound is None:
+                known = ", ".join(f"{h}x{w}" for h, w in self._shapes)
+                raise BadInputError(f"frame {frame}", f"tensor shape {height}x{width}", f"one of {known}")
             bound.run(moved)
             if self._copies:
                 moved.uploaded += bound.in_bytes
@@ -236,13 +234,6 @@ class InferStage:
         self._bindings.clear()
         self._inputs = self._outputs = ()
 
-    def _binding(self, key: Key, frame: int) -> BoundPart:
-        try:
-            return self._bindings[key]
-        except KeyError:
-            shape, known = key[1], ", ".join(f"{h}x{w}" for h, w in self._shapes)
-            raise BadInputError(f"frame {frame}", f"tensor shape {shape[0]}x{shape[1]}", f"one of {known}") from None
-
 
 def build(settings: Mapping[str, Any], unit: UnitContext) -> InferStage:
     """Build the stage that runs part `settings["part"]` of the network. Raises BadInputError, MissingPartError."""
@@ -253,10 +244,7 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> InferStage:
 
 
 def _bound(session: Session, part: NetworkPart, source: U8, target: U8, weights: int) -> BoundPart:
-    """Return `part`, bound to the slots `source` and `target`.
-
-    `weights`: number of bytes of the part's weights that each run reads from memory.
-    """
+    """Return `part`, bound to the slots `source` and `target`."""
     given, handed_on = views(source, part.crossing_in), views(target, part.crossing_out)
     inputs, outputs = [given[name] for name in part.inputs], [handed_on[name] for name in part.outputs]
     passed = [(given[name], handed_on[name]) for name in handed_on if name not in part.outputs]

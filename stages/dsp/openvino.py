@@ -22,6 +22,7 @@ from trilane.writing import write_bytes
 
 openvino = quiet_openvino()
 DEVICE = "CPU"
+DIGEST_BYTES = hashlib.sha256().digest_size
 LAYERS = {"Convolution", "Deconvolution", "FullyConnected", "MatMul"}
 INTEGERS = ("i8", "u8")
 WITHOUT_BIAS = "/WithoutBiases"
@@ -66,9 +67,11 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OpenvinoSession:
     }
     stored = cache_entry("openvino", f"{_key(network, settings)}.blob")
     if stored is not None:
-        with contextlib.suppress(OSError, ValueError, RuntimeError):  # missing or damaged: it is compiled again
-            blob = _without_digest(stored.read_bytes())
-            return OpenvinoSession(_core().import_model(io.BytesIO(blob), DEVICE, settings))
+        with contextlib.suppress(OSError, RuntimeError):  # missing or damaged: it is compiled again
+            content = stored.read_bytes()
+            digest, blob = content[:DIGEST_BYTES], content[DIGEST_BYTES:]
+            if hashlib.sha256(blob).digest() == digest:  # OpenVINO would not notice
+                return OpenvinoSession(_core().import_model(io.BytesIO(blob), DEVICE, settings))
     try:
         compiled = _core().compile_model(_core().read_model(network.model.SerializeToString()), DEVICE, settings)
     except RuntimeError as error:
@@ -76,7 +79,8 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OpenvinoSession:
     _check_integer(compiled, network)
     if stored is not None:
         with contextlib.suppress(BadInputError):  # a full disk: it is compiled again next time
-            write_bytes(stored, _with_digest(compiled.export_model().getvalue()))
+            blob = compiled.export_model().getvalue()
+            write_bytes(stored, hashlib.sha256(blob).digest() + blob)
     return OpenvinoSession(compiled)
 
 
@@ -86,21 +90,6 @@ def _key(network: IntegerNetwork, settings: Mapping[str, Any]) -> str:
     machine = [str(core.get_property(DEVICE, name)) for name in ("FULL_DEVICE_NAME", "OPTIMIZATION_CAPABILITIES")]
     parts = (network.digest, version(), *machine, *(f"{name}={value}" for name, value in settings.items()))
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
-
-
-def _with_digest(blob: bytes) -> bytes:
-    return hashlib.sha256(blob).digest() + blob
-
-
-def _without_digest(content: bytes) -> bytes:
-    """Return the blob in `content`, a result of `_with_digest`.
-
-    Raises ValueError if the blob is damaged, because OpenVINO would not notice.
-    """
-    size = hashlib.sha256().digest_size
-    if hashlib.sha256(content[size:]).digest() != content[:size]:
-        raise ValueError("a damaged blob")
-    return content[size:]
 
 
 @cache

@@ -14,13 +14,13 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import av
 import numpy as np
@@ -35,7 +35,6 @@ from trilane.scene.footage import Footage, Stored, film_of, in_order
 from trilane.scene.lens import cover
 from trilane.stages.gpu.video_reader import (
     DEFAULT_STEP_S,
-    Pixels,
     VideoReader,
     check_size,
     pixels_of,
@@ -86,7 +85,10 @@ def read_picture(path: Path, shape: Shape, turned: int | None = None) -> U8:
     """
     with _opened(path) as image:
         how = BY_TAG.get(_orientation(image)) if turned is None else CLOCKWISE.get(turned % 4)
-        upright = _eight_bits(image if how is None else image.transpose(how))
+        upright = image if how is None else image.transpose(how)
+        if image.mode in DEEP_MODES:
+            upright = Image.fromarray((np.asarray(upright).astype(np.uint32) // DEEP_STEP).astype(np.uint8))
+        upright = upright.convert("RGB")
         cut = cover((upright.height, upright.width), shape)
         x, y = upright.width / cut.width, upright.height / cut.height
         box = (cut.left * x, cut.top * y, (cut.left + shape[1]) * x, (cut.top + shape[0]) * y)
@@ -96,12 +98,6 @@ def read_picture(path: Path, shape: Shape, turned: int | None = None) -> U8:
 def _orientation(image: Image.Image) -> int:
     """Return the EXIF orientation tag; in a PNG, a tag after the pixels is ignored, so that no pixels are decoded."""
     return int(Image.Image.getexif(image).get(ExifTags.Base.Orientation, 1))
-
-
-def _eight_bits(image: Image.Image) -> Image.Image:
-    if image.mode in DEEP_MODES:
-        return Image.fromarray((np.asarray(image).astype(np.uint32) // DEEP_STEP).astype(np.uint8)).convert("RGB")
-    return image.convert("RGB")
 
 
 @contextmanager
@@ -243,8 +239,9 @@ def check_pictures(path: Path, fps: float, frames: int, camera: CameraPath) -> N
     `camera`: camera of the scene, to whose views the pictures may belong.
     """
     if path.is_dir():
-        for _ in _checked(_shown(path, fps, frames, camera)):
-            pass
+        with ThreadPoolExecutor(len(machine.here.cores())) as pool:
+            for _ in pool.map(check_picture, _shown(path, fps, frames, camera)):
+                pass
     elif is_picture(path):
         check_picture(path)
 
@@ -256,11 +253,6 @@ def _shown(path: Path, fps: float, frames: int, camera: CameraPath) -> list[Path
     film = film_of([picture.name for picture in pictures], fps)
     last_s = (frames - 1) / fps
     return pictures if last_s >= film.period_s else pictures[: film.number_at(last_s) + 1]
-
-
-def _checked(paths: Sequence[Path]) -> Iterable[None]:
-    with ThreadPoolExecutor(len(machine.here.cores())) as pool:
-        yield from pool.map(check_picture, paths)
 
 
 def _folder(path: Path, fps: float) -> Footage:
@@ -278,22 +270,6 @@ def _folder(path: Path, fps: float) -> Footage:
 def _size(stored: Stored) -> str:
     height, width = stored.shown()
     return f"{width}x{height}{QUARTER_WORDS.get(stored.turned, '')}"
-
-
-class _Head(NamedTuple):
-    """Facts of a video from its first frame and its stream.
-
-    `stored`: size and quarter turns of the frames.
-    `pixels`: aspect, transfer and primaries of the pixels.
-
-    `codec`: name of the codec.
-    `bits`: bits per colour.
-    """
-
-    stored: Stored
-    pixels: Pixels
-    codec: str
-    bits: int
 
 
 def require_video(path: Path) -> None:
@@ -322,34 +298,29 @@ def _video(path: Path) -> Footage:
     require_video(path)
     try:
         with av.open(str(path), metadata_errors="replace") as container:
-            head = _head(container, path)
+            stream = video_stream(container, path)
+            frame = next(iter(container.decode(stream)), None)
+            if frame is None:
+                raise BadInputError(path, "no video frame", "a video with at least one frame")
+            check_size(path, frame)
+            pixels, codec = pixels_of(stream), stream.codec_context.name
+            stored = Stored((frame.height, round(frame.width * pixels.aspect)), quarters_of(frame))
+            bits = max(component.bits for component in frame.format.components)
         with av.open(str(path), metadata_errors="replace") as container:
             times = _times(container, path)
     except (av.FFmpegError, ValueError) as error:
         raise BadInputError(path, f"no readable video ({error})", "a video that FFmpeg can decode") from error
     steps = sorted(later - earlier for earlier, later in pairwise(times))
     period_s = times[-1] - times[0] + (times[-1] - times[-2] if steps else DEFAULT_STEP_S)
-    what = [f"video of {_size(head.stored)}, {head.codec}"]
-    if head.pixels.transfer:
+    what = [f"video of {_size(stored)}, {codec}"]
+    if pixels.transfer:
         what.append(
-            f"high range ({head.pixels.transfer}, {head.bits} bits): tone mapped by ITU-R BT.2390, white at 203 cd/m2, "
+            f"high range ({pixels.transfer}, {bits} bits): tone mapped by ITU-R BT.2390, white at 203 cd/m2, "
             "peaks at 1000"
         )
-    elif head.bits > EIGHT_BITS:
-        what.append(f"{head.bits} bits a colour: shown with 8")
-    return Footage(tuple(what), (_rate(steps, period_s),), (head.stored,), period_s=period_s)
-
-
-def _head(container: Any, path: Path) -> _Head:
-    stream = video_stream(container, path)
-    frame = next(iter(container.decode(stream)), None)
-    if frame is None:
-        raise BadInputError(path, "no video frame", "a video with at least one frame")
-    check_size(path, frame)
-    pixels = pixels_of(stream)
-    stored = Stored((frame.height, round(frame.width * pixels.aspect)), quarters_of(frame))
-    bits = max(component.bits for component in frame.format.components)
-    return _Head(stored, pixels, stream.codec_context.name, bits)
+    elif bits > EIGHT_BITS:
+        what.append(f"{bits} bits a colour: shown with 8")
+    return Footage(tuple(what), (_rate(steps, period_s),), (stored,), period_s=period_s)
 
 
 def _times(container: Any, path: Path) -> list[float]:

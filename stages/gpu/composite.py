@@ -283,10 +283,7 @@ class CompositeStage:
         self._draw(pose)
 
     def _take(self, pose: NDArray[np.void], image: NDArray[np.uint8]) -> None:
-        """Upload the background's new picture, if there is one, and `image` if the frame is a full frame.
-
-        `pose`: header of the frame. `image`: the networks' pictures of the avatars.
-        """
+        """Upload the background's new picture, if there is one, and `image` if the frame is a full frame."""
         if self._background is not None and self._picture is not None:
             picture = self._background.at(float(pose["media_time_s"]))
             if picture is not None:
@@ -296,11 +293,12 @@ class CompositeStage:
         if int(pose["work"]) == FrameWork.FULL:
             # Copied, because a later frame is written to the same slot.
             self._held = pose.copy()
-            shape, used = _tensor_shape(pose), {self._network[int(avatar["avatar"])] for avatar in _visible(pose)}
+            shape, visible = _tensor_shape(pose), _visible(pose)
             parts = network_parts(image, len(self._painters), self._shapes, PAINTED_CHANNELS)
-            for network in used:
+            for network in {self._network[int(avatar["avatar"])] for avatar in visible}:
                 self._painters[network].upload(shape, parts[network][: math.prod(shape) * PAINTED_CHANNELS])
-            counter_of(self._ctx).least += _cells_bytes(pose)
+            cells = (avatar["tensor_rect"][2:].tolist() for avatar in visible)
+            counter_of(self._ctx).least += sum(PAINTED_CHANNELS * height * width for height, width in cells)
 
     def _holds(self, picture: int) -> bool:
         """Return whether the uploaded picture of the avatars belongs to the frame with the number `picture`."""
@@ -352,21 +350,13 @@ class CompositeStage:
             self._planes.draw(pose["view"], pose["projection"])
 
     def _depth(self, pose: NDArray[np.void], avatar: Any) -> float:
-        """Return z of the pelvis of an avatar in camera space, metres; the most negative is the farthest.
-
-        `pose`: header of the frame. `avatar`: the avatar's part of it.
-        """
+        """Return z of the pelvis of an avatar in camera space, metres; the most negative is the farthest."""
         pelvis = avatar["joints"][0] @ np.append(self._rest[int(avatar["avatar"])][0], 1.0)
         return float(pose["view"][2, :3] @ pelvis + pose["view"][2, 3])
 
 
 def _visible(pose: NDArray[np.void]) -> list[Any]:
     return [avatar for avatar in pose["avatars"][: int(pose["avatar_count"])] if avatar["visible"]]
-
-
-def _cells_bytes(pose: NDArray[np.void]) -> int:
-    """Return the bytes of the network's picture in the `tensor_rect`s of the visible avatars."""
-    return sum(4 * int(avatar["tensor_rect"][2]) * int(avatar["tensor_rect"][3]) for avatar in _visible(pose))
 
 
 def _tensor_shape(pose: NDArray[np.void]) -> Shape:

@@ -64,7 +64,7 @@ def texture_array(ctx: Any, texture: Floats, filtering: str = "linear", levels: 
     """
     height, width, channels = texture.shape
     array = ctx.texture_array((width, height, channels // 4), 4, _pixels(texture), dtype="f2")
-    shrunk, anisotropy = FILTERS[filter_of(filtering, bool(levels))]
+    shrunk, anisotropy = FILTERS["mipmap" if levels and filtering == "linear" else filtering]
     if shrunk != moderngl.LINEAR:
         array.build_mipmaps(**({"max_level": len(levels)} if levels else {}))
     for number, level in enumerate(levels, 1):
@@ -93,14 +93,6 @@ def texture_words(ctx: Any, texture: Floats) -> tuple[Any, float]:
     made = ctx.texture((width * eighths, height), 4, np.ascontiguousarray(words).tobytes(), dtype="u4")
     made.filter = (moderngl.NEAREST, moderngl.NEAREST)
     return made, 2.0 ** (FLOAT_BIAS - HALF_BIAS - raised)
-
-
-def filter_of(asked: str, learnt: bool) -> str:
-    """Return the filter of a texture. `asked`: filter of the scene. `learnt`: whether the texture has learnt levels.
-
-    Learnt levels are always read, so `linear` becomes `mipmap` with them.
-    """
-    return "mipmap" if learnt and asked == "linear" else asked
 
 
 def _pixels(texture: Floats) -> bytes:
@@ -357,7 +349,10 @@ class RasterStage:
         moved.start(pose.nbytes)
         shape = (int(pose["tensor_shape"][0]), int(pose["tensor_shape"][1]))
         visible = [a for a in pose["avatars"][: int(pose["avatar_count"])] if a["visible"]]
-        _refuse_nan(frame, visible)
+        for avatar in visible:
+            if not np.isfinite(avatar["joints"]).all():
+                found = f"avatar {int(avatar['avatar'])} has a joint that is not a finite number"
+                raise TrilaneError(f"frame {frame}: {found}")
         skinned = self._vertices[slot_in]
         parts = network_parts(self._outputs[slot_out].payload, len(self._passes), self._shapes, MAX_CHANNELS)
         for network, (packed, part) in enumerate(zip(self._passes, parts, strict=True)):
@@ -393,12 +388,6 @@ def _placement(pose: NDArray[np.void], avatar: Any, vertices: NDArray[np.float32
         vertices=vertices,
         mesh=int(avatar["mesh"]),
     )
-
-
-def _refuse_nan(frame: int, avatars: Sequence[Any]) -> None:
-    for avatar in avatars:
-        if not np.isfinite(avatar["joints"]).all():
-            raise TrilaneError(f"frame {frame}: avatar {int(avatar['avatar'])} has a joint that is not a finite number")
 
 
 def build(settings: Mapping[str, Any], unit: UnitContext) -> RasterStage:

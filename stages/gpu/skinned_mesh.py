@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import moderngl
 import numpy as np
@@ -93,14 +93,13 @@ def mesh_arrays(
         weight=np.ascontiguousarray(weight[source], np.float32),
         triangles=triangles,
         source=source,
-        surface=_surface(normal, colour, source),
+        surface={
+            name: np.ascontiguousarray(rows[source], np.float32)
+            for name, rows in (("normal", normal), ("colour", colour))
+            if rows is not None
+        },
         closed=is_closed(vertices, faces),
     )
-
-
-def _surface(normal: Floats | None, colour: Floats | None, source: NDArray[np.int64]) -> dict[str, F32]:
-    arrays = {"normal": normal, "colour": colour}
-    return {name: np.ascontiguousarray(rows[source], np.float32) for name, rows in arrays.items() if rows is not None}
 
 
 def is_closed(vertices: Floats, faces: Ints) -> bool:
@@ -152,7 +151,7 @@ def patch_order(centres: NDArray[np.float64], patch: int = PATCH_TRIANGLES) -> N
         part = part[np.argsort(points[:, axis], kind="stable")]
         half = -(-len(part) // 2 // patch) * patch if len(part) >= 2 * patch else len(part) // 2
         pending += [part[half:], part[:half]]
-    return np.concatenate(done) if done else np.empty(0, np.int64)
+    return np.concatenate(done)
 
 
 def weight_batches(arrays: MeshArrays) -> dict[int, NDArray[np.uint32]]:
@@ -229,59 +228,63 @@ class BodyPose:
     vertices: F32 | None = None
 
 
-class Mesh(Protocol):
+class Mesh:
     """A mesh that `MeshDraw` draws: buffers, a vertex shader, and the pose of a frame.
 
     `arrays`: vertices and triangles.
     `vertex_shader`: file of `trilane.shaders`.
+    `defines`: preprocessor definitions of the vertex shader, except K.
     `batches`: pairs of a number of skin weights and the index buffer of the triangles that are drawn with it.
     `pose_bytes`: size of a frame's pose. A number that is uploaded several times counts once.
     """
 
-    arrays: MeshArrays
     vertex_shader: str
-    batches: list[tuple[int, Any]]
     pose_bytes: int
+    _content: list[tuple[Any, ...]]
 
-    @property
-    def defines(self) -> dict[str, int | str]:
-        """Preprocessor definitions of the vertex shader, except K."""
+    def __init__(self, ctx: Any, arrays: MeshArrays, batches: dict[int, NDArray[np.uint32]]) -> None:
+        self.arrays, self._ctx = arrays, ctx
+        self.defines: dict[str, int | str] = {}
+        # Software drivers read an index of two bytes faster.
+        self._index_size = 2 if len(arrays.position) <= 1 << 16 else 4
+        kind = f"u{self._index_size}"
+        self.batches = [(k, ctx.buffer(triangles.astype(kind).tobytes())) for k, triangles in batches.items()]
 
     def prepare(self, ctx: Any) -> None:
         """Enable the depth test. For a closed mesh, also leave out the triangles that face away."""
+        ctx.enable_only(moderngl.DEPTH_TEST | (moderngl.CULL_FACE if self.arrays.closed else moderngl.NOTHING))
+        ctx.depth_func = "<"
+        ctx.front_face = "cw"  # row 0 is on top: triangles that wind counter-clockwise there are stored clockwise
 
     def vertex_array(self, program: Any, indices: Any) -> Any:
-        """Return a vertex array with which `program` draws the triangles of index buffer `indices`."""
+        """Return a vertex array with which `program` draws the triangles of index buffer `indices`.
+
+        It lacks attributes that the shader's compiler removed.
+        """
+        size = self._index_size
+        return self._ctx.vertex_array(
+            program, self._content, index_buffer=indices, index_element_size=size, skip_errors=True
+        )
 
     def upload_pose(self, pose: BodyPose) -> None:
         """Write a frame's pose to the GPU. Raises ValueError if `pose` lacks an array that the mesh needs."""
+        raise NotImplementedError
 
     def bind_pose(self, program: Any) -> None:
         """Make `program` read the uploaded pose."""
 
 
-class PosedMesh:
-    """A mesh whose vertices the CPU unit skins for each frame."""
+class PosedMesh(Mesh):
+    """A mesh whose vertices the CPU unit skins for each frame; they are vertex attributes."""
 
     vertex_shader = "posed_vertices.vert"
 
     def __init__(self, ctx: Any, arrays: MeshArrays) -> None:
-        self.arrays, self._ctx = arrays, ctx
-        self.defines: dict[str, int | str] = {}
+        super().__init__(ctx, arrays, {WEIGHT_COUNTS[0]: arrays.triangles})
         self._corners = np.empty((len(arrays.source), 3), np.float32)
         self.pose_bytes = len(np.unique(arrays.source)) * self._corners.itemsize * 3
         self._positions = ctx.buffer(reserve=self._corners.nbytes, dynamic=True)
-        self._uv = ctx.buffer(arrays.uv.tobytes())
-        self.batches = [(WEIGHT_COUNTS[0], ctx.buffer(_index_bytes(arrays, arrays.triangles)))]
-
-    def prepare(self, ctx: Any) -> None:
-        """Enable the depth test. For a closed mesh, also leave out the triangles that face away."""
-        _prepare(ctx, self.arrays.closed)
-
-    def vertex_array(self, program: Any, indices: Any) -> Any:
-        """Return a vertex array with which `program` draws the triangles of index buffer `indices`."""
-        content = [(self._positions, "3f", "position"), (self._uv, "2f", "uv")]
-        return _vertex_array(self._ctx, program, content, indices, self.arrays)
+        self._content = [(self._positions, "3f", "position"), (ctx.buffer(arrays.uv.tobytes()), "2f", "uv")]
 
     def upload_pose(self, pose: BodyPose) -> None:
         """Write the body's vertices to the GPU. Raises ValueError without them."""
@@ -292,11 +295,8 @@ class PosedMesh:
         counter_of(self._ctx).read += self._corners.nbytes
         upload(self._ctx, self._positions, self._corners)
 
-    def bind_pose(self, program: Any) -> None:
-        """Do nothing: the positions are vertex attributes."""
 
-
-class SkinnedMesh:
+class SkinnedMesh(Mesh):
     """A mesh whose vertices the vertex shader skins.
 
     `posedirs`: texture with the pose blend shapes of the body's vertices; None for a body without them.
@@ -305,34 +305,19 @@ class SkinnedMesh:
     vertex_shader = "skin.vert"
 
     def __init__(self, ctx: Any, arrays: MeshArrays, posedirs: NDArray[np.floating[Any]] | None = None) -> None:
-        self.arrays = arrays
+        super().__init__(ctx, arrays, weight_batches(arrays))
+        self.defines["JOINTS"] = JOINTS
         self.posedirs = None if posedirs is None else _posedirs_texture(ctx, posedirs)
+        if self.posedirs is not None:
+            self.defines |= {"POSE_FEATURES": POSE_FEATURES, "ROW": POSEDIRS_ROW}
+        if arrays.surface:
+            self.defines["SURFACE"] = 1
         names, formats, columns = _layout(arrays, self.posedirs is not None)
         packed = np.hstack([np.ascontiguousarray(column).view(np.uint8) for column in columns])
-        self._content = (ctx.buffer(packed.tobytes()), " ".join(formats), *names)
-        self.batches = [(k, ctx.buffer(_index_bytes(arrays, part))) for k, part in weight_batches(arrays).items()]
+        self._content = [(ctx.buffer(packed.tobytes()), " ".join(formats), *names)]
         self._joints = ctx.buffer(reserve=JOINTS * 48)
         self._feature = ctx.buffer(reserve=-(-POSE_FEATURES // 4) * 16)
         self.pose_bytes = 4 * (JOINTS * 12 + (0 if posedirs is None else POSE_FEATURES))
-        self._ctx = ctx
-
-    @property
-    def defines(self) -> dict[str, int | str]:
-        """Preprocessor definitions of the vertex shader, except K."""
-        values: dict[str, int | str] = {"JOINTS": JOINTS}
-        if self.posedirs is not None:
-            values |= {"POSE_FEATURES": POSE_FEATURES, "ROW": POSEDIRS_ROW}
-        if self.arrays.surface:
-            values["SURFACE"] = 1
-        return values
-
-    def prepare(self, ctx: Any) -> None:
-        """Enable the depth test, and for a closed mesh leave out the triangles that face away."""
-        _prepare(ctx, self.arrays.closed)
-
-    def vertex_array(self, program: Any, indices: Any) -> Any:
-        """Return a vertex array of this mesh for `program`, without attributes that the shader's compiler removed."""
-        return _vertex_array(self._ctx, program, [self._content], indices, self.arrays)
 
     def upload_pose(self, pose: BodyPose) -> None:
         """Write the skinning matrices, and for a mesh with pose blend shapes the pose feature, to the GPU.
@@ -358,32 +343,8 @@ class SkinnedMesh:
         program["posedirs"].value = 8
 
 
-def _index_size(arrays: MeshArrays) -> int:
-    """Return the number of bytes of an index: two if that is enough, because software drivers read these faster."""
-    return 2 if len(arrays.position) <= 1 << 16 else 4
-
-
-def _index_bytes(arrays: MeshArrays, triangles: NDArray[np.uint32]) -> bytes:
-    return triangles.astype(f"u{_index_size(arrays)}").tobytes()
-
-
-def _vertex_array(ctx: Any, program: Any, content: Any, indices: Any, arrays: MeshArrays) -> Any:
-    return ctx.vertex_array(
-        program, content, index_buffer=indices, index_element_size=_index_size(arrays), skip_errors=True
-    )
-
-
-def _prepare(ctx: Any, closed: bool) -> None:
-    ctx.enable_only(moderngl.DEPTH_TEST | (moderngl.CULL_FACE if closed else moderngl.NOTHING))
-    ctx.depth_func = "<"
-    ctx.front_face = "cw"  # row 0 is on top: triangles that wind counter-clockwise in the picture are stored clockwise
-
-
 def _layout(arrays: MeshArrays, with_source: bool) -> tuple[list[str], list[str], list[NDArray[Any]]]:
-    """Return (names, formats, columns) of the interleaved vertex buffer; the formats are moderngl's.
-
-    `with_source`: whether each vertex has the index of the body's vertex.
-    """
+    """Return (names, formats, columns) of the interleaved vertex buffer; the formats are moderngl's."""
     columns: dict[str, tuple[str, NDArray[Any]]] = {"position": ("3f", arrays.position), "uv": ("2f", arrays.uv)}
     columns |= {name: (f"{values.shape[1]}f", values) for name, values in arrays.surface.items()}
     for group in range(arrays.weights_per_vertex // 4):

@@ -118,10 +118,7 @@ def roll_off(light: F64) -> F64:
 
 @cache
 def _srgb() -> U8:
-    """Return the sRGB bytes of lights (STEPS,).
-
-    Entry i is for a light whose square root is the i-th of STEPS equal steps from 0 to 1.
-    """
+    """Return the sRGB bytes of lights (STEPS,)."""
     light = (np.arange(STEPS) / (STEPS - 1)) ** 2
     curve = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.power(light, 1 / 2.4) - 0.055)
     return (curve * 255 + 0.5).astype(np.uint8)

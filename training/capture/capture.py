@@ -128,7 +128,10 @@ class _Opening:
         masks = self._try(lambda: open_pictures(self.folder / self.file.masks, MASK))
         mask_of: list[int] = []
         if frames is not None:
-            self._count(frames)
+            if len(frames.names) < LEAST_FRAMES:
+                count = f"{len(frames.names)} frame" + "s" * (len(frames.names) > 1)
+                expected = f"at least {LEAST_FRAMES}, one for each side of the person"
+                self.faults.append(Fault(self.file.frames, count, expected))
             mask_of = self._matched(frames, masks) if masks is not None else []
             self._look(frames, masks, mask_of, track)
         fits = self._fits(frames.names, body) if frames is not None and body is not None else []
@@ -152,12 +155,6 @@ class _Opening:
             self.faults.append(Fault.of(error))
             return None
 
-    def _count(self, frames: Pictures) -> None:
-        if len(frames.names) < LEAST_FRAMES:
-            count = f"{len(frames.names)} frame" + "s" * (len(frames.names) > 1)
-            expected = f"at least {LEAST_FRAMES}, one for each side of the person"
-            self.faults.append(Fault(self.file.frames, count, expected))
-
     def _matched(self, frames: Pictures, masks: Pictures) -> list[int]:
         """Return, for each frame, the number of its mask. A frame without a mask gets -1 and a fault.
 
@@ -175,10 +172,7 @@ class _Opening:
         return found
 
     def _look(self, frames: Pictures, masks: Pictures | None, mask_of: Sequence[int], track: Track) -> None:
-        """Read every frame and its mask, and add a fault for each that cannot be used.
-
-        `mask_of`: for each frame, the number of its mask; -1: it has none.
-        """
+        """Read every frame and its mask, and add a fault for each that cannot be used."""
         shape = self.file.camera.shape
         for number in track(range(len(frames.names))):
             frame = self._read(frames, number, f"{self.file.frames}/{frames.names[number]}", shape)
@@ -227,10 +221,7 @@ class _Opening:
             return None
 
     def _require_sides(self, seen: Sequence[tuple[float, float]], frames: int) -> None:
-        """Add a fault for the sides of the person that no frame shows.
-
-        `seen`: (yaw, height) of each camera whose fit could be read. `frames`: number of frames.
-        """
+        """Add a fault for the sides of the person that no frame shows."""
         shown = frames_by_side([yaw for yaw, _ in seen])
         missing = [side for side, count in shown.items() if not count and side not in self.file.missing_views]
         if missing:
@@ -250,8 +241,6 @@ def _fits_of_file(path: Path, count: int) -> list[Mapping[str, NDArray[Any]]]:
     """Return, for each frame, the arrays of its fit by name, from one file for all frames. Raises BadInputError.
 
     A one-dimensional array of shape or expression coefficients holds for all frames.
-
-    `count`: number of frames.
     """
     arrays = read_npz(path, NAMES, EXPECTED_FITS)
     shared = {name: arrays.pop(name) for name in SHAPE if name in arrays and arrays[name].ndim < 2}

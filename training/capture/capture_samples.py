@@ -110,7 +110,10 @@ class CaptureRenderer:
 
     def _drawn(self, rng: np.random.Generator, band: str, density: float) -> CaptureSample | None:
         number = self._numbers[int(rng.integers(len(self._numbers)))]
-        view, screen = self.capture.views[number], screen_shape(rng)
+        view, screen = (
+            self.capture.views[number],
+            (OUTPUT_ROWS, round(OUTPUT_ROWS * SCREENS[rng.integers(len(SCREENS))])),
+        )
         posed = self._raster.posed(self.capture.fits[number])
         camera = SampleCamera(view, self._projection, self._lens)
         by = zoomed_view(rng, band, posed, camera, self._centres, self._rule, screen)
@@ -406,11 +409,6 @@ class SampleCamera:
     def shape(self) -> Shape:
         """(height, width) of the frame."""
         return round(self.lens.height_px), round(self.lens.width_px)
-
-
-def screen_shape(rng: np.random.Generator) -> Shape:
-    """Return (height, width) of a screen of `OUTPUT_ROWS` rows with a random aspect ratio of `SCREENS`."""
-    return OUTPUT_ROWS, round(OUTPUT_ROWS * SCREENS[rng.integers(len(SCREENS))])
 
 
 def zoomed_view(

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from trilane.arrays import F32, F64, U8, Mask
+from trilane.arrays import F32, U8, Mask
 from trilane.body.joints import JOINT_INDEX, JOINT_NAMES
 from trilane.training.capture.capture import HALF, STEP_DEG, Capture, frames_by_side, widest_gap_deg
 from trilane.training.capture.capture_file import Fault, FaultyCaptureError
@@ -110,20 +110,20 @@ CROWN_SHARE, ARMPIT_REACH = 0.25, 0.5
 
 def vertex_regions(body: BodyArrays) -> NDArray[np.int64]:
     """Return the region (V,) of each vertex, as an index into `REGIONS`."""
-    by_joint = np.array([_region_of(name) for name in JOINT_NAMES])
-    regions: NDArray[np.int64] = by_joint[body.weights.argmax(axis=1)]
+    by_joint = [
+        next(k for k, starts in enumerate(BY_JOINT.values()) if name.startswith(starts)) for name in JOINT_NAMES
+    ]
+    regions: NDArray[np.int64] = np.array(by_joint)[body.weights.argmax(axis=1)]
+    head, low = regions == REGIONS.index("face and head"), body.joints[JOINT_INDEX["head"], 1]
+    high = body.vertices[head, 1].max()
     up = vertex_normals(body.vertices, body.faces)[:, 1]
     for name, inside in (
         (SOLES, (regions == REGIONS.index("feet")) & (up < -STEEP)),
         (ARMPITS, _near_armpit(body) & (up < -STEEP)),
-        (CROWN, _on_crown(body, regions) & (up > STEEP)),
+        (CROWN, head & (body.vertices[:, 1] > high - CROWN_SHARE * (high - low)) & (up > STEEP)),
     ):
         regions[inside] = REGIONS.index(name)
     return regions
-
-
-def _region_of(joint: str) -> int:
-    return next(k for k, starts in enumerate(BY_JOINT.values()) if joint.startswith(starts))
 
 
 def _near_armpit(body: BodyArrays) -> Mask:
@@ -133,13 +133,6 @@ def _near_armpit(body: BodyArrays) -> Mask:
         reach = ARMPIT_REACH * float(np.linalg.norm(elbow - shoulder))
         near |= np.linalg.norm(body.vertices - shoulder, axis=1) < reach
     return near
-
-
-def _on_crown(body: BodyArrays, regions: NDArray[np.int64]) -> Mask:
-    head = regions == REGIONS.index("face and head")
-    low: F64 = body.joints[JOINT_INDEX["head"], 1]
-    high = body.vertices[head, 1].max()
-    return np.asarray(head & (body.vertices[:, 1] > high - CROWN_SHARE * (high - low)))
 
 
 # Which texels of the body a capture shows: each pixel of a UV image that lies on the mask shows its texel.

@@ -144,10 +144,7 @@ def share_ranges(model: onnx.ModelProto, ranges: Any) -> None:
 
 
 def _sources(name: str, makers: dict[str, onnx.NodeProto]) -> Iterator[str]:
-    """Yield the tensor `name`, and then each tensor from which operators of `MOVES` alone have made it.
-
-    `makers`: node that makes each tensor, by the tensor's name.
-    """
+    """Yield the tensor `name`, and then each tensor from which operators of `MOVES` alone have made it."""
     yield name
     while name in makers and makers[name].op_type in MOVES:
         name = makers[name].input[0]
@@ -228,7 +225,9 @@ def power_of_two_weights(model: onnx.ModelProto, ranges: Any, reduce_range: bool
         ends = {node.input[0], node.output[0]} if node.op_type == "Conv" else set()
         if not ends or not ends <= known or node.input[1] not in constants:
             continue
-        source, target = (_step_of(ranges[name]) for name in (node.input[0], stored[node.output[0]]))
+        source, target = (
+            float(ranges[name].highest - ranges[name].lowest) / BYTE for name in (node.input[0], stored[node.output[0]])
+        )
         kernel = constants[node.input[1]]
         bias = _bias_of(node, kernel, constants, model)
         finest = np.maximum(FINEST * target, np.abs(numpy_helper.to_array(bias)) / LARGEST_BIAS) / source
@@ -246,10 +245,7 @@ def power_of_two_weights(model: onnx.ModelProto, ranges: Any, reduce_range: bool
 def _bias_of(
     node: onnx.NodeProto, kernel: onnx.TensorProto, constants: dict[str, onnx.TensorProto], model: onnx.ModelProto
 ) -> onnx.TensorProto:
-    """Return the bias (O,) of the Conv `node`. If it has none, first add a bias of zeros to `model` and `constants`.
-
-    `kernel`: weights of the Conv. `constants`: constants of `model`, by name.
-    """
+    """Return the bias (O,) of the Conv `node`. If it has none, first add a bias of zeros to `model` and `constants`."""
     if len(node.input) == 2:
         zeros = numpy_helper.from_array(np.zeros(kernel.dims[0], np.float32), f"{node.output[0]}_bias")
         constants[zeros.name] = model.graph.initializer.add()
@@ -278,9 +274,6 @@ def _round_weights(kernel: onnx.TensorProto, finest: NDArray[np.float64], top: i
     """Round `kernel` (O, I, h, w) in place, and return the scale (O,) of each output channel, a power of two.
 
     The weights of a channel become even multiples of its scale.
-
-    `finest`: lower limit (O,) of the scales.
-    `top`: largest multiple.
     """
     values = numpy_helper.to_array(kernel).astype(np.float64)
     rows = values.reshape(len(values), -1)
@@ -307,17 +300,11 @@ def _like(tensor: onnx.TensorProto, values: NDArray[np.float64], shape: tuple[in
     return numpy_helper.from_array(values.reshape(shape).astype(np.float32), tensor.name)
 
 
-def _step_of(data: Any) -> float:
-    return float(data.highest - data.lowest) / BYTE
-
-
 def _cut(name: str, data: Any, model: onnx.ModelProto) -> tuple[float, float]:
     """Return (low, high) of the part of a tensor's measured range that bytes must cover; 0 is included.
 
     Bytes must cover the whole range of the network's input, of its output and of the logits: with clipped logits, no
     pixel would be fully transparent.
-
-    `name`: name of the tensor. `data`: its measured range, from ONNX Runtime's TensorsData.
     """
     makers = {out: node for node in model.graph.node for out in node.output}
     ends = {value.name for value in (model.graph.input[0], model.graph.output[0])}

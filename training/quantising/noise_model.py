@@ -136,15 +136,12 @@ class NoiseGraph:
         if node.op_type == "QuantizeLinear":
             self.store(node)
         elif node.op_type == "DequantizeLinear" and node.input[0] in self.values:
-            self._constant(node)
+            # An input of the noise model, so that each draw can change it.
+            self.constants[node.output[0]] = self.constant(node)
         elif node.op_type == "DequantizeLinear" and node.input[0] != self.source.input[0].name:
             self.nodes.append(helper.make_node("Identity", [node.input[0]], list(node.output)))
         else:
             self.nodes.append(node)
-
-    def _constant(self, node: onnx.NodeProto) -> None:
-        """Make the constant that `node` dequantises an input of the noise model, so that each draw can change it."""
-        self.constants[node.output[0]] = self.constant(node)
 
     def constant(self, node: onnx.NodeProto) -> tuple[F32, NDArray[np.float64]]:
         """Return (float value of the constant that `node` dequantises, largest error of each element)."""
@@ -194,10 +191,6 @@ class NoiseGraph:
         """Add nodes for `y` = (round(`x` / step + offset) - offset) step, which has an error of at most ½ step.
 
         A value that is exactly 0, or at an end of the range or beyond, is only clipped.
-
-        `x`, `y`: names of the tensor before and after rounding.
-        `step`: step of the stored tensor, as a real number.
-        `ends`: names of the constants (lower end, upper end) of the range.
         """
         step_name, none = self._limit(f"{y}.step", step), self._limit(f"{y}.none", 0.0)
         offset = f"{y}.offset"

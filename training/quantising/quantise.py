@@ -105,15 +105,15 @@ def quantise(
 
     Raises BadInputError for wrong frames, an unknown method or layer, or a network that is not finite.
     """
-    _check_frames(model, frames)
-    _check_weights(model)
     plain, ranges = _measured(model, frames, method)
     unknown = set(keep_float) - {node.name for node in plain.graph.node}
     if unknown:
         raise BadInputError("quantise", f"no layer {', '.join(sorted(unknown))}", "names of layers to keep in float")
     limit_logits(plain, ranges)
     calibrated = _calibrated(plain, ranges, reduce_range, keep_float)
-    constants = _float_constants(plain, calibrated.model)
+    # A bias that was added by the rounding has the float value 0.
+    constants = {name: np.zeros(tensor.dims, np.float32) for name, tensor in constants_of(calibrated.model).items()}
+    constants |= {name: numpy_helper.to_array(tensor) for name, tensor in constants_of(plain).items()}
     quantised = insert_scales_and_zero_points(
         calibrated.model, calibrated.ranges, calibrated.overrides, reduce_range, keep_float
     )
@@ -136,8 +136,6 @@ def byte_ranges(model: onnx.ModelProto, frames: Sequence[F32], method: str = CAL
 
     Raises BadInputError as `quantise` does.
     """
-    _check_frames(model, frames)
-    _check_weights(model)
     plain, ranges = _measured(model, frames, method)
     limit_logits(plain, ranges)
     calibrated = _calibrated(plain, ranges, reduce_range=True, keep_float=())
@@ -149,15 +147,12 @@ def byte_ranges(model: onnx.ModelProto, frames: Sequence[F32], method: str = CAL
     return ByteRanges(reals, calibrated.rounds_alike)
 
 
-def _float_constants(plain: onnx.ModelProto, rounded: onnx.ModelProto) -> dict[str, NDArray[Any]]:
-    """Return float constants by name: those of the model `plain`, and zeros for biases that only `rounded` has."""
-    known = {name: numpy_helper.to_array(tensor) for name, tensor in constants_of(plain).items()}
-    added = {name: np.zeros(tensor.dims, np.float32) for name, tensor in constants_of(rounded).items()}
-    return added | known
-
-
 def _measured(model: onnx.ModelProto, frames: Sequence[F32], method: str) -> tuple[onnx.ModelProto, Any]:
     """Return (model as ONNX Runtime prepares it for quantising, measured ranges of its tensors)."""
+    _check_frames(model, frames)
+    for tensor in model.graph.initializer:
+        if tensor.data_type == TensorProto.FLOAT and not np.isfinite(numpy_helper.to_array(tensor)).all():
+            raise BadInputError("quantise", f"weights {tensor.name!r} that are not finite", "a trained network")
     with tempfile.TemporaryDirectory(prefix="trilane-quantise-") as folder:
         prepared = Path(folder) / "prepared.onnx"
         source = Path(folder) / "float.onnx"
@@ -172,10 +167,7 @@ def _measured(model: onnx.ModelProto, frames: Sequence[F32], method: str) -> tup
 
 
 def _calibrated(model: onnx.ModelProto, ranges: Any, reduce_range: bool, keep_float: Sequence[str]) -> _Calibrated:
-    """Return `model` rounded so that all runtimes round alike; if this is impossible, `model` with measured ranges.
-
-    `ranges`: measured ranges, ONNX Runtime's TensorsData. `reduce_range`, `keep_float`: as for `quantise`.
-    """
+    """Return `model` rounded so that all runtimes round alike; if this is impossible, `model` with measured ranges."""
     if not keep_float and may_round_alike(model):
         rounded, widened = copy.deepcopy(model), copy.deepcopy(ranges)
         power_of_two_ranges(rounded, widened)
@@ -198,12 +190,6 @@ def _check_frames(model: onnx.ModelProto, frames: Sequence[NDArray[np.float32]])
     for i, frame in enumerate(frames):
         if frame.shape != (h, w, c) or not np.isfinite(frame).all():
             raise BadInputError("calibration", f"frame {i} of shape {frame.shape}", f"finite values, ({h}, {w}, {c})")
-
-
-def _check_weights(model: onnx.ModelProto) -> None:
-    for tensor in model.graph.initializer:
-        if tensor.data_type == TensorProto.FLOAT and not np.isfinite(numpy_helper.to_array(tensor)).all():
-            raise BadInputError("quantise", f"weights {tensor.name!r} that are not finite", "a trained network")
 
 
 def _describe(model: onnx.ModelProto, keep_float: Sequence[str]) -> None:
@@ -349,14 +335,6 @@ def insert_scales_and_zero_points(
     return result
 
 
-def set_picture_scale_and_zero_point(graph: onnx.GraphProto, node: onnx.NodeProto) -> None:
-    """Give `node`, the Quantize node of the output of `graph`, the scale 1/255 and the zero point 0."""
-    values = {"picture_scale": np.float32(OUTPUT_SCALE), "picture_zero_point": np.uint8(0)}
-    for slot, (name, value) in enumerate(values.items(), start=1):
-        node.input[slot] = name
-        graph.initializer.append(numpy_helper.from_array(np.asarray(value), name))
-
-
 # Gives an integer network bytes at both ends: NHWC input bytes, and output bytes that are the picture.
 #
 # Rule: bytes are dequantised first and then transposed. In the opposite order OpenVINO computes the first layer in
@@ -373,7 +351,10 @@ def replace_ends_by_bytes(model: onnx.ModelProto) -> None:
     first = next(node for node in graph.node if source.name in node.input and node.op_type == "QuantizeLinear")
     last = next(node for node in graph.node if target.name in node.output and node.op_type == "DequantizeLinear")
     maker = next(node for node in graph.node if last.input[0] in node.output)
-    set_picture_scale_and_zero_point(graph, maker)
+    values = {"picture_scale": np.float32(OUTPUT_SCALE), "picture_zero_point": np.uint8(0)}
+    for slot, (name, value) in enumerate(values.items(), start=1):
+        maker.input[slot] = name
+        graph.initializer.append(numpy_helper.from_array(np.asarray(value), name))
     n, c, h, w = (dim.dim_value for dim in source.type.tensor_type.shape.dim)
     inner = [node for node in graph.node if node not in (first, last)]
     real = _nhwc_to_real(inner, source.name, first.output[0])
@@ -389,11 +370,7 @@ def replace_ends_by_bytes(model: onnx.ModelProto) -> None:
 
 
 def _nhwc_to_real(inner: list[onnx.NodeProto], source: str, quantised: str) -> list[onnx.NodeProto]:
-    """Return nodes that dequantise and transpose the input, and make the other nodes read their output.
-
-    `inner`: other nodes of the graph; those that dequantise the tensor `quantised` are removed.
-    `source`: name of the input.
-    """
+    """Return nodes that dequantise and transpose the input, and make the other nodes read their output."""
     readers = [node for node in inner if quantised in node.input]
     scale, zero_point = readers[0].input[1:3]
     nchw = readers[0].output[0]

@@ -633,7 +633,7 @@ def test_fields_may_be_parted_by_semicolons_with_decimal_commas(tmp_path: Path) 
         file = tmp_path / f"{name}.csv"
         file.write_bytes("\r\n".join(["\ufeff" + head, *lines]).encode())
         found.append(read_pose_table(file, TableClock(None, "auto"), TUM_NAMES, "a table"))
-    np.testing.assert_allclose(found[0].times_s, times, atol=1e-6)
+    np.testing.assert_allclose(found[0].times.since_s, times, atol=1e-6)
     np.testing.assert_allclose(found[0].places, poses[:, :3], atol=1e-6)
     assert np.array_equal(found[0].places, found[1].places)
 
@@ -649,4 +649,4 @@ def test_times_in_a_column_of_places_are_refused(tmp_path: Path, column: int) ->
     with pytest.raises(BadInputError, match=f"in the place of {'xyz'[column - 1]} numbers that grow by equal steps"):
         read_pose_table(file, TableClock(None, "auto"), TUM_NAMES, "a table")
     np.savetxt(file, np.column_stack([times, poses]), fmt="%.6f")
-    assert len(read_pose_table(file, TableClock(None, "auto"), TUM_NAMES, "a table").times_s) == len(times)
+    assert len(read_pose_table(file, TableClock(None, "auto"), TUM_NAMES, "a table").turns) == len(times)

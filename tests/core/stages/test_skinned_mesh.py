@@ -15,9 +15,9 @@ from trilane.errors import BadInputError, TrilaneError
 from trilane.stages.gpu.opengl import build_program, shader_source
 from trilane.stages.gpu.skinned_mesh import (
     BodyPose,
+    Mesh,
     PosedMesh,
     SkinnedMesh,
-    _index_bytes,
     avatar_mesh,
     enough_weights,
     is_closed,
@@ -217,5 +217,5 @@ def test_what_cannot_be_drawn_is_refused_by_its_name(where: str, changed: dict[s
 def test_indices_are_of_two_bytes_where_that_suffices(count: int, size: int) -> None:
     arrays = SimpleNamespace(position=np.broadcast_to(0.0, (count, 3)))
     triangles = np.array([(count - 1, 1, 2)], np.uint32)
-    found = np.frombuffer(_index_bytes(arrays, triangles), f"u{size}")  # type: ignore[arg-type]
-    assert found.tolist() == [count - 1, 1, 2]
+    ((_, indices),) = Mesh(SimpleNamespace(buffer=bytes), arrays, {4: triangles}).batches  # type: ignore[arg-type]
+    assert np.frombuffer(indices, f"u{size}").tolist() == [count - 1, 1, 2]
