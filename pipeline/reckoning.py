@@ -178,7 +178,6 @@ class WhatIf:
     def _replayed(self, frames: Sequence[Mapping[str, Need]], slowed: str, message_ns: int) -> list[int]:
         """Replay frames, and return the time in ns of each block of LEAST_FRAMES frames but the first and the last.
 
-        `frames`: for each frame, the needs of its jobs by stage.
         `slowed`: name of the slowed stage; "" for none.
         `message_ns`: time from the end of a job until the next job is handed over.
         """
@@ -259,10 +258,7 @@ class RunEfficiencies:
         }
 
     def _book(self, jobs: Sequence[JobRecord], first_ns: int) -> None:
-        """Add the work and CPU time of `jobs` that must lie between the first and the last presented frame.
-
-        `first_ns`: time in ns of the first presented frame.
-        """
+        """Add the work and CPU time of `jobs` that must lie between the first and the last presented frame."""
         for job in jobs:
             cores, threads = self._places[job.unit]
             length_ns = job.end_ns - job.begin_ns
@@ -333,9 +329,6 @@ def _bound(budget: Budget, unit_of: Mapping[str, str], slowed: ReplayFindings | 
     The bound is the unit, and the stage, whose slowing costs most. If the replays cannot be trusted, the bound is the
     unit, and the stage, with the largest share of the path. If the largest share belongs to no unit (other programs,
     release), its name is the bottleneck even if the replays can be trusted.
-
-    `unit_of`: unit of each stage.
-    `slowed`: results of the replays; None: none were made.
     """
     names = budget.names(unit_of)
     path = {kind: budget.largest(name_of) for kind, name_of in names.items()}
@@ -364,10 +357,7 @@ def _bound(budget: Budget, unit_of: Mapping[str, str], slowed: ReplayFindings | 
 
 
 def _costs_most(costs: Mapping[str, Cost], name: str) -> dict[str, Any]:
-    """Return the keys of `_cost` for the largest cost, and `rivals`: the other names whose cost may be as large.
-
-    `name`: name with the largest cost.
-    """
+    """Return the keys of `_cost` for `name`, which costs most, and `rivals`: other names that may cost as much."""
     most = costs[name]
     rivals = None
     if most.half_width() is not None:

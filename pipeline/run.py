@@ -166,11 +166,8 @@ def run_pipeline(
             # A run with a journal may last for days, so the ledger keeps sketches instead of all values.
             sketch = None if journal is None else DdSketch
             core = Core(pipeline.graph(), settings, Books(target_ns, sketch))
-            clock = RealtimeClock(core, processes, interrupts, log, requests, governor, on_progress, sketch)
-            cores = sorted({core for unit in pipeline.units.values() for core in unit.cores})
-            if controls is not None:
-                clock.heed(controls)
-            run = _Run(core, clock, processes, interrupts, log, record, cores, pipeline.warms_up)
+            clock = RealtimeClock(core, processes, interrupts, log, requests, governor, on_progress, sketch, controls)
+            run = _Run(core, clock, processes, interrupts, log, record, pipeline.run_cores, pipeline.warms_up)
             run.execute()
         is_open = requests is not None or controls is not None
         report = core.report(clock="host", requested=core.source.released if is_open else None)
@@ -271,10 +268,7 @@ class _Run:
         )
 
     def _mean_metrics(self) -> Mapping[str, Mapping[str, float]]:
-        """Return the mean of each metric, over the jobs that reported it, by stage and metric.
-
-        Counts of bytes are left out, because `add_bytes` reports them.
-        """
+        """Return the mean of each metric, without the counts of bytes, over the jobs that reported it, by stage."""
         reported = self._clock.reported
         return {
             stage: {name: total / reported[stage][name] for name, total in sums.items() if name not in BYTES}

@@ -304,10 +304,7 @@ class Timeline:
         self.units[job.unit].held.append(Handed(job, self._now_ns, heard_ns, after))
 
     def _end(self, event: JobDone, after: list[Key]) -> Iterator[Fact]:
-        """Note the end of a job, and yield the facts that follow. Its frame waits for the next stages or is presented.
-
-        `after`: list that gets the key of the job.
-        """
+        """Note the end of a job, add its key to `after`, and yield the facts that follow."""
         handed = self.units[event.unit].take(event.job)
         if handed is None:
             return

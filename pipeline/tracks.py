@@ -99,8 +99,9 @@ class ChainTrack:
     def __init__(self, graph: Graph, settings: Settings) -> None:
         names = [stage.name for stage in graph.stages]
         self.frames: dict[int, FrameState] = {}
-        self._source = Source(settings, self._turn_away)
-        self._turned_away: dict[str, deque[tuple[int, int]]] = {cause: deque() for cause in DropCause}
+        turned_away: dict[str, deque[tuple[int, int]]] = {cause: deque() for cause in DropCause}
+        self._source = Source(settings, lambda frame, ns, cause: turned_away[cause].append((frame, ns)))
+        self._turned_away = turned_away
         self._bypass, self._latency_to = graph.bypass, graph.latency_to
         self._from_release = graph.from_release
         self._first, self._last = names[0], names[-1]
@@ -182,9 +183,6 @@ class ChainTrack:
     def late(self, _unit: str) -> list[str]:
         """Return an empty list, because no stage of a chain has several inputs."""
         return []
-
-    def _turn_away(self, frame: int, release_ns: int, cause: DropCause) -> None:
-        self._turned_away[cause].append((frame, release_ns))
 
     def _frame(self, number: int, now_ns: int) -> FrameState:
         """Return the state of a frame in flight. If the journal lacks the frame's first job, make the state now."""

@@ -107,7 +107,7 @@ def world(monkeypatch: pytest.MonkeyPatch) -> World:
         ("run_loop", world.run_loop),
         ("start_units", lambda *_: {"left": 1.5, "right": 2.5}),
         ("close_units", lambda *_: None),
-        ("beside_units", lambda cores, pids: lambda now: 0.25 if (cores, pids == now) == ([0, 1, 3], True) else None),
+        ("beside_units", lambda cores, pids: lambda now: 0.25 if (cores, pids == now) == ((0, 1, 3), True) else None),
         ("processor_of", lambda cores: lambda: ProcessorState(throttles=len(cores))),
     ):
         monkeypatch.setattr(run, name, part)
