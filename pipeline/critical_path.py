@@ -58,16 +58,13 @@ class Sharing:
     """Computes which stages had a core while the jobs of another stage had none.
 
     `cores`: numbers of the cores of each unit; a unit whose cores are not known is missing.
-    `delay`: number of further jobs after whose end a job is counted. By then, all jobs that ran at the same time must
-    have ended.
     """
 
-    def __init__(self, cores: Mapping[str, Sequence[int]], delay: int = DELAY) -> None:
+    def __init__(self, cores: Mapping[str, Sequence[int]]) -> None:
         self._beside = {
             unit: [other for other in cores if other != unit and set(cores[other]) & set(own)]
             for unit, own in cores.items()
         }
-        self._delay = delay
         self._waiting: deque[JobRecord] = deque()
         self._jobs: dict[str, list[JobRecord]] = {unit: [] for unit in cores}
         self._sums: dict[str, Taken] = {}
@@ -77,10 +74,10 @@ class Sharing:
         if self._beside.get(job.unit):
             of_unit = self._jobs[job.unit]
             of_unit.append(job)
-            if len(of_unit) > 4 * self._delay:
-                del of_unit[: 2 * self._delay]
+            if len(of_unit) > 4 * DELAY:
+                del of_unit[: 2 * DELAY]
         self._waiting.append(job)
-        if len(self._waiting) > self._delay:
+        if len(self._waiting) > DELAY:
             self._count(self._waiting.popleft())
 
     def close(self) -> dict[str, Taken]:

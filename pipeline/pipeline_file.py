@@ -340,8 +340,9 @@ def time_of(measurement: Measurement) -> StageTime:
 def _inputs(value: object, where: str) -> tuple[PortInput, ...]:
     """Return the inputs of a stage. `value`: value of its key `in`: a stage, stage.port, or a table of ports."""
     # A table is one input, such as { from = "camera", sync = "latest" }, or a table of ports.
-    is_one = not isinstance(value, dict) or ("from" in value and value.keys() <= {*InputKeys.known()})
-    ports = {"": value} if is_one else value
+    ports = value if isinstance(value, dict) else {"": value}
+    if "from" in ports and ports.keys() <= {*InputKeys.known()}:
+        ports = {"": value}
     if not ports:
         raise BadInputError(where, "an empty table", "a port, such as { frame = 'camera' }", "a source has no `in`")
     found = []

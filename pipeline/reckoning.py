@@ -171,7 +171,10 @@ class WhatIf:
         if not count or not measured_ns or not any(need.cpu_ns for needs in frames for need in needs.values()):
             return None
         plain_ns = replays.pop("")
-        costs = {name: _stage_cost(spans_ns[:count], plain_ns[:count]) for name, spans_ns in replays.items()}
+        costs = {}
+        for name, spans_ns in replays.items():
+            each = tuple(slow / plain - 1 for slow, plain in zip(spans_ns[:count], plain_ns[:count], strict=True))
+            costs[name] = Cost(sum(spans_ns[:count]) / sum(plain_ns[:count]) - 1, each)
         whole_ns = measured_ns / ((len(self._blocks) - 1) * LEAST_FRAMES)
         return ReplayFindings(costs, count * LEAST_FRAMES, sum(plain_ns) / len(plain_ns) / LEAST_FRAMES / whole_ns)
 
@@ -194,11 +197,6 @@ class WhatIf:
         ends_ns = [end_ns for _, end_ns in run.run()]
         cuts = ends_ns[LEAST_FRAMES - 1 :: LEAST_FRAMES]
         return [after - before for before, after in pairwise(cuts[:-1])]
-
-
-def _stage_cost(slowed_ns: Sequence[int], plain_ns: Sequence[int]) -> Cost:
-    each = tuple(slow / plain - 1 for slow, plain in zip(slowed_ns, plain_ns, strict=True))
-    return Cost(sum(slowed_ns) / sum(plain_ns) - 1, each)
 
 
 class RunEfficiencies:

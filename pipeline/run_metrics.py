@@ -6,7 +6,6 @@ is left out of the file. Times are in ms, shares from 0 to 1.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any, Final, Literal, Self
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
@@ -477,11 +476,3 @@ class RunMetrics(PolicyMetrics):
     streams: dict[str, NewestTaken] = Field(default={})
     caps: Caps | None = None
     temperature_c: Temperature | None = None
-
-
-def metrics_of(ledger_report: Mapping[str, Any]) -> RunMetrics:
-    """Return the figures of a run. Raises ValueError for a wrong key or value.
-
-    `ledger_report`: keys of `Ledger.report()`, and further keys of report.json.
-    """
-    return RunMetrics.model_validate(ledger_report)

@@ -251,48 +251,27 @@ def _told_apart(made: list[Measurement]) -> list[Measurement]:
     return result
 
 
-class Figures(NamedTuple):
-    """Figures of measured times in ms, as a tool states them; None for a figure that the tool does not state.
-
-    `sd`: standard deviation.
-    `low`, `high`: least and largest time.
-    `p50`, `p95`: percentiles.
-    """
-
-    mean: float | None = None
-    sd: float | None = None
-    low: float | None = None
-    p50: float | None = None
-    p95: float | None = None
-    high: float | None = None
-
-
 #: Relative rounding of a figure that a tool prints with six digits.
 ROUNDING: Final = 2e-5
 
 
-def contradiction(figures: Figures) -> str:
-    """Return a sentence about two figures that contradict each other; "" if no two figures do.
+def contradiction(stated: Measurement) -> str:
+    """Return a sentence about two figures of a measurement that contradict each other; "" if no two figures do.
 
     Mean and percentiles must lie between the least and the largest time, and a higher percentile must not be smaller.
     """
-    named = [
-        ("the least", figures.low),
-        ("the median", figures.p50),
-        ("p95", figures.p95),
-        ("the largest", figures.high),
-    ]
+    mean, sd, low, high = stated.mean_ms, stated.sd_ms, stated.min_ms, stated.max_ms
+    named = [("the least", low), ("the median", stated.p50_ms), ("p95", stated.p95_ms), ("the largest", high)]
     ordered = [(name, value) for name, value in named if value is not None]
     for (name, value), (next_name, next_value) in pairwise(ordered):
         if value > next_value * (1 + ROUNDING):
             return f"{name} ({value:g} ms) is above {next_name} ({next_value:g} ms)"
-    low, high, mean = figures.low, figures.high, figures.mean
     if mean is not None and low is not None and mean < low * (1 - ROUNDING):
         return f"the mean ({mean:g} ms) is below the least ({low:g} ms)"
     if mean is not None and high is not None and mean > high * (1 + ROUNDING):
         return f"the mean ({mean:g} ms) is above the largest ({high:g} ms)"
-    if None not in (figures.sd, low, high) and figures.sd > (high - low) * (1 + ROUNDING) + 1e-3:  # type: ignore[operator]
-        return f"the standard deviation ({figures.sd:g} ms) is larger than all of the range"
+    if None not in (sd, low, high) and sd > (high - low) * (1 + ROUNDING) + 1e-3:  # type: ignore[operator]
+        return f"the standard deviation ({sd:g} ms) is larger than all of the range"
     return ""
 
 

@@ -13,13 +13,13 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import PurePosixPath
 from typing import Any, Final
 
 from trilane.pipeline.measurements.measurement import (
     PER_MS,
     ROUNDING,
-    Figures,
     Kind,
     Measurement,
     Measurements,
@@ -226,18 +226,15 @@ class BenchmarkLog:
             if time is None:
                 return
             ms[key] = time
-        figures = Figures(*(ms.get(key) for key in ("avg", "std", "min", "median", "p95", "max")))
-        like_means = [figures._replace(mean=ms[key]) for key in ("first", "curr", "p5") if key in ms]
-        if wrong := next(filter(None, map(contradiction, [figures, *like_means])), ""):
+        runs = int(count) if isinstance(count, float) else None
+        figures = (ms.get(key) for key in ("avg", "std", "min", "median", "p95", "max"))
+        what, hardware = "runs after the warm-up, figures alone", _ran_by(self._lines)
+        made = Measurement(name, "run", unit, what, (), runs, *figures, hardware=hardware)
+        like_means = [replace(made, mean_ms=ms[key]) for key in ("first", "curr", "p5") if key in ms]
+        if wrong := next(filter(None, map(contradiction, [made, *like_means])), ""):
             self.found.refuse(row, wrong)
             return
-        runs = int(count) if isinstance(count, float) else None
-        self.found.add(
-            Measurement(
-                name, "run", unit, "runs after the warm-up, figures alone", (), runs, figures.mean, figures.sd,
-                figures.low, figures.p50, figures.p95, figures.high, hardware=_ran_by(self._lines),
-            )
-        )  # fmt: skip
+        self.found.add(made)
 
     def _operator(self, place: str, line: str) -> None:
         """Add a row of the table of operators in run order. The first row of the table names the columns."""
@@ -419,20 +416,17 @@ def _add_stats(found: Measurements, row: str, name: str, kind: Kind, stats: obje
             ms[key] = found.ms(row, stats[key], "ms", "layer" if key == "stdev" else kind, key)
             if ms[key] is None:
                 return
-    figures = Figures(ms.get("mean"), ms.get("stdev"), ms.get("min"), ms.get("median"), None, ms.get("max"))
-    wrong = contradiction(figures)
-    if wrong or figures.mean is None:
+    count = stats.get("count")
+    what = "calls of the network in its runtime" if kind == "run" else "wall time, with all around the network"
+    made = Measurement(
+        name, kind, "ms", what, (), count, ms.get("mean"), ms.get("stdev"), ms.get("min"), ms.get("median"), None,
+        ms.get("max"), service=kind == "run", more={"p90_ms": p90} if (p90 := ms.get("p90")) is not None else {},
+    )  # fmt: skip
+    wrong = contradiction(made)
+    if wrong or made.mean_ms is None:
         found.refuse(row, wrong or "no mean")
         return
-    count = stats.get("count")
     if count is not None and (not isinstance(count, int) or isinstance(count, bool) or count < 1):
         found.refuse(row, f"count is {count!r}, not a whole number of runs")
         return
-    what = "calls of the network in its runtime" if kind == "run" else "wall time, with all around the network"
-    more = {"p90_ms": ms["p90"]} if ms.get("p90") is not None else {}
-    found.add(
-        Measurement(
-            name, kind, "ms", what, (), count, figures.mean, figures.sd, figures.low, figures.p50, None, figures.high,
-            service=kind == "run", more=more,  # type: ignore[arg-type]
-        )
-    )  # fmt: skip
+    found.add(made)

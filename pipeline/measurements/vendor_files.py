@@ -34,7 +34,6 @@ from typing import Any, Final
 from trilane.pipeline.measurements.measurement import (
     CYCLES,
     PER_MS,
-    Figures,
     Kind,
     Measurement,
     Measurements,
@@ -384,11 +383,6 @@ def _add_latencies(found: Measurements, scenario: str, facts: Mapping[str, tuple
                 row, f"the percentile {lower:g} ({time:g} ms) is above the percentile {upper:g} ({other:g} ms)"
             )
             return
-    figures = Figures(ms["Mean"], None, ms.get("Min"), ms.get("50.00"), ms.get("95.00"), ms.get("Max"))
-    wrong = contradiction(figures) or _of_rate(scenario, facts, ms["Mean"])
-    if wrong:
-        found.refuse(row, wrong)
-        return
     name = facts.get("SUT name", ("", "query"))[1] or "query"
     more = {f"p{key:g}_ms": value for key, value in percentiles}
     result = facts.get("Result is", ("", ""))[1]
@@ -397,12 +391,14 @@ def _add_latencies(found: Measurements, scenario: str, facts: Mapping[str, tuple
     if scenario == OFFLINE and is_finite(rate):
         hints.append(f"{rate:g} samples a second")
         more["samples_per_second"] = rate
-    found.add(
-        Measurement(
-            name, kind, "ns", _what(scenario), (), count, figures.mean, None, figures.low, figures.p50, figures.p95,
-            figures.high, service=scenario == SINGLE, hint="; ".join(hints), more=more,
-        )
+    made = Measurement(
+        name, kind, "ns", _what(scenario), (), count, ms["Mean"], None, ms.get("Min"), ms.get("50.00"),
+        ms.get("95.00"), ms.get("Max"), service=scenario == SINGLE, hint="; ".join(hints), more=more,
     )  # fmt: skip
+    if wrong := contradiction(made) or _of_rate(scenario, facts, ms["Mean"]):
+        found.refuse(row, wrong)
+        return
+    found.add(made)
 
 
 def _what(scenario: str) -> str:

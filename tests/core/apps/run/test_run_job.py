@@ -21,7 +21,7 @@ from trilane.hw_profiles.governor import Governor
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.journal import JournalWriter, journal_of
 from trilane.pipeline.result import Failure, JournalFile, RunResult
-from trilane.pipeline.run_metrics import metrics_of
+from trilane.pipeline.run_metrics import RunMetrics
 from trilane.scene.schema import OutputSpec, Scene
 from trilane.scheduler.events import Settings
 from trilane.scheduler.recording import Recording
@@ -61,7 +61,7 @@ def a_result(frames: int = FRAMES, policy: str = "pipelined", **changes: Any) ->
     """What a run of so many frames hands back."""
     run = simulate(application_graph(), Settings(frames, policy), lambda stage, *_: STAGE_NS[stage], keep=True)
     assert run.recording is not None
-    report = metrics_of({**run.report, "clock": "host", "policy": policy, "edge": "double"})
+    report = RunMetrics.model_validate({**run.report, "clock": "host", "policy": policy, "edge": "double"})
     result = RunResult(
         report=report,
         requested=frames,
@@ -295,10 +295,8 @@ def test_a_run_at_a_chips_pace_is_compared(runs: Callable[..., Runs], tmp_path: 
 def test_a_cap_is_kept_by_a_governor_of_this_machine(runs: Callable[..., Runs], tmp_path: Path) -> None:
     caps = {"how": "duty cycles", "profile": "host", "performance_profile": "balanced"}
     capped = a_result()
-    capped = replace(
-        capped,
-        report=metrics_of({**capped.report.as_json(), "caps": caps, "temperature_c": {"kind": "modelled"}}),
-    )
+    changed = {**capped.report.as_json(), "caps": caps, "temperature_c": {"kind": "modelled"}}
+    capped = replace(capped, report=RunMetrics.model_validate(changed))
     double = runs(capped, a_result(policy="sequential"))
     report = go(double, tmp_path / "run", performance_profile=PerformanceProfile.BALANCED.value).report
     governors = [call["governor"] for call in double.calls]
