@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import (
@@ -55,102 +55,6 @@ ENDLESS = 1 << 40
 SKIPS = -1
 
 
-class Jobs(Protocol):
-    """The times of a tenant's jobs on a chip, with its units at given corners.
-
-    `mean_ms`: mean time of a job by stage if no other tenant runs.
-    `bound_ms`: lower bound on the frame time if the source is always ready; 0 if none is known.
-    `is_known`: whether the error of every time is known.
-    """
-
-    @property
-    def mean_ms(self) -> Mapping[str, float]: ...
-
-    @property
-    def bound_ms(self) -> float: ...
-
-    @property
-    def is_known(self) -> bool: ...
-
-    def service_ns(self, stage: str, unit: str, frame: int, begin_ns: int) -> int:
-        """Return the time in ns of the job of `stage` for `frame` on `unit`, if no other tenant runs.
-
-        `begin_ns`: virtual time at which the job begins.
-        """
-
-    def network(self, stage: str, frame: int) -> Hashable | None:
-        """Return a name for the network that the job of `stage` for `frame` computes; None if it computes none."""
-
-    def network_ms(self, network: Any, use: float) -> float:
-        """Return the time of a job with `network` in ms, while other jobs take the share `use` of the bandwidth."""
-
-    def moved_bytes(self, network: Any) -> float:
-        """Return the bytes that `network` moves in a job."""
-
-
-class SharingPipeline(Protocol):
-    """A pipeline that shares a chip with others.
-
-    `name`: name in reports.
-    `source`: text of the user's request.
-    `kind`: avatar, network or pipeline.
-    `fps`: frames that are released a second.
-    `takes_memory`: whether its camera, display and composition use the memory all the time.
-    `repeats`: number of frames after which its jobs are the same again.
-    `graph`: its graph for the scheduler.
-    `fed`: (graph, settings) for a run whose source is always ready and in which no frame is dropped.
-    `hardware`: for each unit of the pipeline, the chip's unit that does its jobs; a unit outside of the chip has its
-    own name there.
-    """
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def source(self) -> str: ...
-
-    @property
-    def kind(self) -> str: ...
-
-    @property
-    def fps(self) -> float: ...
-
-    @property
-    def takes_memory(self) -> bool: ...
-
-    @property
-    def repeats(self) -> int: ...
-
-    @property
-    def graph(self) -> Graph: ...
-
-    @property
-    def fed(self) -> tuple[Graph, Settings]: ...
-
-    @property
-    def hardware(self) -> Mapping[str, str]: ...
-
-    def settings(self, display_ns: int) -> Settings:
-        """Return the settings of its scheduler for endless frames at its rate.
-
-        `display_ns`: shortest time between two shown frames of an avatar.
-        """
-
-    def skips(self, frame: int, is_fresh: bool) -> bool:
-        """Return whether a frame takes the bypass of the graph. `is_fresh`: whether its job is fresh."""
-
-    def on(self, profile: Profile, corners: Corners, end: Ends, always: float) -> Jobs:
-        """Return the times of its jobs on the chip `profile`.
-
-        `corners`: corner of each unit of the chip.
-        `end`: expected times, or one end of their intervals.
-        `always`: share of the memory's bandwidth that is taken all the time, 0 to 1.
-        """
-
-    def facts(self, profile: Profile) -> dict[str, Any]:
-        """Return a prediction's keys `unit`, `numbers`, `precision`, `policy` and `edge` for this pipeline."""
-
-
 def check_rate(name: str, fps: float) -> None:
     """Raise BadInputError if `fps`, frames a second, is out of range. `name`: name of the tenant, for the message."""
     if not LEAST_FPS <= fps <= MOST_FPS:
@@ -161,8 +65,11 @@ def check_rate(name: str, fps: float) -> None:
 class Tenant:
     """An avatar, or a network by itself, as a `SharingPipeline`.
 
+    `name`: name in reports.
+    `source`: text of the user's request.
     `networks`: one network for each combination of tensor shape, number of avatars in view and levels of their meshes.
     `frames`: for each frame, the index of its network in `networks`, or `SKIPS`; after its end the list starts over.
+    `fps`: frames that are released a second.
     `unit`: unit of the network.
     `variant`: how the stages are connected and scheduled.
     `is_bare`: whether it consists only of the network, whose result is due when the next frame comes.
@@ -192,22 +99,27 @@ class Tenant:
 
     @property
     def kind(self) -> str:
+        """The kind in reports: avatar, network or pipeline."""
         return "network" if self.is_bare else "avatar"
 
     @property
     def takes_memory(self) -> bool:
+        """Whether its camera, display and composition use the memory all the time."""
         return not self.is_bare
 
     @property
     def repeats(self) -> int:
+        """The number of frames after which its jobs are the same again."""
         return len(self.frames)
 
     @property
     def hardware(self) -> Mapping[str, str]:
+        """The chip's unit for each unit of the pipeline; a unit outside of the chip has its own name there."""
         return {unit: unit for unit in UNITS}
 
     @property
     def graph(self) -> Graph:
+        """The graph for the scheduler."""
         name, _ = INFER
         if self.is_bare:
             return chain([(name, self.unit)], self.variant.edge, name)
@@ -215,11 +127,16 @@ class Tenant:
 
     @property
     def fed(self) -> tuple[Graph, Settings]:
+        """(Graph, settings) for a run whose source is always ready and in which no frame is dropped."""
         policy = self.variant.policy
         settings = Settings(ENDLESS, Variant().policy if POLICIES[policy].paced else policy, hang_ns=ENDLESS)
         return holding_back(self.graph), settings
 
     def settings(self, display_ns: int) -> Settings:
+        """Return the settings of its scheduler for endless frames at its rate.
+
+        `display_ns`: shortest time between two shown frames of an avatar.
+        """
         policy = self.variant.policy
         limits: dict[str, Any] = {"in_queue": 0 if POLICIES[policy].newest else 1, "hang_ns": ENDLESS}
         period_ns = round(NS_PER_S / self.fps)
@@ -239,12 +156,20 @@ class Tenant:
         return self.frames[frame % len(self.frames)]
 
     def skips(self, frame: int, is_fresh: bool) -> bool:  # noqa: ARG002 an older result is never shown again here
+        """Return whether a frame takes the bypass of the graph. `is_fresh`: whether its job is fresh."""
         return self.place(frame) == SKIPS
 
-    def on(self, profile: Profile, corners: Corners, end: Ends, always: float) -> Jobs:
+    def on(self, profile: Profile, corners: Corners, end: Ends, always: float) -> _AvatarJobs:
+        """Return the times of its jobs on the chip `profile`.
+
+        `corners`: corner of each unit of the chip.
+        `end`: expected times, or one end of their intervals.
+        `always`: share of the memory's bandwidth that is taken all the time, 0 to 1.
+        """
         return _AvatarJobs(self, self.computes.on(profile, self.unit), corners, end, always)
 
     def facts(self, profile: Profile) -> dict[str, Any]:
+        """Return a prediction's keys `unit`, `numbers`, `precision`, `policy` and `edge` for this pipeline."""
         return {
             "unit": self.unit,
             "numbers": self.computes.numbers,
@@ -255,9 +180,14 @@ class Tenant:
 
 
 class _AvatarJobs:
-    """The `Jobs` of a `Tenant`. The name of a network is its index in `Tenant.networks`.
+    """The times of a tenant's jobs on a chip, with its units at given corners, if no other tenant runs.
+
+    The name of a network is its index in `Tenant.networks`.
 
     `chip`: hardware profile in the precision and under the runtime of the networks.
+    `mean_ms`: mean time of a job by stage.
+    `bound_ms`: lower bound on the frame time if the source is always ready; 0 if none is known.
+    `is_known`: whether the error of every time is known.
     """
 
     is_known = True
@@ -273,15 +203,19 @@ class _AvatarJobs:
         self.mean_ms = {stage: sum(times[stage] for times in each) / len(each) for stage in each[0]}
 
     def service_ns(self, stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
+        """Return the time in ns of the job of `stage` for `frame`."""
         return round(self._stages_ms(self._kind(frame), self._always)[stage] * NS_PER_MS)
 
     def network(self, stage: str, frame: int) -> Hashable | None:
+        """Return a name for the network that the job of `stage` for `frame` computes; None if it computes none."""
         return self._kind(frame) if stage == INFER[0] else None
 
     def network_ms(self, network: int, use: float) -> float:
+        """Return the time of a job with `network` in ms, while other jobs take the share `use` of the bandwidth."""
         return self._stages_ms(network, use)[INFER[0]]
 
     def moved_bytes(self, network: int) -> float:
+        """Return the bytes that `network` moves in a job."""
         tenant = self._tenant
         return moved_bytes(tenant.networks[network].work, self._chip.units[tenant.unit])
 
@@ -365,7 +299,7 @@ class FileTenant:
     def skips(self, frame: int, is_fresh: bool) -> bool:  # noqa: ARG002 as in every prediction of a file
         return self.file.bypass is not None and self.file.bypass[1].takes(frame)
 
-    def on(self, profile: Profile, corners: Corners, end: Ends, always: float) -> Jobs:
+    def on(self, profile: Profile, corners: Corners, end: Ends, always: float) -> _FileJobs:
         return _FileJobs(self, profile, corners, end, always)
 
     def chip(self, stage: str, profile: Profile, unit: UnitName) -> Profile:
@@ -378,6 +312,10 @@ class FileTenant:
         run = self.file.run
         units = dict.fromkeys(self.hardware.values())
         return {"unit": ", ".join(units), "numbers": None, "precision": None, "policy": run.policy, "edge": run.edge}
+
+
+#: A pipeline that shares a chip with others; its members are described at `Tenant`.
+SharingPipeline = Tenant | FileTenant
 
 
 class _Priced(NamedTuple):
@@ -393,10 +331,9 @@ class _Priced(NamedTuple):
 
 
 class _FileJobs:
-    """The `Jobs` of a `FileTenant`. The name of a network is the name of its stage.
+    """The jobs of a `FileTenant`, as `_AvatarJobs`. The name of a network is the name of its stage.
 
-    A network takes bandwidth only if the chip's model gives its time. If the file states the time, the stage counts as
-    a stage without a network.
+    A network takes bandwidth only if the chip's model gives its time, not if the file states it.
     """
 
     def __init__(self, tenant: FileTenant, profile: Profile, corners: Corners, end: Ends, always: float) -> None:
