@@ -131,12 +131,7 @@ def run_scenario(
 
 @dataclass(eq=False)
 class _Player(threading.Thread):
-    """A thread that requests frames from a run.
-
-    `requests`: queue of frame requests; the thread waits until the queue is open.
-    `work`: function that requests frames and waits for the answers.
-    `errors`: errors that `work` raised.
-    """
+    """A thread that does `work` once the queue `requests` is open; `errors` has the errors that `work` raised."""
 
     requests: FrameRequestQueue
     work: Callable[[], None]

@@ -188,7 +188,7 @@ def _simpy_variants(graph: Graph, service: Service, frames: int) -> tuple[dict[s
     except ModuleNotFoundError:
         return {}, {"absent": {SIMPY: f"not installed: {install_line('peers')}"}}
     given = graph, service, frames, PERIOD_NS
-    return {variant: lambda model=model: model(*given).run() for variant, model in models.items()}, {}
+    return {variant: partial(lambda model: model(*given).run(), model) for variant, model in models.items()}, {}
 
 
 def _models() -> dict[str, Any]:

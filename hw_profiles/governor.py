@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from math import exp
 from pathlib import Path
 from typing import Any, Protocol
@@ -372,13 +373,11 @@ def warm_up(
         raise BadInputError("minutes", f"{minutes:g}", f"above 0, at most {MAX_MINUTES}")
     requested = dict(zip(UNITS, map(CORNERS.index, corners_of(profile, performance_profile)), strict=True))
     thermal_state, throttle, moments = ThermalState.at_rest(profile), Throttle(), []
-    poll_s, steady_at = profile.thermal.poll_s.or_else(1.0), dict[Corners, Settled]()
+    poll_s, steady_at = profile.thermal.poll_s.or_else(1.0), cache(at)
     for tick in range(max(1, round(60 * minutes / poll_s))):
         cpu, gpu, dsp = (CORNERS[throttle.corner_index(unit, requested[unit])] for unit in UNITS)
         corners = (cpu, gpu, dsp)
-        if corners not in steady_at:
-            steady_at[corners] = at(corners)
-        now = steady_at[corners]
+        now = steady_at(corners)
         power = unit_power_w(profile, now, corners)
         thermal_state.advance(profile, power, poll_s)
         total = sum(power.values()) + profile.thermal.base_power_w.or_else(0)

@@ -259,13 +259,12 @@ def with_shapes(model: onnx.ModelProto, given: Mapping[str, Shape]) -> onnx.Mode
     _give(model.graph, inputs, given)
     for value in inputs:
         _check_input(value)
-    inferred = _inferred(model)
-    shapes = _known(model.graph, inputs, inferred)
-    while any(shapes.get(name) is None for node in model.graph.node for name in node.output if name):
-        if not fold(model, shapes):
-            break
+    while True:
         inferred = _inferred(model)
         shapes = _known(model.graph, inputs, inferred)
+        is_known = all(name in shapes for node in model.graph.node for name in node.output if name)
+        if is_known or not fold(model, shapes):
+            break
     _check_all(model.graph, inferred, shapes)
     _check_convolutions(model.graph, shapes)
     del model.graph.value_info[:]
@@ -471,11 +470,12 @@ def _results(
     if len(values) < len(inputs) or not _is_small(node, values):
         return []
     feeds = dict(zip((name for name in node.input if name), values, strict=True))
-    inputs = [
+    given = [
         helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(value.dtype), value.shape)
         for name, value in feeds.items()
     ]
-    graph = helper.make_graph([node], "one", inputs, _ends(node))
+    ends = [helper.make_empty_tensor_value_info(name) for name in node.output]
+    graph = helper.make_graph([node], "one", given, ends)
     try:
         with np.errstate(all="ignore"):
             found = ReferenceEvaluator(helper.make_model(graph, opset_imports=opsets)).run(None, feeds)
@@ -503,7 +503,3 @@ def _is_small(node: onnx.NodeProto, values: Sequence[NDArray[np.generic]]) -> bo
         sizes = values[-1].astype(np.int64).ravel().tolist()
         return all(size >= 0 for size in sizes) and prod(sizes) * values[0].size <= KEPT_ELEMENTS
     return node.op_type in _BOUNDED and bool(values)
-
-
-def _ends(node: onnx.NodeProto) -> list[onnx.ValueInfoProto]:
-    return [helper.make_empty_tensor_value_info(name) for name in node.output]

@@ -182,11 +182,7 @@ def _ill_known(work: Work, unit: Unit) -> list[tuple[str, float, float]]:
 
 
 class _Running(NamedTuple):
-    """A network that runs all the time.
-
-    `frame_ms`: time between two results.
-    `busy`: share of the time in which each unit works.
-    """
+    """A network that runs all the time: time between two results, and share of the time in which each unit works."""
 
     frame_ms: float
     busy: Mapping[str, float]

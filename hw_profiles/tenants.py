@@ -9,9 +9,9 @@ network each job computes, and how long a network takes with less bandwidth.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from typing import Any, NamedTuple
 
 from trilane.errors import BadInputError
@@ -31,7 +31,6 @@ from trilane.hw_profiles.pipeline_prediction import (
     NEVER_HANGS_NS,
     Drawn,
     Ends,
-    StagePrice,
     always_fed,
     factors_at,
     fed_bound_ms,
@@ -195,8 +194,7 @@ class _AvatarJobs:
 
     def __init__(self, tenant: Tenant, chip: Profile, corners: Corners, end: Ends, always: float) -> None:
         self._tenant, self._chip, self._corners, self._end = tenant, chip, corners, end
-        self._always = always
-        self._ms: dict[tuple[int, float], dict[str, float]] = {}
+        self._always, self._stages_ms = always, cache(self._made_ms)
         kinds = [kind for kind in tenant.frames if kind != SKIPS] or [0]
         each = [self._stages_ms(kind, always) for kind in kinds]
         # The mean over the frames with a network; if no frame has one, the times of the first network.
@@ -221,11 +219,6 @@ class _AvatarJobs:
 
     def _kind(self, frame: int) -> int:
         return max(self._tenant.place(frame), 0)
-
-    def _stages_ms(self, kind: int, use: float) -> dict[str, float]:
-        if (kind, use) not in self._ms:
-            self._ms[kind, use] = self._made_ms(kind, use)
-        return self._ms[kind, use]
 
     def _made_ms(self, kind: int, use: float) -> dict[str, float]:
         tenant, used = self._tenant, _used(self._chip, use)
@@ -319,10 +312,7 @@ SharingPipeline = Tenant | FileTenant
 
 
 class _Priced(NamedTuple):
-    """A network whose time comes from the chip's model.
-
-    `factor`: time at the chosen end of its interval, divided by the expected time.
-    """
+    """A network that the chip's model prices. `factor`: time at the chosen end of its interval, over the expected."""
 
     work: Work
     chip: Profile
@@ -343,7 +333,11 @@ class _FileJobs:
         )
         self.is_known = all(each.low_ms is not None for each in prices.values())
         factors = factors_at(prices, end)
-        self._networks = dict(_priced(tenant, prices, profile, factors))
+        self._networks: dict[str, _Priced] = {}
+        for name, graph in tenant.graphs.items():
+            unit = next((each for each in UNITS if each == tenant.hardware[tenant.file.stages[name].unit]), None)
+            if prices[name].is_modelled and unit is not None:
+                self._networks[name] = _Priced(graph.work, tenant.chip(name, profile, unit), unit, factors[name])
         used = {name: self.network_ms(name, always) / prices[name].time.mean_ms for name in self._networks}
         self._drawn = Drawn(prices, 0, {**factors, **used})
         self.mean_ms = {name: each.time.mean_ms * {**factors, **used}[name] for name, each in prices.items()}
@@ -364,15 +358,6 @@ class _FileJobs:
     def moved_bytes(self, network: str) -> float:
         work, chip, unit, _ = self._networks[network]
         return moved_bytes(work, chip.units[unit])
-
-
-def _priced(
-    tenant: FileTenant, prices: Mapping[str, StagePrice], profile: Profile, factors: Mapping[str, float]
-) -> Iterable[tuple[str, _Priced]]:
-    for name, graph in tenant.graphs.items():
-        unit = next((each for each in UNITS if each == tenant.hardware[tenant.file.stages[name].unit]), None)
-        if prices[name].is_modelled and unit is not None:
-            yield name, _Priced(graph.work, tenant.chip(name, profile, unit), unit, factors[name])
 
 
 def _used(profile: Profile, use: float) -> Profile:

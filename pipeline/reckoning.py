@@ -94,11 +94,7 @@ class ReplayFindings(NamedTuple):
 
 
 class _Block(NamedTuple):
-    """LEAST_FRAMES presented frames in a row.
-
-    `needs`: for each frame, the needs of its jobs by stage.
-    `span_ns`: time from the last presented frame before the block to the block's last frame.
-    """
+    """LEAST_FRAMES presented frames in a row: needs of each frame's jobs by stage, and time since the frame before."""
 
     needs: tuple[Mapping[str, Need], ...]
     span_ns: int

@@ -325,11 +325,7 @@ class _Live:
 
 
 class _Turns:
-    """A `trilane.scheduler.core.Clock` that moves the units to the next placement whenever SLICE frames are presented.
-
-    `clock`: clock that does all other work.
-    `places`: for each placement in the order of its turn, the cores of each unit.
-    """
+    """A `Clock` that moves the units to the next of `places` whenever SLICE frames are presented."""
 
     def __init__(self, core: Core, clock: RealtimeClock, processes: UnitProcesses, places: Sequence[Cores]) -> None:
         self._core, self._clock, self._processes, self._places = core, clock, processes, places

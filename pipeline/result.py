@@ -201,11 +201,7 @@ class CapReadings(Protocol):
 
 
 class _KeptRun:
-    """The record of a run in memory, which the scheduler's loop fills through `add`.
-
-    `recording`, `jobs`: steps and jobs of the run.
-    `failure`: error after which nothing more can be recorded: none.
-    """
+    """The record of a run in memory, which the scheduler's loop fills through `add`; it has no `failure`."""
 
     def __init__(self, graph: Graph, settings: Settings) -> None:
         self.recording = Recording(graph, settings)

@@ -196,17 +196,14 @@ class Join:
     """The inputs of a `JoiningStage`, which takes one slot of each input for a job.
 
     `inputs`: slots of each input.
+    `is_source`: whether all inputs take the newest frame, so that the source gives the stage's frames.
     """
 
     def __init__(self, inputs: Sequence[list[Packet]], latest: Sequence[bool]) -> None:
         """Keep the slots. `latest`: for each input, whether it takes the newest frame."""
         self.inputs = list(inputs)
         self._by_frame = [place for place, is_latest in enumerate(latest) if not is_latest]
-
-    @property
-    def is_source(self) -> bool:
-        """Whether all inputs take the newest frame, so that the source gives the stage's frames."""
-        return not self._by_frame
+        self.is_source = not self._by_frame
 
     def slots(self, packed: int) -> tuple[int | None, ...]:
         """Return the slot of each input of a job; None for an input without a frame. `packed`: `Job.slot_in`."""

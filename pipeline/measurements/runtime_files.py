@@ -227,9 +227,9 @@ class BenchmarkLog:
                 return
             ms[key] = time
         runs = int(count) if isinstance(count, float) else None
-        figures = (ms.get(key) for key in ("avg", "std", "min", "median", "p95", "max"))
+        mean, sd, low, p50, p95, high = (ms.get(key) for key in ("avg", "std", "min", "median", "p95", "max"))
         what, hardware = "runs after the warm-up, figures alone", _ran_by(self._lines)
-        made = Measurement(name, "run", unit, what, (), runs, *figures, hardware=hardware)
+        made = Measurement(name, "run", unit, what, (), runs, mean, sd, low, p50, p95, high, hardware=hardware)
         like_means = [replace(made, mean_ms=ms[key]) for key in ("first", "curr", "p5") if key in ms]
         if wrong := next(filter(None, map(contradiction, [made, *like_means])), ""):
             self.found.refuse(row, wrong)
