@@ -188,7 +188,6 @@ def _check(scenarios: tuple[str, ...], judges: tuple[str, ...], numbers: dict[st
 # Reddi et al., MLPerf Inference Benchmark, ISCA 2020, sections III and V.
 
 CONFIDENCE = 0.99
-MOST_QUERIES = 1 << 32  # more than any percentile needs
 WARM_UP = 8
 #: Scenario -> percentile of the queries' latency that is judged. For offline, the rate is judged.
 PERCENTILES = {"single-stream": 0.90, "multi-stream": 0.99, "server": 0.99, "offline": 0.90}
@@ -369,7 +368,7 @@ def queries_needed(percentile: float, late: int = 1) -> int:
     `percentile`: this share, such as 0.99. `late`: number of queries that may exceed the limit. With one late query, 64
     queries are needed for 0.90, and 662 for 0.99.
     """
-    numbers = range(MOST_QUERIES)
+    numbers = range(MAX_FRAMES)
     return bisect_left(numbers, True, late + 1, key=lambda n: tail(n, late, 1 - percentile) <= 1 - CONFIDENCE)
 
 

@@ -312,7 +312,7 @@ def trained(bundle: Bundle, weights: Path) -> Paint:
 
 def dequantised(network: NetworkFile) -> Paint:
     """Return a function that runs `network` without rounding (`unrounded`), by ONNX Runtime in FP32."""
-    return _painted(lambda *shape: unrounded(reshaped(network, *shape)))
+    return _painted(lambda *shape: unrounded(reshaped(network, *shape)), None)
 
 
 def as_written(network: NetworkFile) -> Paint:
@@ -328,7 +328,7 @@ def as_written(network: NetworkFile) -> Paint:
     return lambda tensor: np.asarray(paint(tensor) / np.float32(255))
 
 
-def _painted(model_of: Callable[..., onnx.ModelProto], settings: onnxruntime.SessionOptions | None = None) -> Paint:
+def _painted(model_of: Callable[..., onnx.ModelProto], settings: onnxruntime.SessionOptions | None) -> Paint:
     """Return a function that runs a model of a network with an input of real numbers by ONNX Runtime.
 
     `model_of`: function that returns the model for a tensor's height and width.
