@@ -200,13 +200,15 @@ def _models() -> dict[str, Any]:
 
 def _processed(graph: Graph, service: Service, frames: int, variants: list[str]) -> dict[str, int]:
     """Return how many events SimPy processes in a run of each of `variants`, by variant."""
-    counts = dict.fromkeys(variants, 0)
-    for variant in variants:
-        env = _models()[variant](graph, service, frames, PERIOD_NS).env
-        while env.peek() != float("inf"):
-            env.step()
-            counts[variant] += 1
-    return counts
+    return {variant: _count_events(_models()[variant](graph, service, frames, PERIOD_NS).env) for variant in variants}
+
+
+def _count_events(env: Any) -> int:
+    count = 0
+    while env.peek() != float("inf"):
+        env.step()
+        count += 1
+    return count
 
 
 def _row(variant: str, frames: int, events: int, seconds: list[float], processed: int) -> dict[str, Any]:
