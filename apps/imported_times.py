@@ -20,8 +20,8 @@ from typing import Any, Final
 from trilane.errors import BadInputError, MissingPartError, did_you_mean
 from trilane.files import read_text
 from trilane.hw_profiles.calibrate import fit_row
-from trilane.pipeline.measurements.measurement import Measurement
-from trilane.pipeline.measurements.read_file import OWN_COLUMNS, Measurements, chosen
+from trilane.pipeline.measurements.measurement import Measurement, Measurements
+from trilane.pipeline.measurements.read_file import OWN_COLUMNS, chosen
 from trilane.pipeline.pipeline_file import checked_tables, tables_of, time_of
 
 #: Largest number of samples that a pipeline file gets.

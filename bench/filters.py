@@ -68,10 +68,7 @@ def measure(sizes: tuple[int, ...] = (64, 128, 256, 512), repeats: int = 20) -> 
 
 
 class _FilterFixture:
-    """The default avatar, ready to be drawn with every filter, with its network and its ground truth.
-
-    `ctx`: OpenGL context.
-    """
+    """The default avatar, ready to be drawn with every filter, with its network and its ground truth."""
 
     def __init__(self) -> None:
         bundle, assets = load_bundle("default"), load_drawable("default")

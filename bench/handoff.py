@@ -107,9 +107,8 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 300, rounds
                     times.setdefault((variant, size), []).append(pairs[variant, size].run(frames))
                 times.setdefault((PIPELINE, size), []).append(_through_pipeline(size, frames))
     config = {"frames": frames, "rounds": rounds, "idle_cores": idle_cores}
-    rows = [
-        _row(variant, size, rounds) for (variant, size), rounds in sorted(times.items(), key=lambda item: item[0][1])
-    ]
+    by_size = sorted(times.items(), key=lambda item: item[0][1])
+    rows = [_row(variant, size, rounds) for (variant, size), rounds in by_size]
     verdicts = {**_verdicts(rows, max(kib)), **against_peers(times)}
     return {"rows": rows, **verdicts, "absent": absent, "config": config}
 
@@ -233,10 +232,7 @@ def _answer(pipe: Connection) -> Any:
 
 
 def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, int], ChannelPair], dict[str, str]]:
-    """Return (pairs, absent): waiting processes by variant and size in KiB, and the reason for each absent variant.
-
-    `stack`: exit stack that ends the processes. `sizes`: sizes in KiB.
-    """
+    """Return (waiting processes by variant and size in KiB, which `stack` ends; the reason for each absent variant)."""
     context = multiprocessing.get_context("spawn")
     pairs, absent = {}, {}
     for variant, make in CHANNELS.items():
@@ -252,10 +248,7 @@ def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, in
 
 
 def _through_pipeline(size: int, frames: int) -> Times:
-    """Run `handoff_pipeline`, and return (times from raster's end to infer's begin, times to infer's end), in µs.
-
-    `size`: size of the slot in KiB. `frames`: number of frames. Raises TrilaneError if the run fails.
-    """
+    """Run `handoff_pipeline`, and return (times from raster's end to infer's begin, times to infer's end), in µs."""
     result = run_pipeline(handoff_pipeline(size * 1024), frames, policy="sequential")
     if result.interrupted:
         raise KeyboardInterrupt
@@ -336,8 +329,7 @@ def _slower(
     """Return the p50 of each peer minus the p50 of the variant `ours`, by peer, by size in KiB.
 
     Each value is the 95 % interval (low, high) of the median over the rounds, in µs.
-    `times`: times of each round, by variant and size. `until`: index into `Times`: 0 until all bytes can be read, 1
-    until all were read.
+    `until`: index into `Times`: 0 until all bytes can be read, 1 until all were read.
     """
     p50 = {key: np.array([np.percentile(of_round[until], 50) for of_round in of]) for key, of in times.items()}
     sizes = sorted({size for _, size in times})
@@ -399,10 +391,9 @@ def handoff_pipeline(payload_bytes: int) -> Pipeline:
     `payload_bytes`: size of this payload.
     """
     sizes = [payload_bytes if before == WRITER else 0 for before, _ in STAGES[:-1]]
+    stages = (PipelineStage(name=name, unit=unit, factory=FACTORY, settings={"name": name}) for name, unit in STAGES)
     return Pipeline(
-        stages=tuple(
-            PipelineStage(name=name, unit=unit, factory=FACTORY, settings={"name": name}) for name, unit in STAGES
-        ),
+        stages=tuple(stages),
         edges=tuple(PipelineEdge(payload_bytes=size) for size in sizes),
         units=host_units(),
     )

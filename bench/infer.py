@@ -96,8 +96,7 @@ def _fixtures(
 ) -> Iterator[tuple[NetworkFixture, onnx.ModelProto | None]]:
     """Yield (integer network, float network) for each combination of settings; None: the float network is unknown.
 
-    Parameters: see `measure`. A `network` that is named has no known float network. Raises BadInputError for a wrong
-    size, or a network that cannot be read.
+    Raises BadInputError for a wrong size, or a network that cannot be read.
     """
     if network:
         file = read_network(Path(network)) if network.endswith(".onnx") else load_bundle(network).read_network()
@@ -143,8 +142,7 @@ def _measure_periods(variants: dict[str, ProcessVariant], seconds: float, period
     """Return the measured times of each variant, by name, in ms.
 
     The times of a variant have the keys `startup_cold_ms`, `startup_warm_ms`, and `periods`, a list of the times of all
-    runs for each period. `variants`: variants by name. `seconds`: time for which each variant runs. `period`: seconds
-    of a variant's turn.
+    runs for each period.
     """
     with runners(variants) as by_name:
         cold = {name: runner.startup_ms for name, runner in by_name.items()}

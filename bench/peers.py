@@ -132,9 +132,6 @@ def _measure_rounds(
     """Return the times of all runs in ms, by round, by variant.
 
     For `benchmark_app`, each round has a single time, which is the median that the tool itself measures.
-    `variants`: variants of inference by name. `integer`: ONNX file for `benchmark_app`. `threads`: number of threads.
-    `rounds`: number of rounds. `seconds`: time for which each variant runs in a round.
-    Raises TrilaneError if a process fails, MissingPartError if `benchmark_app` is not installed.
     """
     times: dict[str, list[list[float]]] = {name: [] for name in (*variants, APP)}
     with runners(variants) as by_name:
@@ -148,7 +145,6 @@ def _measure_rounds(
 def _benchmark_app(network: Path, threads: int, seconds: int) -> float:
     """Return the median latency in ms that OpenVINO's tool `benchmark_app` measures, with one request at a time.
 
-    `network`: ONNX file. `threads`: number of threads. `seconds`: time for which the tool runs.
     Raises MissingPartError if the tool is not installed, TrilaneError if it fails.
     """
     tool = machine.here.program(APP, first=Path(sys.executable).parent)

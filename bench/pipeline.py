@@ -122,7 +122,7 @@ def measure(
     rows: list[dict[str, Any]] = []
     accuracy: dict[str, Any] = {}
     for name, tensor_size, count in product(avatar, size, cores):
-        checked = _config(name, tensor_size, count, frames, runtime, video=video)
+        checked = _config(name, tensor_size, usable_cores()[:count], frames, runtime, video)
         accuracy[name if len(size) == 1 else f"{name} at {tensor_size}"] = next(iter(checked.accuracy.values()))
         settings = [Setting(name, tensor_size, count, *pair) for pair in _pairs(policy, edge)]
         rows += _measure_rounds(checked, settings, rounds)
@@ -133,10 +133,7 @@ def measure(
 def _measure_two(
     which: Sequence[tuple[str, str]], edge: str, cores: int, frames: int, rounds: int, runtime: str, *, video: bool
 ) -> dict[str, Any]:
-    """Measure two avatars at once, and return the result of `measure`.
-
-    `which`: (avatar, size) of both. `cores`: number of cores that both share. Other parameters: see `measure`.
-    """
+    """Measure two avatars, (avatar, size) each, at once on the same cores, and return the result of `measure`."""
     asked = [
         Asked(_folder(name), size, frames, runtime, usable_cores()[:cores], video=video, edge=edge)
         for name, size in which
@@ -180,10 +177,9 @@ def _pairs(policies: Sequence[str], edges: Sequence[str]) -> list[tuple[str, str
     return [(SEQUENTIAL, "double"), *(pair for pair in product(policies, edges) if pair != (SEQUENTIAL, "double"))]
 
 
-def _config(avatar: str, size: str, cores: int, frames: int, runtime: str, video: bool) -> Checked:
+def _config(avatar: str, size: str, cores: tuple[int, ...], frames: int, runtime: str, video: bool) -> Checked:
     checked = configure(RunOptions(size=size, avatar=_folder(avatar), frames=frames, runtime=runtime), Path.cwd())
-    units = host_units(usable_cores()[:cores])
-    return checked.changed(units=units, record=video)
+    return checked.changed(units=host_units(cores), record=video)
 
 
 def _run_round(checked: Checked, settings: list[Setting]) -> list[dict[str, Any]]:
@@ -197,10 +193,9 @@ def _run_round(checked: Checked, settings: list[Setting]) -> list[dict[str, Any]
 
 
 def _compare(runs: list[dict[str, Any]], after: dict[str, Any]) -> None:
-    """Add the comparisons of `measure` to the figures of each run of a round.
+    """Add the comparisons of `measure` to the figures of each run of a round, whose first run is `sequential`.
 
-    `runs`: figures of the runs; the first run is `sequential`. `after`: figures of the next sequential run. Each run is
-    compared with both sequential runs, but the first run only with itself.
+    Each run is compared with this run and with the next sequential run, `after`; the first run only with itself.
     """
     for place, row in enumerate(runs):
         beside = (runs[0], after if place else runs[0])
@@ -230,13 +225,10 @@ def finished_run(checked: Checked, what: str, least: int = 2, **options: Any) ->
         result = run_avatar(placed.config, placed.assets, **options)
     if result.interrupted:
         raise KeyboardInterrupt
-    if result.failure is not None or result.presented < least:
-        reason = (
-            result.failure.message
-            if result.failure
-            else f"{result.presented} of at least {least} frames were presented"
-        )
-        raise TrilaneError(f"{what}: {reason}")
+    if result.failure is not None:
+        raise TrilaneError(f"{what}: {result.failure.message}")
+    if result.presented < least:
+        raise TrilaneError(f"{what}: {result.presented} of at least {least} frames were presented")
     return result
 
 
@@ -300,10 +292,7 @@ def latencies_ns(recording: Recording, jobs: Sequence[JobRecord]) -> list[int]:
 
 
 def _latency_ms(runs: list[dict[str, Any]]) -> dict[str, float | None]:
-    """Return the keys `latency_p50_ms` and `latency_p99_ms` over all frames of `runs`; None for too few frames.
-
-    `runs`: figures of each run.
-    """
+    """Return the keys `latency_p50_ms` and `latency_p99_ms` over all frames of `runs`; None for too few frames."""
     ordered = sorted(ns for run in runs for ns in run[LATENCIES])
     enough = {percent: len(ordered) >= samples_needed(percent / 100) for percent in (50, 99)}
     return {
@@ -313,12 +302,8 @@ def _latency_ms(runs: list[dict[str, Any]]) -> dict[str, float | None]:
 
 
 def _summary(setting: Setting, runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the row of `setting`. `runs`: figures of the setting's run in each round.
-
-    The row has the medians of numbers, the most frequent names, and the sums of dropped and lost frames.
-    """
-    names = ("slowest", "busiest")
-    sums = ("dropped", "lost")
+    """Return the row of `setting`: medians of numbers over its runs, most frequent names, and sums of lost frames."""
+    names, sums = ("slowest", "busiest"), ("dropped", "lost")
     row: dict[str, Any] = {**vars(setting)}
     for key in (key for key in runs[0] if key not in (LATENCIES, UNITS_MS)):
         values = [run[key] for run in runs]
@@ -404,8 +389,7 @@ def serve(pipe: Connection, asked: Asked) -> None:
     The answer to a policy is (jobs as tuples, seats of `Ran`), or an error message.
     """
     try:
-        request = RunOptions(avatar=asked.avatar, size=asked.size, frames=asked.frames, runtime=asked.runtime)
-        checked = configure(request, Path.cwd()).changed(units=host_units(asked.cores), record=asked.video)
+        checked = _config(asked.avatar, asked.size, asked.cores, asked.frames, asked.runtime, asked.video)
         seats = {unit: ",".join(map(str, settings.cores)) for unit, settings in checked.config.units.items()}
         pipe.send(True)
         while True:
@@ -525,14 +509,9 @@ def computed_ms(
     text, by unit. `asked`: settings of the run.
     """
     stop = (round(SECONDS * 1e9), Stop())
+    settings = Settings(ENDLESS, PIPELINED, hang_ns=ENDLESS)
     members = [
-        Member(
-            application_graph(each.edge),
-            Settings(ENDLESS, PIPELINED, hang_ns=ENDLESS),
-            _service(times),
-            own,
-            inputs=(stop,),
-        )
+        Member(application_graph(each.edge), settings, _service(times), own, inputs=(stop,))
         for times, own, each in zip(isolated, seats, asked, strict=True)
     ]
     cores = {core for own in seats for core in own.values()}

@@ -119,9 +119,8 @@ def _check(counts: Sequence[int], frames: int, rounds: int, finalists: int, furt
 
 
 class _Trial:
-    """Chooses a placement for a scene as a run does, and tries all placements.
+    """Chooses a placement for a scene on some cores as a run does, and tries all placements.
 
-    `checked`: configuration of the scene. `cores`: cores for the units. `starter`: unit starter.
     The constructor chooses the placement. It raises TrilaneError if a unit cannot start or a stage fails.
     """
 
@@ -137,8 +136,10 @@ class _Trial:
         self._chosen = candidates[self._choice.best]
         self._took_s = time.monotonic() - begin_s
         known = [each.placement for each in self._found]
-        self._found += [] if where in known else [self._rule]
-        self._places = {of: self._place(each) for of, each in (("chosen", self._chosen), ("rule", self._rule))}
+        if where not in known:
+            self._found.append(self._rule)
+            known.append(where)
+        self._places = {"chosen": known.index(self._chosen.placement), "rule": known.index(where)}
         self._rounds: Sequence[Round] = ()
         self._further: dict[int, list[float]] = {}
         self._others = 0.0
@@ -220,10 +221,6 @@ class _Trial:
         """Return the median frame time of each placement in the rounds with all placements, ms."""
         return [median(each.frame_ns[place] for each in self._rounds) / NS_PER_MS for place in range(len(self._found))]
 
-    def _place(self, one: Ranked) -> int:
-        """Return the index of the placement of `one` in the list of all placements."""
-        return [each.placement for each in self._found].index(one.placement)
-
     def _try(self, places: Sequence[int], rounds: int) -> Sequence[Round]:
         return tried(self._checked, [self._found[place].placement for place in places], rounds, self._starter)
 
@@ -239,10 +236,7 @@ def _interval(prefix: str, values: Sequence[float]) -> dict[str, float]:
 
 
 def _virtual(checked: Checked, avatar: str, count: int) -> Mapping[str, Any]:
-    """Return a row of `virtual` in `measure`: computed frame times of all placements on `count` equal cores.
-
-    Each core is alone on its physical core. `checked`: configuration of the scene. `avatar`: name of the avatar.
-    """
+    """Return a row of `virtual` in `measure`: computed frame times on `count` equal cores without siblings."""
     shape = min(checked.config.buckets, key=lambda shape: (abs(shape[0] - shape[1]), shape))
     work = painting(networks_of(checked.assets), shape, {"avatar": avatar})
     profile, plan = load_profile(HOST), Plan(work, "dsp", Variant(POLICY, EDGE))

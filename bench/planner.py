@@ -122,12 +122,14 @@ def measure(
             rows.append({"name": one.name, **one.time(rounds, starter), **row})
             if out:
                 _write(Path(out), one.name, sheets)
+    known = [row["by_frame"] for row in rows if row["by_frame"]]
+    losses_db = [plans["fixed"]["worst_psnr_db"] - plans["planned"]["worst_psnr_db"] for plans in known]
     return {
         "scenes": rows,
         "median_speedup": median(row["speedup"] for row in rows),
         "least_speedup": min(row["speedup"] for row in rows),
         "largest_loss_db": max(row["psnr_fixed_db"] - row["psnr_planned_db"] for row in rows),
-        "worst_loss_db": max((_worst_loss_db(row["by_frame"]) for row in rows if row["by_frame"]), default=None),
+        "worst_loss_db": max(losses_db, default=None),
         "sources": {"scenes": MEASURED},
         "driver": found[-1].driver,
         "config": {"frames": frames, "rounds": rounds, "pictures": pictures, "runtime": runtime, "video": video},
@@ -156,10 +158,7 @@ class _Moment:
 
 
 class _Scene:
-    """One scene, which is run and compared by both plans.
-
-    `name`: name of the scene. `driver`: facts about the OpenGL driver; empty before `compare`.
-    """
+    """One scene, which is run and compared by both plans. `driver`: facts about OpenGL; empty before `compare`."""
 
     def __init__(self, name: str, frames: int, runtime: str, *, video: bool) -> None:
         """Configure both plans.
@@ -271,10 +270,6 @@ def by_frame(
     return found
 
 
-def _worst_loss_db(found: Mapping[str, Any]) -> float:
-    return float(found["fixed"]["worst_psnr_db"] - found["planned"]["worst_psnr_db"])
-
-
 def _figures(errors: Mapping[str, PictureErrors]) -> dict[str, float | None]:
     return {key: value for plan, each in errors.items() for key, value in each.figures(plan).items()}
 
@@ -300,10 +295,7 @@ def sheet(moment: _Moment) -> U8:
 
 
 def _write(folder: Path, name: str, sheets: Sequence[tuple[int, U8]]) -> None:
-    """Write each of `sheets`, (frame number, picture), to `folder` as `NAME-FRAME.png`.
-
-    `name`: name of the scene. Raises BadInputError if a file cannot be written.
-    """
+    """Write each of `sheets`, (frame number, picture), to `folder` as `NAME-FRAME.png`. Raises BadInputError."""
     from PIL import Image
 
     with write_folder(folder) as draft:

@@ -76,9 +76,8 @@ def _variants(
 ) -> dict[str, Callable[[int], object]]:
     """Return all variants by name. Each is a function of the input's number, which draws this input.
 
-    `ctx`: OpenGL context. `fixture`: body to draw. `tensors`: array (SLOTS, bytes) that a variant in `COMPARED` writes
-    to, by variant. `shape`: (height, width) of the tensor. `deferred`: whether a run on this driver draws UVs first and
-    reads the texture in a second pass.
+    `tensors`: array (SLOTS, bytes) that a variant in `COMPARED` writes to, by variant. `deferred`: whether a run on
+    this driver draws UVs first and reads the texture in a second pass.
     """
     draws = (
         packed_variant(ctx, fixture, shape, deferred),

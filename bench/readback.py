@@ -10,7 +10,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -156,13 +156,16 @@ Box = tuple[int, int, int, int]
 RING = 3
 
 
-class Readback(Protocol):
-    """A variant that reads part of a framebuffer of 32-bit unsigned words into a slot.
+class Readback:
+    """Reads part of a framebuffer of 32-bit unsigned words into a slot: the driver copies while the caller waits.
 
     `lag`: number of further submits after which the bytes arrive.
     """
 
-    lag: int
+    lag = 0
+
+    def __init__(self, ctx: Any, most_bytes: int) -> None:
+        """Do nothing: no memory is needed."""
 
     def submit(self, target: Any, box: Box, words: int, tensor: U8) -> None:
         """Start a read.
@@ -172,34 +175,18 @@ class Readback(Protocol):
         `words`: number of words of a pixel.
         `tensor`: array that gets the bytes, `lag` submits later.
         """
+        target.read_into(tensor, box, components=words, dtype="u4", alignment=1)
 
     def drain(self) -> None:
         """Finish all reads, so that every submitted tensor has its bytes."""
 
 
-class DirectReadback:
-    """A readback in which the driver copies to the slot while the caller waits."""
-
-    lag = 0
-
-    def __init__(self, ctx: Any, most_bytes: int) -> None:
-        """Do nothing: no memory is needed."""
-
-    def submit(self, target: Any, box: Box, words: int, tensor: U8) -> None:
-        """Read at once, and wait until the bytes are in `tensor`."""
-        target.read_into(tensor, box, components=words, dtype="u4", alignment=1)
-
-    def drain(self) -> None:
-        """Do nothing: no read is pending."""
-
-
-class PboReadback:
+class PboReadback(Readback):
     """A readback through a pixel buffer. The driver copies to the buffer, and the caller from the buffer to the slot.
 
     `orphan`: whether the buffer gets new memory for each frame.
     """
 
-    lag = 0
     orphan = False
 
     def __init__(self, ctx: Any, most_bytes: int) -> None:
@@ -212,9 +199,6 @@ class PboReadback:
         target.read_into(self._buffer, box, components=words, dtype="u4", alignment=1)
         self._buffer.read_into(tensor, size=tensor.nbytes)
 
-    def drain(self) -> None:
-        """Do nothing: no read is pending."""
-
 
 class OrphanPboReadback(PboReadback):
     """A `PboReadback` with new memory for each frame, so that the driver need not wait for the old memory."""
@@ -222,7 +206,7 @@ class OrphanPboReadback(PboReadback):
     orphan = True
 
 
-class RingReadback:
+class RingReadback(Readback):
     """A readback through a ring of pixel buffers with fences.
 
     The bytes of a buffer are copied to their slot only when the buffer is needed for a new read.
@@ -255,32 +239,25 @@ class RingReadback:
 
 
 READBACKS: dict[str, Callable[[Any, int], Readback]] = {
-    "direct": DirectReadback,
+    "direct": Readback,
     "pbo": PboReadback,
     "pbo-orphan": OrphanPboReadback,
     "pbo-ring": RingReadback,
 }
 
 
-class Upload(Protocol):
-    """A variant that writes the bytes of a slot to a texture."""
-
-    def write(self, texture: Any, image: U8) -> None:
-        """Write `image` to `texture`. After the call, the caller may change `image`."""
-
-
-class SubUpload:
-    """An upload in which the driver copies directly from the slot."""
+class Upload:
+    """Writes the bytes of a slot to a texture: the driver copies directly from the slot."""
 
     def __init__(self, ctx: Any, most_bytes: int) -> None:
         """Do nothing: no memory is needed."""
 
     def write(self, texture: Any, image: U8) -> None:
-        """Let the driver copy from `image` at once."""
+        """Write `image` to `texture`. After the call, the caller may change `image`."""
         texture.write(image, alignment=1)
 
 
-class OrphanUpload:
+class OrphanUpload(Upload):
     """An upload through one pixel buffer that gets new memory for each frame."""
 
     def __init__(self, ctx: Any, most_bytes: int) -> None:
@@ -293,7 +270,7 @@ class OrphanUpload:
         texture.write(self._buffer, alignment=1)
 
 
-class RingUpload:
+class RingUpload(Upload):
     """An upload through a ring of pixel buffers. A buffer is written again only after the GPU has passed its fence."""
 
     def __init__(self, ctx: Any, most_bytes: int) -> None:
@@ -309,4 +286,4 @@ class RingUpload:
         self._ring.append((buffer, opengl.fence()))
 
 
-UPLOADS: dict[str, Callable[[Any, int], Upload]] = {"sub": SubUpload, "orphan": OrphanUpload, "ring": RingUpload}
+UPLOADS: dict[str, Callable[[Any, int], Upload]] = {"sub": Upload, "orphan": OrphanUpload, "ring": RingUpload}

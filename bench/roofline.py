@@ -134,10 +134,7 @@ def _best_ms(variants: dict[str, ProcessVariant]) -> dict[str, float]:
 
 
 def _memory_gb_s() -> float:
-    """Return the memory rate of one thread in 1e9 bytes a second, measured by a copy that is larger than the caches.
-
-    The rate counts bytes that are read and bytes that are written.
-    """
+    """Return the rate of one thread, in 1e9 bytes a second read and written, by a copy larger than the caches."""
     source, target = np.ones(COPY_BYTES // 8), np.empty(COPY_BYTES // 8)
     best = float("inf")
     for _ in range(ROUNDS):
@@ -155,11 +152,7 @@ def _product() -> onnx.ModelProto:
 
 
 def _layers(side: int, channels: int, kernel: int) -> onnx.ModelProto:
-    """Return a network of `LAYERS` quantised convolutions in sequence.
-
-    Input and output are (1, side, side, channels) uint8.
-    `side`: height and width in pixels. `channels`: channels of every layer. `kernel`: side of each kernel.
-    """
+    """Return a network of `LAYERS` quantised convolutions in sequence, from and to (1, side, side, channels) uint8."""
     rng = np.random.default_rng(0)
     shape = (channels, channels, kernel, kernel)
     constants = {
@@ -222,16 +215,12 @@ class InstructionSet:
     rates: tuple[Fraction, ...]
     source: str
 
-    def rate_nearest(self, measured: float) -> Fraction:
-        """Return the documented rate that is nearest to `measured` sequences a cycle."""
-        return min(self.rates, key=lambda rate: abs(float(rate) - measured))
-
     def macs_a_cycle(self, measured: float) -> float:
         """Return the documented multiply-accumulates a cycle of a core.
 
-        `measured`: measured sequences a cycle, which select one of `rates`.
+        `measured`: measured sequences a cycle, which select the nearest of `rates`.
         """
-        return float(self.macs * self.rate_nearest(measured))
+        return float(self.macs * min(self.rates, key=lambda rate: abs(float(rate) - measured)))
 
 
 ONE, TWO, FOUR = Fraction(1), Fraction(2), Fraction(4)
@@ -408,8 +397,10 @@ def measure_issued(name: str, cores: Sequence[int]) -> Issued:
     if machine.here.architecture() != "x86_64":
         raise OSError("there are no loops for this architecture")
     kernel = KERNELS[name]
-    if kernel.before:
-        _ask_for_tiles()
+    if kernel.before:  # the tile registers of AMX
+        libc = ctypes.CDLL(None, use_errno=True)
+        if libc.syscall(SYS_ARCH_PRCTL, ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA):
+            raise OSError(ctypes.get_errno(), "the tiles of AMX are refused")
     together = threading.Barrier(len(cores))
     with ThreadPoolExecutor(len(cores)) as pool:
         measured = list(pool.map(lambda core: _on_core(core, kernel, together), cores))
@@ -419,18 +410,10 @@ def measure_issued(name: str, cores: Sequence[int]) -> Issued:
     return Issued(fmean(rates), fmean(clocks), fmean(low for low, _ in ends), fmean(high for _, high in ends))
 
 
-def _ask_for_tiles() -> None:
-    """Request the tile registers of AMX from Linux. Raises OSError if Linux refuses them."""
-    libc = ctypes.CDLL(None, use_errno=True)
-    if libc.syscall(SYS_ARCH_PRCTL, ARCH_REQ_XCOMP_PERM, XFEATURE_XTILEDATA):
-        raise OSError(ctypes.get_errno(), "the tiles of AMX are refused")
-
-
 def _on_core(core: int, kernel: Kernel, together: threading.Barrier) -> tuple[float, list[float]]:
     """Return (sequences that a core issues in a cycle, clock of the core in each burst in GHz).
 
     The call binds the calling thread to the core. Therefore the thread must end afterwards.
-    `core`: number of the core. `kernel`: loop to run. `together`: barrier at which the threads of all cores meet.
     """
     os.sched_setaffinity(0, {core})
     turns = BURST_CYCLES // kernel.cycles

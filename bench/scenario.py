@@ -13,6 +13,7 @@ import re
 import tempfile
 import threading
 import time
+from bisect import bisect_left
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -128,14 +129,9 @@ def run_scenario(
     return _row(load, queries, loadgen), loadgen.summary if loadgen is not None else ""
 
 
-@dataclass
+@dataclass(eq=False)
 class _Player(threading.Thread):
-    """A thread that requests frames from a run.
-
-    `requests`: queue of frame requests; the thread waits until the queue is open.
-    `work`: function that requests frames and waits for the answers.
-    `errors`: errors that `work` raised.
-    """
+    """A thread that does `work` once the queue `requests` is open; `errors` has the errors that `work` raised."""
 
     requests: FrameRequestQueue
     work: Callable[[], None]
@@ -152,9 +148,6 @@ class _Player(threading.Thread):
             self.errors.append(error)
         finally:
             self.requests.end()
-
-    def __hash__(self) -> int:
-        return id(self)
 
 
 def _row(load: Load, queries: Queries, loadgen: LoadGenPlayer | None) -> dict[str, Any]:
@@ -336,10 +329,7 @@ def _poisson(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
 
 
 def _all_at_once(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
-    """Ask all queries at once, as many as the pipeline answers in the duration of `load`.
-
-    A few queries before show the rate of the answers.
-    """
+    """Ask all queries at once: as many as the pipeline answers in `load.seconds`, by the rate of a few before."""
     few = queries_needed(load.percentile)
     queries.ask(requests, few)
     queries.wait()
@@ -378,13 +368,8 @@ def queries_needed(percentile: float, late: int = 1) -> int:
     `percentile`: this share, such as 0.99. `late`: number of queries that may exceed the limit. With one late query, 64
     queries are needed for 0.90, and 662 for 0.99.
     """
-    low, high = late, late + 1
-    while tail(high, late, 1 - percentile) > 1 - CONFIDENCE:
-        low, high = high, 2 * high
-    while high - low > 1:
-        middle = (low + high) // 2
-        low, high = (middle, high) if tail(middle, late, 1 - percentile) > 1 - CONFIDENCE else (low, middle)
-    return high
+    numbers = range(MAX_FRAMES)
+    return bisect_left(numbers, True, late + 1, key=lambda n: tail(n, late, 1 - percentile) <= 1 - CONFIDENCE)
 
 
 def bound_ms(latencies_ms: list[float], percentile: float) -> float | None:
@@ -393,12 +378,10 @@ def bound_ms(latencies_ms: list[float], percentile: float) -> float | None:
     As in LoadGen, the result is the k-th largest of `latencies_ms`, where k is the number of queries that may be late.
     For too few queries, the result is None.
     """
-    if len(latencies_ms) < queries_needed(percentile):
-        return None
-    late = 1
-    while queries_needed(percentile, late + 1) <= len(latencies_ms):
+    late = 0
+    while tail(len(latencies_ms), late + 1, 1 - percentile) <= 1 - CONFIDENCE:
         late += 1
-    return sorted(latencies_ms)[-late]
+    return sorted(latencies_ms)[-late] if late else None
 
 
 def verdict(load: Load, latencies_ms: list[float], lasted_s: float) -> list[str]:

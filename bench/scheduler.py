@@ -136,8 +136,7 @@ def _cpu_seconds(variants: dict[str, Run], rounds: int) -> dict[str, list[float]
         for variant in names[first:] + names[:first]:
             taken, ends[variant] = _timed(variants[variant])
             seconds[variant].append(taken)
-        different = [variant for variant in ends if ends[variant] != ends[TRILANE]]
-        if different:
+        if different := [variant for variant in ends if ends[variant] != ends[TRILANE]]:
             raise TrilaneError(f"{', '.join(different)} and trilane present frames at different times")
     return seconds
 
@@ -165,11 +164,7 @@ def _determinism(seeds: int) -> dict[str, int]:
 
 
 def _service(seed: int, frames: int) -> Service:
-    """Return a function that gives the service time of each job, in ns.
-
-    The random times of all jobs are computed here. Therefore a run only spends the time of a look-up.
-    `seed`: seed of the random times. `frames`: number of frames.
-    """
+    """Return a function that gives the service time of each job, in ns, from times that are computed here."""
     rng = np.random.default_rng(seed)
     table = {name: (ms * MS * rng.uniform(0.5, 1.5, frames)).astype(int).tolist() for name, ms in SERVICE_MS.items()}
     return lambda stage, _unit, frame, _begin_ns: table[stage][frame]
@@ -187,20 +182,13 @@ def _trilane_variants(graph: Graph, service: Service, frames: int) -> dict[str, 
 
 
 def _simpy_variants(graph: Graph, service: Service, frames: int) -> tuple[dict[str, Run], dict[str, dict[str, str]]]:
-    """Return (runs, facts): functions that run the models in SimPy, by variant, and keys for the result of `measure`.
-
-    With SimPy, `facts` is {}. If SimPy is not installed, `runs` is {}, and `facts` has the key `absent`.
-    """
+    """Return (functions that run the models in SimPy, by variant; the key `absent` of `measure` without SimPy)."""
     try:
         models = _models()
     except ModuleNotFoundError:
         return {}, {"absent": {SIMPY: f"not installed: {install_line('peers')}"}}
-    return {variant: partial(_run_model, model, graph, service, frames) for variant, model in models.items()}, {}
-
-
-def _run_model(model: Any, graph: Graph, service: Service, frames: int) -> list[int]:
-    presented_ns: list[int] = model(graph, service, frames, PERIOD_NS).run()
-    return presented_ns
+    given = graph, service, frames, PERIOD_NS
+    return {variant: partial(lambda model: model(*given).run(), model) for variant, model in models.items()}, {}
 
 
 def _models() -> dict[str, Any]:
@@ -231,17 +219,12 @@ def _row(variant: str, frames: int, events: int, seconds: list[float], processed
 
 
 def _traces(seed: int) -> list[str]:
-    """Do the same run `REPEATS` times, and return a digest of all steps of each run.
-
-    The policy is `deadline`, and the DSP unit dies once. `seed`: seed of the service times.
-    """
+    """Do the same run `REPEATS` times, with a death of the DSP unit, and return a digest of each run's steps."""
     settings = Settings(SEED_FRAMES, "deadline", period_ns=PERIOD_NS, deadline_ns=3 * PERIOD_NS)
-    digests = []
+    digests, faults = [], [(1_000 * MS + seed * 7 * MS, "dsp")]
     for _ in range(REPEATS):
-        faults = [(1_000 * MS + seed * 7 * MS, "dsp")]
-        done = simulate(
-            application_graph(), settings, _service(seed, SEED_FRAMES), restart_ns=50 * MS, faults=faults, keep=True
-        )
+        service = _service(seed, SEED_FRAMES)
+        done = simulate(application_graph(), settings, service, restart_ns=50 * MS, faults=faults, keep=True)
         assert done.recording is not None
         digests.append(hashlib.sha256(repr((done.recording.steps, done.report)).encode()).hexdigest())
     return digests

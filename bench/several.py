@@ -100,11 +100,7 @@ def measure(
 
 
 class _CrowdFixture:
-    """The default avatar on the GPU, with its network and its ground truth.
-
-    `shaped`: body of the avatar. `network`: its quantised network. `packed`: pass that draws tensors. `avatar`: the
-    avatar, ready to be drawn by `packed`.
-    """
+    """The default avatar on the GPU, with its network and its ground truth; `packed` draws it into a tensor."""
 
     def __init__(self) -> None:
         bundle = load_bundle("default")
@@ -137,10 +133,7 @@ class _CrowdFixture:
         return rows
 
     def _picture(self, view: _View, shown: Sequence[int]) -> U8:
-        """Return the network's picture (h,w,4) uint8 of a tensor that contains only some avatars of `view`.
-
-        `shown`: numbers of these avatars.
-        """
+        """Return the network's picture (h,w,4) uint8 of a tensor that contains only the avatars `shown` of `view`."""
         shape = view.layout.shape
         tensor, image, binding = self._binding(shape)
         target = self.packed.begin(shape)
@@ -163,11 +156,7 @@ class _CrowdFixture:
 
 
 def _views(fixture: _CrowdFixture, avatars: int, views: int, size: str, margin: int) -> Iterator[_View]:
-    """Yield moments that are evenly spread over the default motion, without those at which an avatar is out of view.
-
-    `fixture`: avatar to place. `avatars`: number of avatars. `views`: number of moments. `size`: tensor size, as in
-    `measure`. `margin`: tensor pixels between two avatars.
-    """
+    """Yield moments, evenly spread over the default motion, at which all avatars are in view."""
     specs = tuple(
         AvatarSpec(position=((k - (avatars - 1) / 2) * STEP_M, 0.0, -BACK_M * (k % 2))) for k in range(avatars)
     )

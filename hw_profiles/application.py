@@ -110,15 +110,7 @@ def isolated_job_time(profile: Profile, network: Network, unit: UnitName, corner
 def _job(
     profile: Profile, work: Work, unit: UnitName, corners: Corners, *, contended: bool = True, batch: int = 1
 ) -> JobTime:
-    """Return the time of a job with the operators of `work`.
-
-    `profile`: hardware profile of the chip.
-    `work`: work of one frame.
-    `unit`: unit that does it.
-    `corners`: corner of each unit.
-    `contended`: whether the rest of the application uses the memory at the same time.
-    `batch`: number of frames in the job.
-    """
+    """Return the time of a job; `contended`: the rest of the application uses the memory at the same time."""
     clock = profile.units[unit].clock(corners[UNITS.index(unit)])
     return time_on(profile.units[unit], profile.memory, work, clock, contended=contended, batch=batch)
 
@@ -212,8 +204,6 @@ def application_graph(edge: str = DEFAULT_EDGE, infer: Iterable[tuple[str, str]]
 def _settled(times: StageTimes, variant: Variant, display_ns: int, quick: bool) -> tuple[Any, bool]:
     """Return (report of a run, whether the display limits its rate).
 
-    `times`: time of a job of each stage.
-    `variant`: how the stages are connected and scheduled.
     `display_ns`: shortest time between two shown jobs.
     `quick`: whether to run only QUICK_FRAMES with one slot between stages. With more slots, frames come faster until
     the slots are full, so more frames are needed.
@@ -246,12 +236,7 @@ def settings_of(variant: Variant, frames: int, display_ns: int, *, held: bool = 
 
 
 def _simulated(times: StageTimes, variant: Variant, settings: Settings, *, keep: bool = False) -> Simulation:
-    """Return a simulated run whose jobs take `times`. Raises BadInputError for an unknown edge.
-
-    `variant`: its `edge` is the rule of every edge.
-    `settings`: settings of the scheduler.
-    `keep`: whether the run records its steps and jobs.
-    """
+    """Return a simulated run whose jobs take `times`. Raises BadInputError for an unknown edge."""
     service = {name: ns for name, _, ns in times}
     try:
         graph = chain(((name, unit) for name, unit, _ in times), variant.edge, LATENCY_TO)
@@ -333,11 +318,7 @@ def _shares(
 ) -> tuple[float, dict[str, float]]:
     """Return (busy share of `unit`, shares of its idle time by cause).
 
-    Units with the same worker divide its busy time in proportion to the times of their jobs.
-
-    `worker`: result of `workers_of`.
-    `times`: time of a job in ms of each stage and unit.
-    `units`: row of each worker in the report of the simulated run.
+    Units with the same worker divide its busy time in proportion to the times of their jobs in ms, `times`.
     """
     own, together = (
         sum(ms for (_, other), ms in times.items() if other in group)

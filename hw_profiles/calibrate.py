@@ -57,7 +57,6 @@ from trilane.hw_profiles.schema import (
     EngineName,
     EngineRuntime,
     Profile,
-    Unit,
     corners_of,
     interval_around,
 )
@@ -235,8 +234,7 @@ def network_file(place: str, name: str, folder: Path, remedy: str = "--networks 
     """
     inner = PurePosixPath(name)
     if not name or inner.is_absolute() or ".." in inner.parts or "\0" in name or "\\" in name:
-        expected = f"a path inside {folder}"
-        raise BadInputError(place, repr(name), expected, remedy)
+        raise BadInputError(place, repr(name), f"a path inside {folder}", remedy)
     return folder / (name if inner.suffix == ".onnx" else f"{name}.onnx")
 
 
@@ -264,9 +262,12 @@ def calibrate_tables(data: Mapping[str, Any], path: Path, rows: Sequence[OwnRow]
     for row in rows:
         others = with_numbers(data, _moved(profile, [each for each in rows if each.network != row.network]))
         left_out.append(CheckedRow(row, *_predicted(profile, row), *_predicted(parse_profile(others, path), row)))
-    checked = tuple(each._replace(after=_scaled(each, error_scale(misses(left_out, each)))) for each in left_out)
+    checked = []
+    for each in left_out:
+        ends = interval_around(each.after_ms, error_scale(misses(left_out, each)) * spread_of(each.after))
+        checked.append(each._replace(after=Interval(*ends, each.after.why)))
     numbers = _moved(profile, rows) | _error_scales(profile, left_out)
-    return Calibrated(with_numbers(data, numbers), numbers, checked)
+    return Calibrated(with_numbers(data, numbers), numbers, tuple(checked))
 
 
 def misses(left_out: Sequence[CheckedRow], of: CheckedRow | UnitName) -> list[float]:
@@ -308,11 +309,6 @@ def _error_scales(profile: Profile, left_out: Sequence[CheckedRow]) -> dict[str,
     return numbers
 
 
-def _scaled(checked: CheckedRow, scale: float) -> Interval:
-    low_ms, high_ms = interval_around(checked.after_ms, scale * spread_of(checked.after))
-    return checked.after._replace(low_ms=low_ms, high_ms=high_ms)
-
-
 def _predicted(profile: Profile, row: OwnRow) -> tuple[float, Interval]:
     chip = on_chip(profile, row)
     time = price(chip, row.work, row.unit, corners_of(chip, BURST))
@@ -346,17 +342,14 @@ def with_numbers(data: Mapping[str, Any], numbers: Mapping[str, tuple[float, flo
 
 
 class _EngineRow:
-    """A measured time on a tensor engine, and its prediction.
-
-    The prediction is a function of how far the logarithms of the engine's six rates are from those of the profile.
-    """
+    """A measured time on a tensor engine, and its prediction as a function of deviations of the engine's log rates."""
 
     def __init__(self, profile: Profile, row: OwnRow) -> None:
         chip = on_chip(profile, row)
         unit, self.ms = chip.units[row.unit], row.ms
         clock = unit.clock(corners_of(chip, BURST)[UNITS.index(row.unit)])
         assert unit.engine is not None
-        self.engine: EngineName = engine_name(unit)
+        self.engine = next(name for name, engine in unit.engines.items() if engine is unit.engine)
         numbers = numbers_of(unit.engine, clock)
         runs = [layer.op_type not in unit.fallback for layer in row.work.layers.layers]
         self._costs = amounts(row.work.layers, numbers.room) * numbers.seconds * np.array([*runs, True])[:, None]
@@ -375,11 +368,6 @@ class _EngineRow:
         by_term = (costs[:-1] * slopes).sum(axis=0) + costs[-1]
         by_rate = np.bincount(RATE_OF_TERM, by_term, len(RATES))
         return 1e3 * float(whole), by_rate / whole
-
-
-def engine_name(unit: Unit) -> EngineName:
-    """Return the name of the tensor engine that a unit runs on."""
-    return next(name for name, engine in unit.engines.items() if engine is unit.engine)
 
 
 def prior_covariance(engines: Sequence[EngineName]) -> F64:
@@ -431,7 +419,6 @@ def _derivatives(at: F64, rows: Sequence[_EngineRow], places: Sequence[int], pre
 
     `at`: deviations of the log rates (6 x engines,).
     `places`: index of the first rate of each row's engine in `at`.
-    `precision`: inverse of the prior covariance.
     """
     cost, gradient, curvature = float(at @ precision @ at), precision @ at, precision.copy()
     for row, place in zip(rows, places, strict=True):
@@ -450,7 +437,6 @@ def _unit_numbers(profile: Profile, unit: UnitName, rows: Sequence[OwnRow]) -> d
 
     The fit finds one factor on all times of the unit. It divides the efficiencies by this factor, up to
     MOST_EFFICIENCY, and multiplies the COSTS by it. The spread of each number stays as in `profile`.
-    `rows`: measurements on `unit`.
     """
     own = profile.units[unit]
     noise = max(NOISE, own.model_error_fraction.or_else(0.3))

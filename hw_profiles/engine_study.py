@@ -74,10 +74,9 @@ PROFILE_OF = {
     "sa8295p": "sa8295p",
     "xelite": "snapdragon-x-elite",
 }
-HEXAGON_OF = {"8gen1": "v69", "8gen2": "v73", "8gen3": "v75", "8elite": "v79", "8elite5": "v81"} | {
-    "qcs6490": "v68",
-    "sa8295p": "v68",
-    "xelite": "v73",
+HEXAGON_OF = {
+    **{"8gen1": "v69", "8gen2": "v73", "8gen3": "v75", "8elite": "v79", "8elite5": "v81"},
+    **{"qcs6490": "v68", "sa8295p": "v68", "xelite": "v73"},
 }
 #: Chips of the 888's generation; their mean is in the shared profile, for chips without rows.
 V68 = ("qcs6490", "sa8295p")
@@ -156,8 +155,7 @@ def study_engines(folder: Path) -> Study:
     layers = layers_of_rows(folder, rows)
     engines = {}
     for engine in ENGINES:
-        usual = [row for row in rows if row.engine == engine and not row.anchor]
-        if usual:
+        if usual := [row for row in rows if row.engine == engine and not row.anchor]:
             engines[engine] = study_engine(usual, layers)
     rates = {(chip, name): _known(study.fitted, chip) for name, study in engines.items() for chip in study.fitted.chips}
     for chip, before in BEFORE.items():
@@ -186,20 +184,15 @@ def _known(fitted: Fitted, chip: str) -> dict[str, ChipRate]:
 def _assumed(
     rates: Mapping[tuple[str, EngineName], Mapping[str, ChipRate]], engines: Sequence[EngineName]
 ) -> dict[tuple[str, EngineName], dict[str, ChipRate]]:
-    """Return the assumed rates, by key, of each pair (chip, engine) without rows.
-
-    `rates`: rates of the pairs with rows.
-    """
+    """Return the assumed rates, by key, of each pair (chip, engine) without rows in `rates`."""
     found = {}
     for chip, relative in RELATIVE.items():
         for engine in engines:
             other = next((e for e in SIBLING[engine] if {(chip, e), (relative, e)} <= rates.keys()), None)
             if (chip, engine) not in rates and other is not None and (relative, engine) in rates:
-                ratio = {
-                    key: rate.value / rates[relative, other][key].value for key, rate in rates[chip, other].items()
-                }
+                own, theirs = rates[chip, other], rates[relative, other]
                 found[chip, engine] = {
-                    key: ChipRate(rate.value * ratio[key], ASSUMED_SPREAD, "assumed")
+                    key: ChipRate(rate.value * (own[key].value / theirs[key].value), ASSUMED_SPREAD, "assumed")
                     for key, rate in rates[relative, engine].items()
                 }
     return found
@@ -322,7 +315,9 @@ def _shared(study: Study, command: str) -> Iterator[str]:
         yield f"element_bytes = {2 if name.startswith('fp16') else 1}"
         yield _number("on_chip_mb", ChipRate(ON_CHIP_MB["v68"], 0.1, "published"), VTCM)
         yield _number("error_fraction", ChipRate(engine.error, 0.3, "fitted"), _errors(engine))
-        yield from _rates(name, _middle_of(study, name), f"{command}, mean of the chips of Hexagon v68")
+        chips = [study.rates[chip, name] for chip in V68 if (chip, name) in study.rates]
+        mean = {key: ChipRate(*prior, "fitted") for key, prior in middle(chips).items()}
+        yield from _rates(name, mean, f"{command}, mean of the chips of Hexagon v68")
         yield f"\n[units.dsp.engines.{name}.seen]"
         for network, shares in engine.fitted.seen.items():
             stated = [
@@ -334,11 +329,6 @@ def _shared(study: Study, command: str) -> Iterator[str]:
         for term, value, spread in zip(NAMES, numbers, spreads, strict=True):
             if term not in UNITS_OF_RATES:
                 yield _number(term, ChipRate(math.exp(value), float(spread), "fitted"), source)
-
-
-def _middle_of(study: Study, name: EngineName) -> Mapping[str, ChipRate]:
-    chips = [study.rates[chip, name] for chip in V68 if (chip, name) in study.rates]
-    return {key: ChipRate(*prior, "fitted") for key, prior in middle(chips).items()}
 
 
 def _errors(engine: EngineStudy) -> str:

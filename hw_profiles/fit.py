@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import median
@@ -177,13 +177,11 @@ def _from_residuals(residuals: Sequence[Residual], rows: Sequence[ConfigurationR
 
 
 def _solve(data: Mapping[str, Any], path: Path, step: Step, measured: Sequence[TableCell]) -> tuple[F64, F64]:
-    """Return (factors on the priors of `step.free`, spread of each factor after the fit).
-
-    `data`: tables of the profile with the priors.
-    `path`: file of these tables, for messages.
-    `step`: step of the fit.
-    `measured`: measurements that the step fits.
-    """
+    """Return (factors on the priors in `data` of `step.free`, spread of each factor after a fit to `measured`)."""
+    try:
+        from scipy.optimize import least_squares
+    except ImportError:
+        raise MissingPartError("fitting needs SciPy", extra="fit") from None
     priors = np.array([_at(data, keys[0]).get("spread", 0.5) for keys in step.free])
 
     def residuals(x: F64) -> F64:
@@ -191,18 +189,9 @@ def _solve(data: Mapping[str, Any], path: Path, step: Step, measured: Sequence[T
         errors = [np.log(predicted_ms(profile, each) / each.ms) / step.noise for each in measured]
         return np.concatenate([errors, x])
 
-    solution = _least_squares()(residuals, np.zeros(len(priors)))
+    solution = least_squares(residuals, np.zeros(len(priors)))
     covariance = np.linalg.inv(solution.jac.T @ solution.jac)
     return np.exp(solution.x * priors), priors * np.sqrt(np.diag(covariance))
-
-
-def _least_squares() -> Callable[..., Any]:
-    try:
-        from scipy.optimize import least_squares
-    except ImportError:
-        raise MissingPartError("fitting needs SciPy", extra="fit") from None
-    solver: Callable[..., Any] = least_squares
-    return solver
 
 
 def with_factors(data: Mapping[str, Any], free: Sequence[Keys], factors: Sequence[float] | F64) -> dict[str, Any]:
@@ -245,9 +234,8 @@ def as_toml(
             lines += ["", f"[{table}]"]
             section = table
         value, spread = numbers[key]
-        lines.append(
-            f'{last} = {{ value = {value:.4g}, kind = "fitted", spread = {spread:.2g}, source = {json.dumps(source)} }}'
-        )
+        stated = f'value = {value:.4g}, kind = "fitted", spread = {spread:.2g}, source = {json.dumps(source)}'
+        lines.append(f"{last} = {{ {stated} }}")
     return "\n".join(lines) + "\n"
 
 

@@ -23,7 +23,7 @@ import csv
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
@@ -285,10 +285,7 @@ def _bytes(engine: EngineName, rate: str) -> int:
 
 
 class _Rows:
-    """Rows of one engine as arrays: chip, network and time of each row, and amounts of the rows' layers.
-
-    Equal layers of a row are stored once, with their count.
-    """
+    """Rows of one engine as arrays: chip, network and time of each, and amounts of their different layers."""
 
     def __init__(self, rows: Sequence[Latency], layers: Mapping[str, Layers], chips: Sequence[str]) -> None:
         tables = [_distinct(layers[row.network], _room(row)) for row in rows]
@@ -329,16 +326,12 @@ def _room(row: Latency) -> int:
     return ON_CHIP_MB[row.hexagon] * 2**20 // (2 if row.engine.startswith("fp16") else 1)
 
 
-_tables: dict[tuple[Layers, int], tuple[F64, F64]] = {}
-
-
+@cache
 def _distinct(layers: Layers, room: int) -> tuple[F64, F64]:
     """Return (amounts of each different layer, number of times that it occurs). `room`: as for `amounts`."""
-    if (layers, room) not in _tables:
-        # Many layers of a network are alike, and every step of the fit prices each kind once.
-        table, count = np.unique(amounts(layers, room), axis=0, return_counts=True)
-        _tables[layers, room] = table, count.astype(np.float64)
-    return _tables[layers, room]
+    # Many layers of a network are alike, and every step of the fit prices each kind once.
+    table, count = np.unique(amounts(layers, room), axis=0, return_counts=True)
+    return table, count.astype(np.float64)
 
 
 def priors(engine: EngineName, chips: Sequence[str]) -> tuple[Numbers, Numbers]:
@@ -405,10 +398,7 @@ def _cost(at: F64, data: _Rows, mean: F64, spread: F64) -> float:
 
 
 def _derivatives(at: F64, data: _Rows, mean: F64, spread: F64, chips: int) -> tuple[F64, F64]:
-    """Return (half the gradient of `_cost`, half its curvature as if `predict` were linear).
-
-    `at`, `mean`, `spread`: logarithms of all numbers, their prior means and prior standard deviations (numbers,).
-    """
+    """Return (half the gradient of `_cost`, half its curvature as if `predict` were linear)."""
     ms, shares = data.predict(_from_flat(at))
     misses = np.log(ms / data.ms) / NOISE
     weights = (NU + 1) / (NU + misses**2)  # rows with a large error count little
@@ -434,10 +424,10 @@ class LeftOut(NamedTuple):
         return self.predicted_ms / self.row.ms - 1
 
 
-def folds(networks: Sequence[str], seed: int = 0) -> Iterator[frozenset[str]]:
-    """Yield FOLDS disjoint parts of the networks, drawn at random with `seed`. No part has the network ALWAYS."""
+def folds(networks: Sequence[str]) -> Iterator[frozenset[str]]:
+    """Yield FOLDS disjoint parts of the networks, the same at each call. No part has the network ALWAYS."""
     others = sorted(set(networks) - {ALWAYS})
-    drawn = np.random.default_rng(seed).permutation(len(others))
+    drawn = np.random.default_rng(0).permutation(len(others))
     for fold in range(FOLDS):
         yield frozenset(others[index] for index in drawn[fold::FOLDS])
 

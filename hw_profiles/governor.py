@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from math import exp
 from pathlib import Path
 from typing import Any, Protocol
@@ -144,11 +145,7 @@ def power_allocator(
     The granted power is the power that the device can shed, plus a share of the headroom. The unit with the most power
     is lowered. The most lowered unit is raised if its additional power fits into the grant.
 
-    `profile`: hardware profile of the chip.
-    `thermal_state`: present temperatures.
-    `throttle`: steps of each unit; it is changed in place.
-    `requested`: index into CORNERS of the requested corner, by unit.
-    `power_w`: present power of each unit in watts.
+    Parameters: as for `step_wise`.
     """
     thermal = profile.thermal
     resistance = thermal.device_k_per_w.or_else(5.0)
@@ -160,22 +157,11 @@ def power_allocator(
         return
     lowest = max(UNITS, key=lambda u: throttle.steps[u])
     if throttle.steps[lowest]:
-        more = _next_step_w(profile, throttle, lowest, requested[lowest], power_w[lowest])
+        unit, index = profile.units[lowest], throttle.corner_index(lowest, requested[lowest])
+        now, then = (unit.power_w(CORNERS[i], 1.0) for i in (index, index - 1))
+        more = power_w[lowest] * (then / now - 1) if now else 0.0  # at the same share of busy time
         if wanted + more <= granted:
             throttle.raise_(lowest)
-
-
-def _next_step_w(profile: Profile, throttle: Throttle, name: UnitName, requested: int, power_w: float) -> float:
-    """Return the additional power in watts of the unit `name` one corner higher, at the same share of busy time.
-
-    `profile`: hardware profile of the chip.
-    `throttle`: present throttling of its units.
-    `requested`: index into CORNERS of the unit's requested corner.
-    `power_w`: present power of the unit in watts.
-    """
-    unit, index = profile.units[name], throttle.corner_index(name, requested)
-    now, then = (unit.power_w(CORNERS[i], 1.0) for i in (index, index - 1))
-    return power_w * (then / now - 1) if now else 0.0
 
 
 Govern = Callable[[Profile, ThermalState, Throttle, Mapping[UnitName, int], Mapping[UnitName, float]], None]
@@ -212,10 +198,7 @@ class Governor:
         self._ticks = self._throttled_ticks = 0
         self._first_throttled_s: float | None = None
         self._joules = 0.0
-        self._hottest = {
-            "device": self._thermal_state.device_c,
-            "junction": max(self._thermal_state.junction_c.values()),
-        }
+        self._hottest_c = self._thermal_state.device_c, max(self._thermal_state.junction_c.values())
         self._duty: dict[UnitName, int] = {}
         self.due_ns = 0
 
@@ -274,8 +257,8 @@ class Governor:
         temperature = {
             "kind": "modelled from busy time",
             "device_end": self._thermal_state.device_c,
-            "device_max": self._hottest["device"],
-            "junction_max": self._hottest["junction"],
+            "device_max": self._hottest_c[0],
+            "junction_max": self._hottest_c[1],
         }
         return {"caps": caps, "temperature_c": temperature}
 
@@ -299,8 +282,9 @@ class Governor:
             self._first_throttled_s = at_s
         for unit, duty in self._duty.items():
             self._duty_sum[unit] += duty / FULL_DUTY
-        self._hottest["device"] = max(self._hottest["device"], self._thermal_state.device_c)
-        self._hottest["junction"] = max(self._hottest["junction"], *self._thermal_state.junction_c.values())
+        device_c, junction_c = self._hottest_c
+        now = self._thermal_state
+        self._hottest_c = max(device_c, now.device_c), max(junction_c, *now.junction_c.values())
 
     def _changed(self) -> list[SetDuty]:
         """Return events for the units whose duty has changed since it was last set."""
@@ -391,13 +375,11 @@ def warm_up(
         raise BadInputError("minutes", f"{minutes:g}", f"above 0, at most {MAX_MINUTES}")
     requested = dict(zip(UNITS, map(CORNERS.index, corners_of(profile, performance_profile)), strict=True))
     thermal_state, throttle, moments = ThermalState.at_rest(profile), Throttle(), []
-    poll_s, steady_at = profile.thermal.poll_s.or_else(1.0), dict[Corners, Settled]()
+    poll_s, steady_at = profile.thermal.poll_s.or_else(1.0), cache(at)
     for tick in range(max(1, round(60 * minutes / poll_s))):
         cpu, gpu, dsp = (CORNERS[throttle.corner_index(unit, requested[unit])] for unit in UNITS)
         corners = (cpu, gpu, dsp)
-        if corners not in steady_at:
-            steady_at[corners] = at(corners)
-        now = steady_at[corners]
+        now = steady_at(corners)
         power = unit_power_w(profile, now, corners)
         thermal_state.advance(profile, power, poll_s)
         total = sum(power.values()) + profile.thermal.base_power_w.or_else(0)
@@ -449,23 +431,22 @@ def caps_of(moments: Sequence[Moment]) -> Throttling:
 
 def timeline_of(moments: Sequence[Moment]) -> list[dict[str, Any]]:
     """Return every n-th moment as JSON values, with n such that about MOST_SHOWN moments remain."""
-    return [_shown(m) for m in moments[:: max(1, len(moments) // MOST_SHOWN)]]
+    return [
+        {
+            "t_s": m.t_s,
+            "fps": 1e3 / m.frame_ms,
+            "device_c": m.device_c,
+            "junction_c": m.junction_c,
+            "power_w": m.power_w,
+            "corners": dict(zip(UNITS, m.corners, strict=True)),
+        }
+        for m in moments[:: max(1, len(moments) // MOST_SHOWN)]
+    ]
 
 
 def over_minutes(moments: Sequence[Moment]) -> dict[str, Any]:
     """Return the fields of a prediction that describe its course over minutes."""
     return {"temperature_c": temperatures_of(moments), "caps": caps_of(moments), "timeline": timeline_of(moments)}
-
-
-def _shown(moment: Moment) -> dict[str, Any]:
-    return {
-        "t_s": moment.t_s,
-        "fps": 1e3 / moment.frame_ms,
-        "device_c": moment.device_c,
-        "junction_c": moment.junction_c,
-        "power_w": moment.power_w,
-        "corners": dict(zip(UNITS, moment.corners, strict=True)),
-    }
 
 
 SUFFIXES = (".png", ".svg", ".pdf")
@@ -505,9 +486,8 @@ def plot_over_time(runs: Mapping[str, Sequence[Moment]], limit_c: float, title: 
         (line,) = rate.plot(minutes, [1e3 / m.frame_ms for m in moments], label=label)
         colour = line.get_color()
         temperature.plot(minutes, [m.device_c for m in moments], color=colour, label=f"{label}: device")
-        temperature.plot(
-            minutes, [m.junction_c for m in moments], color=colour, linestyle=":", label=f"{label}: junction"
-        )
+        junction_c = [m.junction_c for m in moments]
+        temperature.plot(minutes, junction_c, color=colour, linestyle=":", label=f"{label}: junction")
     temperature.axhline(limit_c, color="black", linewidth=0.8, linestyle="--", label=f"device limit {limit_c:g} °C")
     rate.set(ylabel="frames per second", title=title)
     rate.set_ylim(0, 1.15 * rate.get_ylim()[1])

@@ -74,11 +74,7 @@ def read_graph(path: Path, input_shapes: Mapping[str, Shape] | None = None) -> G
 def _checked(
     data: bytes, folder: Path, given: Sequence[tuple[str, Shape]]
 ) -> tuple[onnx.ModelProto, NumberFormat, Work]:
-    """Return (graph, number format, work) of `data`, the bytes of a file. Raises UnexpectedValue.
-
-    `folder`: folder of the file.
-    `given`: shapes of inputs by name.
-    """
+    """Return (graph, number format, work) of `data`, the bytes of a file in `folder`. Raises UnexpectedValue."""
     model = _parse(data)
     _check_version(model)
     _check_names(model)

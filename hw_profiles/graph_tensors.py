@@ -117,19 +117,11 @@ def _check_length(tensor: TensorProto, claimed: int, what: str) -> None:
         held, unit = len(tensor.raw_data), "bytes"
     else:
         held, unit = sum(len(getattr(tensor, field)) for field in _FIELDS), "numbers"
-        claimed = _entries(tensor, claimed)
+        # Two 4-bit elements share one entry, and a complex number has two.
+        pairs = tensor.data_type in (TensorProto.COMPLEX64, TensorProto.COMPLEX128)
+        claimed = claimed if _BITS[tensor.data_type] < 8 else prod(tensor.dims) * (2 if pairs else 1)
     if held != claimed:
         raise UnexpectedValue(f"{what} with {held} {unit}", f"the {claimed} that its shape claims", CUT_SHORT)
-
-
-def _entries(tensor: TensorProto, size: int) -> int:
-    """Return the number of list entries of a tensor of `size` bytes.
-
-    Two 4-bit elements share one entry, and a complex number has two.
-    """
-    bits = _BITS[tensor.data_type]
-    pairs = tensor.data_type in (TensorProto.COMPLEX64, TensorProto.COMPLEX128)
-    return size if bits < 8 else prod(tensor.dims) * (2 if pairs else 1)
 
 
 def _check_inside(tensor: TensorProto, folder: Path) -> None:
@@ -145,8 +137,7 @@ def _check_inside(tensor: TensorProto, folder: Path) -> None:
 
 def _forget(tensor: TensorProto) -> None:
     """Drop everything of a tensor except name, type and shape."""
-    bare = TensorProto(name=tensor.name, data_type=tensor.data_type, dims=tensor.dims)
-    tensor.CopyFrom(bare)
+    tensor.CopyFrom(TensorProto(name=tensor.name, data_type=tensor.data_type, dims=tensor.dims))
 
 
 def called(node: onnx.NodeProto) -> str:
@@ -187,10 +178,9 @@ def _check_kinds(graph: onnx.GraphProto) -> None:
 
 
 def _made(graph: onnx.GraphProto) -> Iterator[str]:
-    """Yield the names of the tensors that `graph` makes: its weights, its inputs and its operators' outputs.
+    """Yield the names of the tensors that `graph` makes, as often as it makes each: weights, inputs and results.
 
-    A tensor that is made several times is yielded several times. An input with the name of a weight only declares this
-    weight, and is not yielded.
+    An input with the name of a weight only declares this weight, and is not yielded.
     """
     weights = [tensor.name for tensor in graph.initializer]
     yield from weights
@@ -269,13 +259,12 @@ def with_shapes(model: onnx.ModelProto, given: Mapping[str, Shape]) -> onnx.Mode
     _give(model.graph, inputs, given)
     for value in inputs:
         _check_input(value)
-    inferred = _inferred(model)
-    shapes = _known(model.graph, inputs, inferred)
-    while any(shapes.get(name) is None for node in model.graph.node for name in node.output if name):
-        if not fold(model, shapes):
-            break
+    while True:
         inferred = _inferred(model)
         shapes = _known(model.graph, inputs, inferred)
+        is_known = all(name in shapes for node in model.graph.node for name in node.output if name)
+        if is_known or not fold(model, shapes):
+            break
     _check_all(model.graph, inferred, shapes)
     _check_convolutions(model.graph, shapes)
     del model.graph.value_info[:]
@@ -330,7 +319,8 @@ def _inferred(model: onnx.ModelProto) -> dict[str, onnx.ValueInfoProto]:
         looked_at.CopyFrom(model)
         for node in looked_at.graph.node:
             if stand_in := STAND_INS.get((node.domain, node.op_type)):
-                _replace(node, stand_in)
+                inputs = node.input[:1] if stand_in == "Identity" else node.input
+                node.CopyFrom(helper.make_node(stand_in, inputs, node.output[:1], node.name))
     try:
         result = onnx.shape_inference.infer_shapes(looked_at, strict_mode=True, data_prop=True)
     except (onnx.shape_inference.InferenceError, RuntimeError, ValueError) as error:
@@ -338,11 +328,6 @@ def _inferred(model: onnx.ModelProto) -> dict[str, onnx.ValueInfoProto]:
         remedy = SIZES_INSIDE if _keeps_sizes_outside(model.graph) else "export it again"
         raise UnexpectedValue(f"shapes that do not fit: {found}", "operators whose inputs fit", remedy) from None
     return {value.name: value for value in (*result.graph.value_info, *result.graph.output)}
-
-
-def _replace(node: onnx.NodeProto, op_type: str) -> None:
-    inputs = node.input[:1] if op_type == "Identity" else node.input
-    node.CopyFrom(onnx.helper.make_node(op_type, inputs, node.output[:1], node.name))
 
 
 def _check_all(
@@ -365,9 +350,8 @@ def _check_all(
 def _check_convolutions(graph: onnx.GraphProto, shapes: Mapping[str, Shape]) -> None:
     """Check that a weight's channels fit the input and the output of its convolution, which ONNX does not check."""
     for node in graph.node:
-        if node.op_type not in CONVOLUTIONS:
+        if (at := CONVOLUTIONS.get(node.op_type)) is None:
             continue
-        at = CONVOLUTIONS[node.op_type]
         if len(node.input) <= at:
             raise UnexpectedValue(f"{called(node)} without a weight", "one", EXPORT_AGAIN)
         source, weight, result = (shapes[name] for name in (node.input[0], node.input[at], node.output[0]))
@@ -397,7 +381,7 @@ def _unknown(
     found = f"no static shape for {_shown(value) if value is not None else repr(name)}, made by {called(node)}"
     if _keeps_sizes_outside(graph):
         remedy = SIZES_INSIDE
-    elif not _has_schema(node):
+    elif not onnx.defs.has(node.op_type, node.domain):
         remedy = "ONNX has no such operator: state the shape of its result in the graph's value_info"
     else:
         remedy = "export it with fixed sizes; a result whose size depends on the picture cannot be priced"
@@ -411,10 +395,6 @@ def _keeps_sizes_outside(graph: onnx.GraphProto) -> bool:
         for tensor in graph.initializer
         if not tensor.raw_data and not tensor.int64_data
     )
-
-
-def _has_schema(node: onnx.NodeProto) -> bool:
-    return bool(onnx.defs.has(node.op_type, node.domain))
 
 
 def _sizes(value: onnx.ValueInfoProto, least: int = 1) -> Shape | None:
@@ -480,11 +460,7 @@ def _results(
     shapes: Mapping[str, tuple[int, ...]],
     opsets: Sequence[onnx.OperatorSetIdProto],
 ) -> list[NDArray[np.generic]]:
-    """Return the values that `node` computes; an empty list if an input is unknown, or a result may be too large.
-
-    `known`: known values of tensors, by name.
-    `opsets`: versions of the operator sets.
-    """
+    """Return the values that `node` computes; an empty list if an input is unknown, or a result may be too large."""
     if node.domain not in ("", "ai.onnx"):
         return []
     if node.op_type in OF_SHAPES and node.input and node.input[0] in shapes:
@@ -494,7 +470,12 @@ def _results(
     if len(values) < len(inputs) or not _is_small(node, values):
         return []
     feeds = dict(zip((name for name in node.input if name), values, strict=True))
-    graph = helper.make_graph([node], "one", [_info(name, value) for name, value in feeds.items()], _ends(node))
+    given = [
+        helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(value.dtype), value.shape)
+        for name, value in feeds.items()
+    ]
+    ends = [helper.make_empty_tensor_value_info(name) for name in node.output]
+    graph = helper.make_graph([node], "one", given, ends)
     try:
         with np.errstate(all="ignore"):
             found = ReferenceEvaluator(helper.make_model(graph, opset_imports=opsets)).run(None, feeds)
@@ -522,11 +503,3 @@ def _is_small(node: onnx.NodeProto, values: Sequence[NDArray[np.generic]]) -> bo
         sizes = values[-1].astype(np.int64).ravel().tolist()
         return all(size >= 0 for size in sizes) and prod(sizes) * values[0].size <= KEPT_ELEMENTS
     return node.op_type in _BOUNDED and bool(values)
-
-
-def _info(name: str, value: NDArray[np.generic]) -> onnx.ValueInfoProto:
-    return helper.make_tensor_value_info(name, helper.np_dtype_to_tensor_dtype(value.dtype), value.shape)
-
-
-def _ends(node: onnx.NodeProto) -> list[onnx.ValueInfoProto]:
-    return [helper.make_empty_tensor_value_info(name) for name in node.output]

@@ -175,16 +175,15 @@ def _number(file: Path, otherwise: int) -> int:
 
 def host_tables() -> dict[str, Any]:
     """Return the tables that replace parts of `host.toml`: title, peak rates of the units, speeds of the runtimes."""
-    cores = len(usable_cores())
     ghz = machine.here.clock_ghz()
     known_ghz = ghz if ghz > 0 else FALLBACK_GHZ
     flags = machine.here.cpu_flags()
     flag = next(name for name in RATES if name in flags or not name)
     clock = f"{known_ghz:.1f} GHz" + ("" if ghz > 0 else " (not told, assumed)")
-    split = split_cores(usable_cores())
-    core = {unit: f"core {own[0]}" for unit, own in split.items()}
+    cores = usable_cores()
+    core = {unit: f"core {own[0]}" for unit, own in split_cores(cores).items()}
     return {
-        "title": f"this machine: {cores} cores, {clock}, {flag or 'no vector products'}",
+        "title": f"this machine: {len(cores)} cores, {clock}, {flag or 'no vector products'}",
         "units": {
             "cpu": {**_unit(1, known_ghz, flag, clock), "core": core["cpu"]},
             "gpu": {**_unit(1, known_ghz, flag, clock), "core": core["gpu"]},

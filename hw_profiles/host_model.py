@@ -107,11 +107,8 @@ def _can_be_simulated(placement: Placement) -> bool:
 def _times(profile: Profile, plan: Plan, corners: Corners, cores: int, given: Placement) -> Times:
     """Return the modelled work of a frame, by unit and number of threads.
 
-    The network's unit may have any number of threads up to the number of cores. If its times are measured, only the
-    measured numbers of threads count.
-
-    `cores`: number of cores.
-    `given`: places that the user chose for units; their numbers of threads are added.
+    The network's unit may have any number of threads up to the number of cores, or the measured numbers. Numbers of
+    threads of the places `given` by the user are added.
     """
     rule = rule_placement(tuple(range(cores)))
     counts = {unit: {1, rule[unit].threads} for unit in UNITS}

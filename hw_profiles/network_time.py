@@ -14,6 +14,7 @@ import math
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Final, NamedTuple
 
 from trilane.arrays import F64
@@ -29,7 +30,6 @@ from trilane.hw_profiles.schema import SIGMAS, Corners, EngineRuntime, Profile, 
 from trilane.hw_profiles.unit_times import (
     BOUNDS,
     Bound,
-    JobTime,
     UnitNumbers,
     assumes_peak,
     engine_time,
@@ -153,7 +153,9 @@ def interval(profile: Profile, work: Work, time: NetworkTime) -> Interval:
     else:
         own = unit.engine.error_fraction.or_else(0.5) * job.unlike
         why = [f"networks as unlike those of the fit were off by {own:.0%} besides what its numbers leave open"]
-        why += [_likeness(job), f"the numbers leave {job.unsure or 0:.0%} open for this one"]
+        likeness = f"of those {job.like} is most like it; {job.unlike:.0%} of the time goes into other work"
+        why.append(likeness if job.like else "its profile names no network that its numbers were fitted to")
+        why += [f"the numbers leave {job.unsure or 0:.0%} open for this one"]
         why += [f"{share:.0%} of it is {term}, known to {spread:.0%}" for term, share, spread in _ill_known(work, unit)]
     if unit.measured is None and unit.error_scale is not None:
         why.append(f"own rows scale the error of its {time.unit} by {unit.error_scale.or_else(1):.2g}")
@@ -161,13 +163,6 @@ def interval(profile: Profile, work: Work, time: NetworkTime) -> Interval:
     if odd:
         why.append(f"no rule for {', '.join(odd)}: counted as the movement of its elements")
     return Interval(*interval_around(time.total_ms, relative_error(job, unit)), tuple(why))
-
-
-def _likeness(job: JobTime) -> str:
-    """Return a clause that names the network of the fit nearest to the network of `job`, and their distance."""
-    if not job.like:
-        return "its profile names no network that its numbers were fitted to"
-    return f"of those {job.like} is most like it; {job.unlike:.0%} of the time goes into other work"
 
 
 def _ill_known(work: Work, unit: Unit) -> list[tuple[str, float, float]]:
@@ -180,11 +175,7 @@ def _ill_known(work: Work, unit: Unit) -> list[tuple[str, float, float]]:
 
 
 class _Running(NamedTuple):
-    """A network that runs all the time.
-
-    `frame_ms`: time between two results.
-    `busy`: share of the time in which each unit works.
-    """
+    """A network that runs all the time: time between two results, and share of the time in which each unit works."""
 
     frame_ms: float
     busy: Mapping[str, float]
@@ -273,12 +264,7 @@ def predict_network(
     time = price(profile, work, unit, corners)
     around = interval(profile, work, time)
 
-    known = {corners: time.total_ms}
-
-    def ms_at(at: Corners) -> float:
-        if at not in known:
-            known[at] = price(profile, work, unit, at).total_ms
-        return known[at]
+    ms_at = cache(lambda at: price(profile, work, unit, at).total_ms)
 
     def running(at: Corners) -> _Running:
         frame_ms = max(ms_at(at), 1e3 / wanted.fps if wanted.fps else 0.0)

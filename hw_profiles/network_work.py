@@ -221,7 +221,11 @@ def _shapes(model: Any) -> dict[str, tuple[int, ...]]:
     shapes = {i.name: tuple(i.dims) for i in model.graph.initializer}
     known = {v.name for v in model.graph.value_info}
     if any(name not in known for node in model.graph.node[:-1] for name in node.output[:1]):
-        model = _inferred(model)
+        try:
+            model = onnx.shape_inference.infer_shapes(model)
+        except onnx.shape_inference.InferenceError as error:
+            wrong = str(error).splitlines()[0]
+            raise BadInputError("its shapes", wrong, "shapes that follow from each other", "export it again") from None
     for info in (*model.graph.input, *model.graph.value_info, *model.graph.output):
         shapes[info.name] = tuple(d.dim_value for d in info.type.tensor_type.shape.dim)
     return shapes
@@ -233,14 +237,6 @@ def _weight_inputs(graph: Any) -> set[str]:
     after_first = {name for node in graph.node if node.op_type in kinds for name in node.input[1:] if name in names}
     numbered = {name for name in names if WEIGHT_INPUT.fullmatch(name)}
     return after_first | (numbered if numbered != names else set())
-
-
-def _inferred(model: Any) -> Any:
-    try:
-        return onnx.shape_inference.infer_shapes(model)
-    except onnx.shape_inference.InferenceError as error:
-        wrong = str(error).splitlines()[0]
-        raise BadInputError("its shapes", wrong, "shapes that follow from each other", "export it again") from None
 
 
 def _size(shapes: Shapes, name: str) -> int:
@@ -287,11 +283,7 @@ def _live_counts(graph: Any, shapes: Shapes, constants: set[str]) -> list[int]:
 
 
 def _operator(node: Any, shapes: Shapes, constants: set[str], read: set[str]) -> Operator:
-    """Return the counts of `node`.
-
-    `constants`: names of the tensors that do not depend on the input.
-    `read`: names of the tensors that any node reads, and of the graph's outputs.
-    """
+    """Return the counts of `node`. `read`: names of the tensors that any node reads, and of the graph's outputs."""
     known = has_rule(node.op_type, node.domain)
     weighted = node.op_type in WEIGHTED and known
     own = node.input[:SCALE_AND_SHIFT] if node.op_type == "BatchNormalization" else node.input
@@ -299,9 +291,8 @@ def _operator(node: Any, shapes: Shapes, constants: set[str], read: set[str]) ->
     moved_in = [_size(shapes, name) for name in node.input if name and name not in constants]
     out = sum(_size(shapes, name) for name in node.output if name and (name in read or name == first_result(node)))
     moved = sum(moved_in) * (2 if node.op_type in STATISTICS else 1) + out
-    plain = Operator(
-        node.name or first_result(node), node.op_type, KIND_OF.get(node.op_type, UNKNOWN), 0, moved, weights, 0, 0, out
-    )
+    name, kind = node.name or first_result(node), KIND_OF.get(node.op_type, UNKNOWN)
+    plain = Operator(name, node.op_type, kind, 0, moved, weights, 0, 0, out)
     if known and node.op_type in CONVOLUTIONS:
         return _convolution(node, shapes, plain)
     if known and (node.op_type in PRODUCTS or node.op_type in RECURRENT):
@@ -313,9 +304,8 @@ def _operator(node: Any, shapes: Shapes, constants: set[str], read: set[str]) ->
 def _convolution(node: Any, shapes: Shapes, plain: Operator) -> Operator:
     """Return the counts of the convolution `node`. `plain`: its counts without products."""
     groups = next((a.i for a in node.attribute if a.name == "group"), 1)
-    weight, source, result = (
-        shapes[name] for name in (node.input[CONVOLUTIONS[node.op_type]], node.input[0], node.output[0])
-    )
+    names = node.input[CONVOLUTIONS[node.op_type]], node.input[0], node.output[0]
+    weight, source, result = (shapes[name] for name in names)
     if min(len(weight), len(source), len(result)) < CONVOLVED or not 0 < groups <= min(source[1], result[1]):
         found = f"tensors of {len(source)}, {len(weight)} and {len(result)} dimensions in {groups} groups"
         raise BadInputError(f"operator {plain.name}", found, "a convolution of pictures", "export it again")

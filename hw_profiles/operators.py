@@ -16,8 +16,9 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from math import prod
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -134,7 +135,11 @@ def product_of(node: Any, shapes: list[Shape], out: Shape) -> Product | None:
     `out`: shape of its first result.
     """
     if node.op_type in RECURRENT:
-        return _recurrent(shapes) if [len(shape) for shape in shapes[:3]] == [3, 3, 3] else None
+        # X (steps, sequences, size), W and R (directions, gates, size): each step of each sequence takes all weights.
+        if [len(shape) for shape in shapes[:3]] != [3, 3, 3]:
+            return None
+        source, weights, recurrence = shapes[:3]
+        return Product(prod(source[:2]) * (prod(weights) + prod(recurrence)), source[2], weights[1])
     if node.op_type == "Einsum":
         return _einsum(node, shapes)
     at = PRODUCTS[node.op_type]
@@ -147,43 +152,21 @@ def product_of(node: Any, shapes: list[Shape], out: Shape) -> Product | None:
     return Product(prod(out) * depth, depth, width)
 
 
-def _recurrent(shapes: list[Shape]) -> Product:
-    """Return the counts of a recurrent layer: every step of every sequence is multiplied by all weights.
-
-    `shapes`: X (steps, sequences, size), W and R (directions, gates, size).
-    """
-    steps, weights, recurrence = shapes[0], shapes[1], shapes[2]
-    macs = prod(steps[:2]) * (prod(weights) + prod(recurrence))
-    return Product(macs, steps[2], weights[1])
-
-
 def _einsum(node: Any, shapes: list[Shape]) -> Product | None:
-    """Return the counts of an Einsum: one product for every combination of all indices.
-
-    Return None for an equation that has an ellipsis or does not fit the shapes.
-    """
+    """Return the counts of an Einsum; None for an equation with an ellipsis or one that does not fit the shapes."""
     equation = next((a.s.decode() for a in node.attribute if a.name == "equation"), "").replace(" ", "")
     sources, _, result = equation.partition("->")
     terms = sources.split(",")
-    if (
-        "." in equation
-        or len(terms) != len(shapes)
-        or any(len(t) != len(s) for t, s in zip(terms, shapes, strict=True))
-    ):
+    if "." in equation or [*map(len, terms)] != [*map(len, shapes)]:
         return None
-    sizes = {
-        index: size for term, shape in zip(terms, shapes, strict=True) for index, size in zip(term, shape, strict=True)
-    }
+    sizes = dict(zip("".join(terms), chain.from_iterable(shapes), strict=True))
     summed = set(sizes) - set(result)
-    return Product(
-        prod(sizes.values()),
-        prod(sizes[index] for index in summed),
-        prod(sizes[index] for index in set(terms[-1]) - summed),
-    )
+    c_in, c_out = (prod(sizes[index] for index in of) for of in (summed, set(terms[-1]) - summed))
+    return Product(prod(sizes.values()), c_in, c_out)
 
 
 RateName = Literal["arithmetic", "activation", "spill", "weight", "operator", "job"]
-RATES: tuple[RateName, ...] = ("arithmetic", "activation", "spill", "weight", "operator", "job")
+RATES: tuple[RateName, ...] = get_args(RateName)
 
 #: The rate by which the amount of each term is divided. Amounts of `arithmetic` are products. Amounts of `activation`,
 #: `spill` and `weight` are elements, and amounts of `operator` and `job` are counts.
@@ -403,44 +386,33 @@ def layers_of(graph: Any, shapes: Shapes, constants: set[str]) -> Layers:
         kind = _kind(node)
         before = [layers[name] for name in names.given(node) if name in layers]
         sigmoid = next((layer for layer in before if _is_swish(node, layer, names)), None)
-        if kind in FOLDED_ACTIVATIONS and before and _folds(before[0], names):
+        # A layer whose result nothing else reads can take up what follows it.
+        taker = before[0].kind if before and names.reads[before[0].writes] == 1 else ""
+        if kind in FOLDED_ACTIVATIONS and taker in TAKES:
             layers[before[0].writes] = before[0]._replace(amounts={**before[0].amounts, **_clip(node, shapes)})
             names.rename(node.output[0], before[0].writes)
-        elif node.op_type == "BatchNormalization" and before and _takes_up(before[0], names):
+        elif node.op_type == "BatchNormalization" and taker in PLAIN_PRODUCTS:
             names.rename(node.output[0], before[0].writes)
         elif sigmoid is not None:
             del layers[sigmoid.writes]
             layers[first_result(node)] = _layer(node, names, "Swish", sigmoid.reads)
         elif kind == "Add" and any(layer.kind in PLAIN_PRODUCTS for layer in before):
-            layers[node.output[0]] = EngineLayer(
-                node.name or node.output[0], "Add", {}, names.given(node), node.output[0]
-            )
+            result = node.output[0]
+            layers[result] = EngineLayer(node.name or result, "Add", {}, names.given(node), result)
         else:
             layers[first_result(node)] = _layer(node, names, kind, names.given(node))
-    sizes = {name: _padded(shape, ACTIVATION_BLOCK) for name, shape in shapes.items() if name not in constants}
+    sizes = {name: _padded(shape) for name, shape in shapes.items() if name not in constants}
     ends = ([i.name for i in graph.input if i.name not in constants], [o.name for o in graph.output])
     whole = tuple(layers.values())
     return Layers(whole, sizes, *(sum(prod(shapes[name]) for name in end) for end in ends))
 
 
-def _folds(before: EngineLayer, names: _Graph) -> bool:
-    return before.kind in TAKES and names.reads[before.writes] == 1
-
-
-def _takes_up(before: EngineLayer, names: _Graph) -> bool:
-    """Return whether a batch normalisation after the layer `before` can become part of the weights of `before`."""
-    return before.kind in PLAIN_PRODUCTS and names.reads[before.writes] == 1
-
-
 def _clip(node: Any, shapes: Shapes) -> dict[str, float]:
-    return {"clip": 2.0 * _padded(shapes[node.output[0]], ACTIVATION_BLOCK)} if node.op_type == "Clip" else {}
+    return {"clip": 2.0 * _padded(shapes[node.output[0]])} if node.op_type == "Clip" else {}
 
 
 def _is_swish(node: Any, before: EngineLayer, names: _Graph) -> bool:
-    """Return whether `node` multiplies a tensor with its own sigmoid, and nothing else reads that sigmoid.
-
-    `before`: layer of the sigmoid.
-    """
+    """Return whether `node` multiplies a tensor with its own sigmoid, which the layer `before` makes for it alone."""
     if _kind(node) != "Mul" or before.kind != "Sigmoid":
         return False
     return set(names.given(node)) == {*before.reads, before.writes} and names.reads[before.writes] == 1
@@ -454,7 +426,7 @@ def _layer(node: Any, names: _Graph, kind: str, reads: tuple[str, ...]) -> Engin
     else:
         moved = [names.shapes[n] for n in node.input if n and n not in names.constants]
         moved += [names.shapes[n] for n in (writes, *more)]
-        amounts.update(dict(_movement(node, kind, sum(_padded(s, ACTIVATION_BLOCK) for s in moved), names)))
+        amounts.update(dict(_movement(node, kind, sum(_padded(s) for s in moved), names)))
     amounts["operator"] = 1
     counted = {t: float(a) for t, a in amounts.items() if a}
     return EngineLayer(node.name or writes, node.op_type, counted, reads, writes, more)
@@ -472,11 +444,11 @@ def _movement(node: Any, kind: str, moved: int, names: _Graph) -> Iterator[tuple
         yield TERM_OF.get(kind, "other"), moved
 
 
-def _padded(shape: tuple[int, ...], block: int) -> int:
+def _padded(shape: tuple[int, ...]) -> int:
     """Return the elements of a tensor of `shape` with its channels, the second axis, rounded up to whole blocks."""
     if len(shape) != 4:
         return prod(shape)
-    return shape[0] * _up(shape[1], block) * shape[2] * shape[3]
+    return shape[0] * _up(shape[1], ACTIVATION_BLOCK) * shape[2] * shape[3]
 
 
 def _up(count: int, block: int) -> int:
@@ -488,7 +460,7 @@ def _products(node: Any, shapes: Shapes) -> Iterator[tuple[str, float]]:
     if node.op_type not in WITH_PRODUCTS:
         return
     source, out = shapes[node.input[0]], shapes[first_result(node)]
-    moved = _padded(source, ACTIVATION_BLOCK) + _padded(out, ACTIVATION_BLOCK)
+    moved = _padded(source) + _padded(out)
     if node.op_type in CONVOLUTIONS:
         yield from _convolution(node, source, shapes[node.input[CONVOLUTIONS[node.op_type]]], out, moved)
         return
@@ -505,12 +477,7 @@ def _padding(count: int, block: int) -> float:
 
 
 def _convolution(node: Any, source: Shape, weight: Shape, out: Shape, moved: int) -> Iterator[tuple[str, float]]:
-    """Yield (term, amount) of a convolution.
-
-    `source`, `out`: shapes (batch, channels, ...) of its input and its output.
-    `weight`: shape of its weight.
-    `moved`: elements that it reads and writes.
-    """
+    """Yield (term, amount) of a convolution, which reads and writes `moved` elements."""
     attributes = {a.name: a for a in node.attribute}
     groups = attributes["group"].i if "group" in attributes else 1
     yield "moved_depthwise" if groups == source[1] > 1 else "moved", moved
@@ -532,8 +499,6 @@ def _grouped(places: int, c_in: int, c_out: int, groups: int, stride: int) -> It
     """Yield (term, amount) of a convolution in groups.
 
     `places`: number of output positions times number of kernel positions.
-    `c_in`, `c_out`: input and output channels of all groups together.
-    `stride`: stride of the kernel.
     """
     if c_in > groups:
         yield "grouped", places * _up(c_in // groups, INPUT_BLOCK) * _up(c_out, OUTPUT_BLOCK)

@@ -101,9 +101,9 @@ def network_price(chip: Profile, graph: GraphFile, unit: UnitName, corners: Corn
     time = price(chip, graph.work, unit, corners)
     around = interval(chip, graph.work, time)
     source = f"{chip.name}, {unit} in {chip.units[unit].precision}"
-    if not is_known(chip, unit):
-        return StagePrice(StageTime(mean=time.total_ms), source, why=(UNMEASURED,), is_modelled=True)
     mean = StageTime(mean=time.total_ms)
+    if not is_known(chip, unit):
+        return StagePrice(mean, source, why=(UNMEASURED,), is_modelled=True)
     return StagePrice(mean, source, around.low_ms, around.high_ms, around.why, is_modelled=True)
 
 
@@ -220,7 +220,11 @@ class Drawn:
 
     def __init__(self, prices: Mapping[str, StagePrice], seed: int, factors: Mapping[str, float] | None = None) -> None:
         self._prices, self._seed, self._factors = prices, seed, factors or {}
-        self._fixed = {name: self._ns(name, each.mean_ns) for name, each in prices.items() if not each.time.varies}
+        self._fixed = {
+            name: round(each.mean_ns * self._factors.get(name, 1.0))
+            for name, each in prices.items()
+            if not each.time.varies
+        }
         self._blocks: dict[str, tuple[int, list[int]]] = {}
 
     def __call__(self, stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
@@ -234,9 +238,6 @@ class Drawn:
             times = _draw_ms(self._prices[stage].time, rng) * self._factors.get(stage, 1.0) * NS_PER_MS
             block = self._blocks[stage] = number, np.rint(times).astype(np.int64).tolist()
         return block[1][place]
-
-    def _ns(self, name: str, mean_ns: int) -> int:
-        return round(mean_ns * self._factors.get(name, 1.0))
 
 
 def _draw_ms(time: StageTime, rng: np.random.Generator) -> NDArray[np.float64]:
@@ -279,9 +280,8 @@ def predict_file(
     }
     if file.run.fps is not None:
         counts = report["frames"]
-        rate = holding(
-            file.run.fps, needs, wanted_drops(counts["dropped"]), report["deadline_misses"], counts["requested"]
-        )
+        drops = wanted_drops(counts["dropped"])
+        rate = holding(file.run.fps, needs, drops, report["deadline_misses"], counts["requested"])
         share = "" if needs.low_ms is None else _share(file)
         answer["rate"] = {**rate.as_json(), "sentence": rate.sentence + share}
     return answer

@@ -43,8 +43,7 @@ def load_profile(name: str | Path) -> Profile:
 
     Raises BadInputError if there is no such profile, or if it has a defect.
     """
-    path = _find(str(name), Path())
-    data = merged_tables(path)
+    data, path = load_tables(name)
     if path.stem == HOST:
         data = _overlay(data, host_tables())
     return parse_profile(data, path)
@@ -155,13 +154,11 @@ def _bad_input(error: ValidationError, path: Path) -> BadInputError:
         return BadInputError(where, unexpected.found, unexpected.expected, more)
     if first["type"] == "missing":
         return BadInputError(where, "nothing", "this key", more)
-    expected = "a table { value = ..., kind = ..., source = ... }" if "Quantity" in message else _expectation(message)
-    return BadInputError(where, _short(first["input"]), expected, more)
-
-
-def _expectation(message: str) -> str:
     text = message.removeprefix("Input should be ").removeprefix("Field ")
-    return text[:1].lower() + text[1:]
+    expected = text[:1].lower() + text[1:]
+    if "Quantity" in message:
+        expected = "a table { value = ..., kind = ..., source = ... }"
+    return BadInputError(where, _short(first["input"]), expected, more)
 
 
 def _short(value: Any) -> str:
@@ -176,11 +173,6 @@ def _siblings(keys: Sequence[str]) -> Iterator[str]:
     model: Any = Profile
     for key in keys[:-1]:
         fields = getattr(model, "model_fields", {})
-        model = _model_of(fields[key].annotation if key in fields else model)
+        annotation = fields[key].annotation if key in fields else model
+        model = (getattr(annotation, "__args__", ()) or (annotation,))[-1]  # `Model` for `dict[str, Model]`
     yield from getattr(model, "model_fields", {})
-
-
-def _model_of(annotation: Any) -> Any:
-    """Return `Model` for the annotation `dict[str, Model]`, and any other annotation unchanged."""
-    arguments = getattr(annotation, "__args__", ())
-    return arguments[-1] if arguments else annotation

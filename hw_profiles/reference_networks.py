@@ -11,11 +11,10 @@ from __future__ import annotations
 import csv
 from dataclasses import dataclass
 from functools import lru_cache
-from math import gcd, isfinite, prod
+from math import gcd, inf, prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import onnx
 from onnx import TensorProto, helper
 
 from trilane.arrays import check_side, parse_shape
@@ -68,9 +67,9 @@ class NetworkSpec:
     layout: str = "packed"
 
     def __post_init__(self) -> None:
-        _require_one_of("encoder", self.encoder, ENCODERS)
-        _require_one_of("norm", self.norm, NORMS)
-        _require_one_of("layout", self.layout, LAYOUTS)
+        for key, known in (("encoder", ENCODERS), ("norm", NORMS), ("layout", LAYOUTS)):
+            if (value := getattr(self, key)) not in known:
+                raise BadInputError(key, repr(value), "one of " + ", ".join(known))
         try:
             check_side(self.height, "height")
             check_side(self.width, "width")
@@ -106,11 +105,6 @@ def build_network(spec: NetworkSpec) -> Any:
     return b.model(f"unet-{spec.encoder}-{spec.norm}", [b.same("Sigmoid", joined)])
 
 
-def _require_one_of(key: str, value: str, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise BadInputError(key, repr(value), "one of " + ", ".join(known))
-
-
 def _network_input(b: GraphBuilder, spec: NetworkSpec) -> TensorRef:
     """Return the network's input in the layout of `spec`.
 
@@ -129,7 +123,8 @@ def _decoder(b: GraphBuilder, features: list[TensorRef]) -> TensorRef:
     """Return the decoder's result at full size. `features`: features of the encoder, from stride 2 to stride 32."""
     x, skips = features[-1], [*reversed(features[:-1]), None]
     for width, skip in zip(DECODER, skips, strict=True):
-        x = b.upsampled(x)
+        shape = (x.channels, 2 * x.height, 2 * x.width)
+        x = b.op("Resize", [x.name, "", b.twice.name], shape, mode="nearest")
         if skip is not None:
             x = b.op("Concat", [x.name, skip.name], (x.channels + skip.channels, x.height, x.width), axis=1)
         x = b.unit(b.unit(x, width, 3), width, 3)
@@ -138,12 +133,8 @@ def _decoder(b: GraphBuilder, features: list[TensorRef]) -> TensorRef:
 
 def parameters(model: Any) -> int:
     """Return the number of weights and biases of a model made by `build_network`."""
-    shapes = [_shape(info) for info in model.graph.input if info.name.startswith("w")]
-    return sum(prod(shape) for shape in shapes)
-
-
-def _shape(info: onnx.ValueInfoProto) -> list[int]:
-    return [d.dim_value for d in info.type.tensor_type.shape.dim]
+    weights = [info.type.tensor_type.shape.dim for info in model.graph.input if info.name.startswith("w")]
+    return sum(prod(size.dim_value for size in shape) for shape in weights)
 
 
 @dataclass(frozen=True)
@@ -166,8 +157,11 @@ class ConfigurationRow:
         text = self.cells.get(column, "")
         if not text:
             return None
-        value = _number(text)
-        if value is None or value <= 0:
+        try:
+            value = float(text)
+        except ValueError:
+            value = 0.0
+        if not 0 < value < inf:
             raise BadInputError(f"{self.place}: {column}", repr(text), "a number above 0, or nothing")
         return value
 
@@ -232,14 +226,6 @@ def spec_of(cells: dict[str, str], place: str) -> NetworkSpec:
         return NetworkSpec(cells["encoder"], cells["norm"], height, width, int(channels), cells["layout"])
     except BadInputError as error:
         raise BadInputError(f"{place}: {error.where}", error.found, error.expected) from None
-
-
-def _number(text: str) -> float | None:
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if isfinite(value) else None
 
 
 def encode(b: GraphBuilder, x: TensorRef, encoder: str) -> list[TensorRef]:
@@ -363,15 +349,8 @@ class GraphBuilder:
         weight = self.weight((out, x.channels // groups, kernel, kernel))
         sources = [x.name, weight] + ([self.weight((out,))] if bias else [])
         shape = (out, -(-x.height // stride), -(-x.width // stride))
-        return self.op(
-            "Conv",
-            sources,
-            shape,
-            kernel_shape=[kernel] * 2,
-            strides=[stride] * 2,
-            pads=[kernel // 2] * 4,
-            group=groups,
-        )
+        sides = {"kernel_shape": [kernel] * 2, "strides": [stride] * 2, "pads": [kernel // 2] * 4}
+        return self.op("Conv", sources, shape, **sides, group=groups)
 
     def same(self, kind: str, x: TensorRef, *more: str, **attributes: Any) -> TensorRef:
         """Append an operator whose result has the size of `x`.
@@ -402,11 +381,6 @@ class GraphBuilder:
         """
         y = self.normed(self.conv(x, out, kernel, stride, groups, bias=self.norm == "batch"))
         return y if act is None else self.same(act, y)
-
-    def upsampled(self, x: TensorRef) -> TensorRef:
-        """Append a resize of `x` to twice the size, by nearest neighbour."""
-        shape = (x.channels, 2 * x.height, 2 * x.width)
-        return self.op("Resize", [x.name, "", self.twice.name], shape, mode="nearest")
 
     def model(self, name: str, outputs: list[TensorRef]) -> Any:
         """Return the graph so far, with the results `outputs`, as an `onnx.ModelProto` of opset 21."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from statistics import NormalDist
-from typing import Annotated, Final, Literal, Self
+from typing import Annotated, Final, Literal, Self, get_args
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
 
@@ -18,7 +18,7 @@ from trilane.unexpected_value import UnexpectedValue
 from trilane.units import PERFORMANCE_PROFILES, UNITS, PerformanceProfile, UnitName
 
 Corner = Literal["max", "turbo", "nominal_plus", "nominal", "svs_plus", "svs", "svs2"]
-CORNERS: tuple[Corner, ...] = ("max", "turbo", "nominal_plus", "nominal", "svs_plus", "svs", "svs2")
+CORNERS: tuple[Corner, ...] = get_args(Corner)
 Kind = Literal["measured", "published", "fitted", "assumed", "unknown"]
 #: Relative error (standard deviation of the logarithm) of a number by its kind, if the profile states none.
 SPREAD_OF_KIND: dict[str, float] = {"measured": 0.05, "published": 0.1, "fitted": 0.15, "assumed": 0.5, "unknown": 1.0}
@@ -136,8 +136,8 @@ class Efficiencies(ProfileTable):
 #: A precision under a runtime: each has numbers of its own.
 EngineName = Literal["int8_tflite", "int8_qnn_dlc", "fp16_tflite", "fp16_qnn_dlc"]
 EngineRuntime = Literal["tflite", "qnn_dlc"]
-ENGINE_RUNTIMES: tuple[EngineRuntime, ...] = ("tflite", "qnn_dlc")
-ENGINES: tuple[EngineName, ...] = ("int8_tflite", "int8_qnn_dlc", "fp16_tflite", "fp16_qnn_dlc")
+ENGINE_RUNTIMES: tuple[EngineRuntime, ...] = get_args(EngineRuntime)
+ENGINES: tuple[EngineName, ...] = get_args(EngineName)
 
 
 class EngineRates(ProfileTable):
@@ -348,11 +348,6 @@ class PerformanceSettings(ProfileTable):
     gpu: Corner = Field(description="Corner of the GPU.")
     dsp: Corner = Field(description="Corner of the DSP.")
     sleep_latency_us: Cost = Field(description="Idle time after which a unit may sleep.")
-
-    def corner(self, unit: UnitName) -> Corner:
-        """Return the corner of `unit`."""
-        corner: Corner = getattr(self, unit)
-        return corner
 
 
 class Thermal(ProfileTable):

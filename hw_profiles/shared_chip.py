@@ -10,7 +10,7 @@ prediction that mean the same as in report.json have the same names.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple
@@ -96,8 +96,6 @@ def _run(
 ) -> Sequence[Simulation]:
     """Return the simulated runs of `tenants` for `seconds` of virtual time.
 
-    `costs`: times of the tenants' jobs.
-    `turns`: name in TURNS.
     `fed`: index of the tenant whose source is always ready; None: no such tenant.
     `keep`: whether the steps and jobs of each run are recorded.
     """
@@ -151,7 +149,7 @@ class _Job(NamedTuple):
     """A job with a network: the index of its tenant, and the tenant's name for the network."""
 
     tenant: int
-    network: Hashable
+    network: Any
 
 
 class _Costs:
@@ -257,10 +255,7 @@ def _rate(
     turns: str,
     frames: Mapping[str, Any],
 ) -> dict[str, dict[str, Any]]:
-    """Return the keys `needs_ms` and `rate` of tenant `number`; without an interval if the error is not known.
-
-    `frames`: counts of its frames at its rate, from its report.
-    """
+    """Return the keys `needs_ms` and `rate` of tenant `number`; without an interval if the error is not known."""
     needs = needed(profile, tenants, number, corners, turns)
     if not (is_known(profile, INFER[1]) and tenants[number].on(profile, corners, "expected", 0.0).is_known):
         needs = FrameInterval(needs.ms)
@@ -304,24 +299,17 @@ def _kept(report: Mapping[str, Any]) -> dict[str, Any]:
     The key `in_time` is the share of released frames that were presented in time, without the frames that `every`
     leaves out.
     """
-    frames, misses = report["frames"], report["deadline_misses"]
+    frames = report["frames"]
     wanted = frames["requested"] - sum(frames["dropped"].values()) + wanted_drops(frames["dropped"])
     return {
         "frames": {key: frames[key] for key in ("requested", "presented", "dropped")},
-        "frame_time_ms": report["frame_time_ms"],
-        "latency_ms": report["latency_ms"],
-        "response_ms": report["response_ms"],
-        "fps": report["fps"],
-        "deadline_misses": misses,
-        "in_time": (frames["presented"] - misses) / max(wanted, 1),
+        **{key: report[key] for key in ("frame_time_ms", "latency_ms", "response_ms", "fps", "deadline_misses")},
+        "in_time": (frames["presented"] - report["deadline_misses"]) / max(wanted, 1),
     }
 
 
 def _settled_ms(moments: Sequence[Moment], at: Callable[[Corners], Together], number: int) -> float | None:
-    """Return the mean frame time of tenant `number` in ms in the last fifth of the moments; None without moments.
-
-    `at`: function that returns the settled state at given corners.
-    """
+    """Return the mean frame time of tenant `number` in ms in the last fifth of the moments; None without moments."""
     last = last_fifth(moments)
     return _mean([at(each.corners).runs[number].report["frame_time_ms"]["mean"] for each in last]) or None
 

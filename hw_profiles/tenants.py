@@ -9,10 +9,10 @@ network each job computes, and how long a network takes with less bandwidth.
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Iterable, Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from functools import cache, cached_property
+from typing import Any, NamedTuple
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import (
@@ -31,7 +31,6 @@ from trilane.hw_profiles.pipeline_prediction import (
     NEVER_HANGS_NS,
     Drawn,
     Ends,
-    StagePrice,
     always_fed,
     factors_at,
     fed_bound_ms,
@@ -55,102 +54,6 @@ ENDLESS = 1 << 40
 SKIPS = -1
 
 
-class Jobs(Protocol):
-    """The times of a tenant's jobs on a chip, with its units at given corners.
-
-    `mean_ms`: mean time of a job by stage if no other tenant runs.
-    `bound_ms`: lower bound on the frame time if the source is always ready; 0 if none is known.
-    `is_known`: whether the error of every time is known.
-    """
-
-    @property
-    def mean_ms(self) -> Mapping[str, float]: ...
-
-    @property
-    def bound_ms(self) -> float: ...
-
-    @property
-    def is_known(self) -> bool: ...
-
-    def service_ns(self, stage: str, unit: str, frame: int, begin_ns: int) -> int:
-        """Return the time in ns of the job of `stage` for `frame` on `unit`, if no other tenant runs.
-
-        `begin_ns`: virtual time at which the job begins.
-        """
-
-    def network(self, stage: str, frame: int) -> Hashable | None:
-        """Return a name for the network that the job of `stage` for `frame` computes; None if it computes none."""
-
-    def network_ms(self, network: Any, use: float) -> float:
-        """Return the time of a job with `network` in ms, while other jobs take the share `use` of the bandwidth."""
-
-    def moved_bytes(self, network: Any) -> float:
-        """Return the bytes that `network` moves in a job."""
-
-
-class SharingPipeline(Protocol):
-    """A pipeline that shares a chip with others.
-
-    `name`: name in reports.
-    `source`: text of the user's request.
-    `kind`: avatar, network or pipeline.
-    `fps`: frames that are released a second.
-    `takes_memory`: whether its camera, display and composition use the memory all the time.
-    `repeats`: number of frames after which its jobs are the same again.
-    `graph`: its graph for the scheduler.
-    `fed`: (graph, settings) for a run whose source is always ready and in which no frame is dropped.
-    `hardware`: for each unit of the pipeline, the chip's unit that does its jobs; a unit outside of the chip has its
-    own name there.
-    """
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def source(self) -> str: ...
-
-    @property
-    def kind(self) -> str: ...
-
-    @property
-    def fps(self) -> float: ...
-
-    @property
-    def takes_memory(self) -> bool: ...
-
-    @property
-    def repeats(self) -> int: ...
-
-    @property
-    def graph(self) -> Graph: ...
-
-    @property
-    def fed(self) -> tuple[Graph, Settings]: ...
-
-    @property
-    def hardware(self) -> Mapping[str, str]: ...
-
-    def settings(self, display_ns: int) -> Settings:
-        """Return the settings of its scheduler for endless frames at its rate.
-
-        `display_ns`: shortest time between two shown frames of an avatar.
-        """
-
-    def skips(self, frame: int, is_fresh: bool) -> bool:
-        """Return whether a frame takes the bypass of the graph. `is_fresh`: whether its job is fresh."""
-
-    def on(self, profile: Profile, corners: Corners, end: Ends, always: float) -> Jobs:
-        """Return the times of its jobs on the chip `profile`.
-
-        `corners`: corner of each unit of the chip.
-        `end`: expected times, or one end of their intervals.
-        `always`: share of the memory's bandwidth that is taken all the time, 0 to 1.
-        """
-
-    def facts(self, profile: Profile) -> dict[str, Any]:
-        """Return a prediction's keys `unit`, `numbers`, `precision`, `policy` and `edge` for this pipeline."""
-
-
 def check_rate(name: str, fps: float) -> None:
     """Raise BadInputError if `fps`, frames a second, is out of range. `name`: name of the tenant, for the message."""
     if not LEAST_FPS <= fps <= MOST_FPS:
@@ -161,8 +64,11 @@ def check_rate(name: str, fps: float) -> None:
 class Tenant:
     """An avatar, or a network by itself, as a `SharingPipeline`.
 
+    `name`: name in reports.
+    `source`: text of the user's request.
     `networks`: one network for each combination of tensor shape, number of avatars in view and levels of their meshes.
     `frames`: for each frame, the index of its network in `networks`, or `SKIPS`; after its end the list starts over.
+    `fps`: frames that are released a second.
     `unit`: unit of the network.
     `variant`: how the stages are connected and scheduled.
     `is_bare`: whether it consists only of the network, whose result is due when the next frame comes.
@@ -192,22 +98,27 @@ class Tenant:
 
     @property
     def kind(self) -> str:
+        """The kind in reports: avatar, network or pipeline."""
         return "network" if self.is_bare else "avatar"
 
     @property
     def takes_memory(self) -> bool:
+        """Whether its camera, display and composition use the memory all the time."""
         return not self.is_bare
 
     @property
     def repeats(self) -> int:
+        """The number of frames after which its jobs are the same again."""
         return len(self.frames)
 
     @property
     def hardware(self) -> Mapping[str, str]:
+        """The chip's unit for each unit of the pipeline; a unit outside of the chip has its own name there."""
         return {unit: unit for unit in UNITS}
 
     @property
     def graph(self) -> Graph:
+        """The graph for the scheduler."""
         name, _ = INFER
         if self.is_bare:
             return chain([(name, self.unit)], self.variant.edge, name)
@@ -215,11 +126,16 @@ class Tenant:
 
     @property
     def fed(self) -> tuple[Graph, Settings]:
+        """(Graph, settings) for a run whose source is always ready and in which no frame is dropped."""
         policy = self.variant.policy
         settings = Settings(ENDLESS, Variant().policy if POLICIES[policy].paced else policy, hang_ns=ENDLESS)
         return holding_back(self.graph), settings
 
     def settings(self, display_ns: int) -> Settings:
+        """Return the settings of its scheduler for endless frames at its rate.
+
+        `display_ns`: shortest time between two shown frames of an avatar.
+        """
         policy = self.variant.policy
         limits: dict[str, Any] = {"in_queue": 0 if POLICIES[policy].newest else 1, "hang_ns": ENDLESS}
         period_ns = round(NS_PER_S / self.fps)
@@ -239,12 +155,20 @@ class Tenant:
         return self.frames[frame % len(self.frames)]
 
     def skips(self, frame: int, is_fresh: bool) -> bool:  # noqa: ARG002 an older result is never shown again here
+        """Return whether a frame takes the bypass of the graph. `is_fresh`: whether its job is fresh."""
         return self.place(frame) == SKIPS
 
-    def on(self, profile: Profile, corners: Corners, end: Ends, always: float) -> Jobs:
+    def on(self, profile: Profile, corners: Corners, end: Ends, always: float) -> _AvatarJobs:
+        """Return the times of its jobs on the chip `profile`.
+
+        `corners`: corner of each unit of the chip.
+        `end`: expected times, or one end of their intervals.
+        `always`: share of the memory's bandwidth that is taken all the time, 0 to 1.
+        """
         return _AvatarJobs(self, self.computes.on(profile, self.unit), corners, end, always)
 
     def facts(self, profile: Profile) -> dict[str, Any]:
+        """Return a prediction's keys `unit`, `numbers`, `precision`, `policy` and `edge` for this pipeline."""
         return {
             "unit": self.unit,
             "numbers": self.computes.numbers,
@@ -255,9 +179,14 @@ class Tenant:
 
 
 class _AvatarJobs:
-    """The `Jobs` of a `Tenant`. The name of a network is its index in `Tenant.networks`.
+    """The times of a tenant's jobs on a chip, with its units at given corners, if no other tenant runs.
+
+    The name of a network is its index in `Tenant.networks`.
 
     `chip`: hardware profile in the precision and under the runtime of the networks.
+    `mean_ms`: mean time of a job by stage.
+    `bound_ms`: lower bound on the frame time if the source is always ready; 0 if none is known.
+    `is_known`: whether the error of every time is known.
     """
 
     is_known = True
@@ -265,33 +194,31 @@ class _AvatarJobs:
 
     def __init__(self, tenant: Tenant, chip: Profile, corners: Corners, end: Ends, always: float) -> None:
         self._tenant, self._chip, self._corners, self._end = tenant, chip, corners, end
-        self._always = always
-        self._ms: dict[tuple[int, float], dict[str, float]] = {}
+        self._always, self._stages_ms = always, cache(self._made_ms)
         kinds = [kind for kind in tenant.frames if kind != SKIPS] or [0]
         each = [self._stages_ms(kind, always) for kind in kinds]
         # The mean over the frames with a network; if no frame has one, the times of the first network.
         self.mean_ms = {stage: sum(times[stage] for times in each) / len(each) for stage in each[0]}
 
     def service_ns(self, stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
+        """Return the time in ns of the job of `stage` for `frame`."""
         return round(self._stages_ms(self._kind(frame), self._always)[stage] * NS_PER_MS)
 
     def network(self, stage: str, frame: int) -> Hashable | None:
+        """Return a name for the network that the job of `stage` for `frame` computes; None if it computes none."""
         return self._kind(frame) if stage == INFER[0] else None
 
     def network_ms(self, network: int, use: float) -> float:
+        """Return the time of a job with `network` in ms, while other jobs take the share `use` of the bandwidth."""
         return self._stages_ms(network, use)[INFER[0]]
 
     def moved_bytes(self, network: int) -> float:
+        """Return the bytes that `network` moves in a job."""
         tenant = self._tenant
         return moved_bytes(tenant.networks[network].work, self._chip.units[tenant.unit])
 
     def _kind(self, frame: int) -> int:
         return max(self._tenant.place(frame), 0)
-
-    def _stages_ms(self, kind: int, use: float) -> dict[str, float]:
-        if (kind, use) not in self._ms:
-            self._ms[kind, use] = self._made_ms(kind, use)
-        return self._ms[kind, use]
 
     def _made_ms(self, kind: int, use: float) -> dict[str, float]:
         tenant, used = self._tenant, _used(self._chip, use)
@@ -365,7 +292,7 @@ class FileTenant:
     def skips(self, frame: int, is_fresh: bool) -> bool:  # noqa: ARG002 as in every prediction of a file
         return self.file.bypass is not None and self.file.bypass[1].takes(frame)
 
-    def on(self, profile: Profile, corners: Corners, end: Ends, always: float) -> Jobs:
+    def on(self, profile: Profile, corners: Corners, end: Ends, always: float) -> _FileJobs:
         return _FileJobs(self, profile, corners, end, always)
 
     def chip(self, stage: str, profile: Profile, unit: UnitName) -> Profile:
@@ -380,11 +307,12 @@ class FileTenant:
         return {"unit": ", ".join(units), "numbers": None, "precision": None, "policy": run.policy, "edge": run.edge}
 
 
-class _Priced(NamedTuple):
-    """A network whose time comes from the chip's model.
+#: A pipeline that shares a chip with others; its members are described at `Tenant`.
+SharingPipeline = Tenant | FileTenant
 
-    `factor`: time at the chosen end of its interval, divided by the expected time.
-    """
+
+class _Priced(NamedTuple):
+    """A network that the chip's model prices. `factor`: time at the chosen end of its interval, over the expected."""
 
     work: Work
     chip: Profile
@@ -393,10 +321,9 @@ class _Priced(NamedTuple):
 
 
 class _FileJobs:
-    """The `Jobs` of a `FileTenant`. The name of a network is the name of its stage.
+    """The jobs of a `FileTenant`, as `_AvatarJobs`. The name of a network is the name of its stage.
 
-    A network takes bandwidth only if the chip's model gives its time. If the file states the time, the stage counts as
-    a stage without a network.
+    A network takes bandwidth only if the chip's model gives its time, not if the file states it.
     """
 
     def __init__(self, tenant: FileTenant, profile: Profile, corners: Corners, end: Ends, always: float) -> None:
@@ -406,7 +333,11 @@ class _FileJobs:
         )
         self.is_known = all(each.low_ms is not None for each in prices.values())
         factors = factors_at(prices, end)
-        self._networks = dict(_priced(tenant, prices, profile, factors))
+        self._networks: dict[str, _Priced] = {}
+        for name, graph in tenant.graphs.items():
+            unit = next((each for each in UNITS if each == tenant.hardware[tenant.file.stages[name].unit]), None)
+            if prices[name].is_modelled and unit is not None:
+                self._networks[name] = _Priced(graph.work, tenant.chip(name, profile, unit), unit, factors[name])
         used = {name: self.network_ms(name, always) / prices[name].time.mean_ms for name in self._networks}
         self._drawn = Drawn(prices, 0, {**factors, **used})
         self.mean_ms = {name: each.time.mean_ms * {**factors, **used}[name] for name, each in prices.items()}
@@ -427,15 +358,6 @@ class _FileJobs:
     def moved_bytes(self, network: str) -> float:
         work, chip, unit, _ = self._networks[network]
         return moved_bytes(work, chip.units[unit])
-
-
-def _priced(
-    tenant: FileTenant, prices: Mapping[str, StagePrice], profile: Profile, factors: Mapping[str, float]
-) -> Iterable[tuple[str, _Priced]]:
-    for name, graph in tenant.graphs.items():
-        unit = next((each for each in UNITS if each == tenant.hardware[tenant.file.stages[name].unit]), None)
-        if prices[name].is_modelled and unit is not None:
-            yield name, _Priced(graph.work, tenant.chip(name, profile, unit), unit, factors[name])
 
 
 def _used(profile: Profile, use: float) -> Profile:

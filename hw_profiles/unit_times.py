@@ -239,7 +239,7 @@ def time_on(
     time = layer_times(unit, memory, work, clock_fraction, contended=contended, batch=batch)
     by_bound = 1e3 * time.layers.sum(axis=0)
     parts = {
-        "fixed": float(by_bound[4]) + _permutes_ms(unit, work),
+        "fixed": float(by_bound[4]) + unit.permute_fixed_ms.or_else(0.0) * (work.input_tensors > 1),
         "input": 1e3 * time.job + batch * work.input_elements * unit.input_ns_per_element.or_else(0.0) / 1e6,
         "weights": float(by_bound[3]),
         "fallback": sum(ms for _, ms in fallback_ms(unit, work, batch)),
@@ -304,11 +304,6 @@ def fallback_ms(unit: Unit, work: Work, batch: int = 1) -> list[tuple[str, float
     """Return (name, time in ms) of each operator that runs on the CPU instead of the unit."""
     fixed, each = unit.fallback_fixed_ms.or_else(0.0), unit.fallback_ns_per_element.or_else(0.0) / 1e6
     return [(o.name, fixed + batch * o.out * each) for o in work.operators if o.op_type in unit.fallback]
-
-
-def _permutes_ms(unit: Unit, work: Work) -> float:
-    """Return the fixed time in ms for a picture that comes in several tensors; 0 for a single tensor."""
-    return unit.permute_fixed_ms.or_else(0.0) if work.input_tensors > 1 else 0.0
 
 
 def nearest(engine: Engine, shares: F64) -> tuple[float, str]:
@@ -425,8 +420,7 @@ def _operator_seconds(
 ) -> NDArray[np.float64]:
     """Return the time of each operator in seconds (operators,): the larger of its arithmetic and its traffic.
 
-    `counts`: counts of the operators (operators, 5), from `Work.table`.
-    `classes`: index into CLASSES of each operator (operators,).
+    `counts`, `classes`: tables of a `Work`.
     """
     macs, moved, c_in, c_out = counts[:, 0], counts[:, 1], counts[:, 2], counts[:, 3]
     padded = macs * _padding_factor(c_in, machine.block) * _padding_factor(c_out, machine.block)

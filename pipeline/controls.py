@@ -10,14 +10,12 @@ order in which they are presented.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import signal
 import threading
-from collections import deque
 from collections.abc import Callable, Mapping
 from types import FrameType
-from typing import Any, Self
+from typing import Any, Generic, Self, TypeVar
 
 from trilane.scheduler.events import Event, FrameRequest, Hold, Stop
 from trilane.signals import that_end
@@ -25,63 +23,74 @@ from trilane.signals import that_end
 ALL = -1
 
 
-class RunControls:
-    """Passes requests to one run; once the run is over, requests do nothing.
+Request = TypeVar("Request")
+
+
+class _Requests(Generic[Request]):
+    """Requests of any thread to one run; once the run is over, a request does nothing.
 
     `fd`: descriptor that becomes readable with each request.
     """
 
     def __init__(self) -> None:
         self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        self._events: list[Event] = []
-        self._kills: list[str] = []
+        self._waiting: list[Request] = []
         self._lock = threading.Lock()
         self._closed = False
 
+    def _put(self, request: Request) -> None:
+        with self._lock:
+            if not self._closed:
+                self._waiting.append(request)
+                os.eventfd_write(self.fd, 1)
+
+    def _take(self) -> list[Request]:
+        with self._lock:
+            taken, self._waiting = self._waiting, []
+        return taken
+
+    def _close(self) -> bool:
+        """Note that the run is over. Return whether this is the first call."""
+        with self._lock:
+            if self._closed:
+                return False
+            self._closed = True
+            os.close(self.fd)
+        return True
+
+
+class RunControls(_Requests[Event | str]):
+    """Passes requests to one run; once the run is over, requests do nothing."""
+
     def hold(self, frames: int) -> None:
         """Release `frames` more frames now, and no others until the next call; `ALL` ends the hold."""
-        self._ask(Hold(frames))
+        self._put(Hold(frames))
 
     def stop(self) -> None:
         """Finish the frames in flight, and end the run."""
-        self._ask(Stop())
+        self._put(Stop())
 
     def kill(self, unit: str) -> None:
         """End the process of `unit` at once; the scheduler starts the unit again."""
-        with self._lock:
-            if not self._closed:
-                self._kills.append(unit)
-                os.eventfd_write(self.fd, 1)
+        self._put(unit)
 
     def taken(self) -> tuple[list[Event], list[str]]:
         """Return (requested events, names of units to kill) since the last call; called by the run."""
-        with self._lock:
-            taken = self._events, self._kills
-            self._events, self._kills = [], []
-            return taken
+        taken = self._take()
+        return [each for each in taken if not isinstance(each, str)], [each for each in taken if isinstance(each, str)]
 
     def close(self) -> None:
         """Note that the run is over; called by the run."""
-        with self._lock:
-            if not self._closed:
-                self._closed = True
-                os.close(self.fd)
-
-    def _ask(self, event: Event) -> None:
-        with self._lock:
-            if not self._closed:
-                self._events.append(event)
-                os.eventfd_write(self.fd, 1)
+        self._close()
 
 
-class FrameRequestQueue:
+class FrameRequestQueue(_Requests[Event]):
     """Passes frame requests to one run; frames are numbered from 0 in the order of the requests.
 
     `answered(frame)`: function that is called with the number of each presented frame.
     `ended()`: function that is called when the run is over; after it `answered` is not called any more.
     `unanswered(causes)`: function that is called once, when the first frames were dropped or lost. `causes`: number of
     these frames by the cause's key in the report.
-    `fd`: descriptor that becomes readable with each request.
     `is_open`: `threading.Event` that is set when the run begins to take requests, and also when the run is over.
     """
 
@@ -91,13 +100,10 @@ class FrameRequestQueue:
         ended: Callable[[], None],
         unanswered: Callable[[Mapping[str, int]], None] = lambda _causes: None,
     ) -> None:
-        self.fd = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        super().__init__()
         self.is_open = threading.Event()
         self.answered, self._ended, self._unanswered = answered, ended, unanswered
         self._told = False
-        self._events: deque[Event] = deque()
-        self._lock = threading.Lock()
-        self._closed = False
 
     def request(self, count: int = 1) -> None:
         """Ask for `count` frames; once the run is over, do nothing."""
@@ -109,11 +115,7 @@ class FrameRequestQueue:
 
     def events(self) -> list[Event]:
         """Return the requests since the last call, as events of the scheduler."""
-        events: list[Event] = []
-        with contextlib.suppress(IndexError):
-            while True:
-                events.append(self._events.popleft())
-        return events
+        return self._take()
 
     def tell_unanswered(self, causes: Mapping[str, int]) -> None:
         """Call `unanswered` the first time that there are dropped or lost frames. `causes`: their number by cause."""
@@ -123,19 +125,9 @@ class FrameRequestQueue:
 
     def close(self) -> None:
         """Note that the run is over: call `ended`, and set `is_open`, so that no thread waits any longer."""
-        with self._lock:
-            if self._closed:
-                return
-            self._closed = True
-            os.close(self.fd)
-        self._ended()
-        self.is_open.set()
-
-    def _put(self, event: Event) -> None:
-        with self._lock:
-            if not self._closed:
-                self._events.append(event)
-                os.eventfd_write(self.fd, 1)
+        if self._close():
+            self._ended()
+            self.is_open.set()
 
 
 class Interrupts:

@@ -18,8 +18,9 @@ job explains a part of this time, another program had the core, or a thread of a
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Iterator, Mapping, Reversible, Sequence
+from operator import attrgetter
 from typing import Any, Final, NamedTuple
 
 from trilane.pipeline.timeline import Down, ExplainedJob, Span
@@ -57,16 +58,13 @@ class Sharing:
     """Computes which stages had a core while the jobs of another stage had none.
 
     `cores`: numbers of the cores of each unit; a unit whose cores are not known is missing.
-    `delay`: number of further jobs after whose end a job is counted. By then, all jobs that ran at the same time must
-    have ended.
     """
 
-    def __init__(self, cores: Mapping[str, Sequence[int]], delay: int = DELAY) -> None:
+    def __init__(self, cores: Mapping[str, Sequence[int]]) -> None:
         self._beside = {
             unit: [other for other in cores if other != unit and set(cores[other]) & set(own)]
             for unit, own in cores.items()
         }
-        self._delay = delay
         self._waiting: deque[JobRecord] = deque()
         self._jobs: dict[str, list[JobRecord]] = {unit: [] for unit in cores}
         self._sums: dict[str, Taken] = {}
@@ -76,10 +74,10 @@ class Sharing:
         if self._beside.get(job.unit):
             of_unit = self._jobs[job.unit]
             of_unit.append(job)
-            if len(of_unit) > 4 * self._delay:
-                del of_unit[: 2 * self._delay]
+            if len(of_unit) > 4 * DELAY:
+                del of_unit[: 2 * DELAY]
         self._waiting.append(job)
-        if len(self._waiting) > self._delay:
+        if len(self._waiting) > DELAY:
             self._count(self._waiting.popleft())
 
     def close(self) -> dict[str, Taken]:
@@ -101,10 +99,13 @@ class Sharing:
         ran_ns: dict[str, int] = {}
         for other in self._beside.get(unit, ()):
             of_other = self._jobs[other]
-            for job in of_other[bisect_right(of_other, begin_ns, key=_end_ns) :]:
+            for job in of_other[bisect_right(of_other, begin_ns, key=attrgetter("end_ns")) :]:
                 if job.begin_ns >= end_ns:
                     break
-                ran_ns[job.stage] = ran_ns.get(job.stage, 0) + _within_ns(job, begin_ns, end_ns)
+                ns, length_ns = min(job.end_ns, end_ns) - max(job.begin_ns, begin_ns), job.end_ns - job.begin_ns
+                # The job's sleep, and its time without a core, are assumed to be spread evenly over the job.
+                ran = ns * max(length_ns - job.preempted_ns - job.asleep_ns, 0) // length_ns if ns > 0 else 0
+                ran_ns[job.stage] = ran_ns.get(job.stage, 0) + ran
         total_ns = sum(ran_ns.values())
         of_others_ns = min(lacked_ns, total_ns)
         return {stage: of_others_ns * ns // total_ns for stage, ns in ran_ns.items() if ns}
@@ -119,20 +120,6 @@ class Sharing:
             was.preempted_ns + job.preempted_ns,
             {stage: was.of.get(stage, 0) + taken.get(stage, 0) for stage in {**was.of, **taken}},
         )
-
-
-def _end_ns(job: JobRecord) -> int:
-    return job.end_ns
-
-
-def _within_ns(job: JobRecord, begin_ns: int, end_ns: int) -> int:
-    """Return the time in ns for which `job` ran between two times.
-
-    The job's sleep, and its time without a core, are assumed to be spread evenly over the job.
-    """
-    ns = min(job.end_ns, end_ns) - max(job.begin_ns, begin_ns)
-    length_ns = job.end_ns - job.begin_ns
-    return ns * max(length_ns - job.preempted_ns - job.asleep_ns, 0) // length_ns if ns > 0 else 0
 
 
 WORK, TAKEN, ASLEEP, RELEASE, STOPPED, STALLED = "work", "taken", "asleep", "release", "stopped", "stalled"
@@ -253,7 +240,8 @@ class Paths:
             before, released = self._bound_by(now)
             from_ns = until_ns if before is None else max(min(before.job.end_ns, job.begin_ns), until_ns)
             for piece in self._gap(now, from_ns, released, before is None):
-                yield from _clipped(piece, until_ns)
+                if piece.end_ns > max(piece.begin_ns, until_ns):
+                    yield piece._replace(begin_ns=max(piece.begin_ns, until_ns))
             now, end_ns = before, from_ns
 
     def _gap(self, now: ExplainedJob, from_ns: int, released: bool, is_first: bool) -> Iterator[Piece]:
@@ -275,10 +263,7 @@ class Paths:
             yield from _divided(now, from_ns, HELD if is_latched else self._overhead(now, from_ns))
 
     def _overhead(self, now: ExplainedJob, from_ns: int) -> str:
-        """Return the kind (STALLED, STOPPED or OVERHEAD) of time before a job that has no cause of `OF_GAPS`.
-
-        `from_ns`: begin of the gap that ends with the begin of `now`.
-        """
+        """Return the kind (STALLED, STOPPED or OVERHEAD) of time since `from_ns` that has no cause of `OF_GAPS`."""
         begin_ns = now.job.begin_ns
         for stall in reversed(self._stalls):
             if stall.end_ns <= from_ns:
@@ -288,12 +273,9 @@ class Paths:
         return STOPPED if from_ns < now.stopped_ns <= begin_ns else OVERHEAD
 
     def _unreleased(self, job: JobRecord, from_ns: int, end_ns: int) -> Iterator[Piece]:
-        """Yield the pieces of the time before a frame was released, the latest piece first.
+        """Yield the pieces of the time before the frame of its first job `job` was released, the latest piece first.
 
         Time in which a unit was down is a piece of kind DOWN, because it explains why no earlier frame was presented.
-
-        `job`: first job of the frame.
-        `from_ns`, `end_ns`: begin and end of the time.
         """
         for down in reversed(self._downs):
             if end_ns <= from_ns or down.end_ns <= from_ns:
@@ -307,10 +289,7 @@ class Paths:
         yield Piece(RELEASE, job.stage, job, from_ns, end_ns)
 
     def _bound_by(self, now: ExplainedJob) -> tuple[ExplainedJob | None, bool]:
-        """Return (job whose end let `now` begin, whether `now` also waited for its frame's release).
-
-        The job is None if it is not known.
-        """
+        """Return (job whose end let `now` begin, None if unknown; whether `now` also waited for its release)."""
         key, job = now.key, now.job
         own = [self._before.get(key), self._input.get(key)]
         mine = self._jobs.get(own[0]) if own[0] else None
@@ -335,12 +314,9 @@ class Paths:
 
 
 def _divided(now: ExplainedJob, from_ns: int, rest: str) -> Iterator[Piece]:
-    """Yield the gap before a job as one piece for each cause, the latest piece first.
+    """Yield the gap before a job, which begins at `from_ns`, as one piece for each cause, the latest piece first.
 
-    The true order of the causes is not known. The time without a cause becomes the latest piece.
-
-    `from_ns`: begin of the gap.
-    `rest`: kind of the time without a cause.
+    The true order of the causes is not known. The time without a cause is of kind `rest`, and becomes the latest piece.
     """
     end_ns = now.job.begin_ns
     left_ns = end_ns - from_ns
@@ -353,11 +329,6 @@ def _divided(now: ExplainedJob, from_ns: int, rest: str) -> Iterator[Piece]:
         if ns > 0:
             yield Piece(cause, now.job.stage, now.job, end_ns - ns, end_ns)
             end_ns -= ns
-
-
-def _clipped(piece: Piece, until_ns: int) -> Iterator[Piece]:
-    if piece.end_ns > max(piece.begin_ns, until_ns):
-        yield piece._replace(begin_ns=max(piece.begin_ns, until_ns))
 
 
 #: The kind of a piece, and its stage.
@@ -393,14 +364,10 @@ def parts(piece: Piece, begin_ns: int, end_ns: int, sharing: Sharing | None = No
 
 
 def _divided_preempted(stage: str, ns: int, taken: Mapping[str, int], lacked_ns: int) -> dict[Part, int]:
-    """Divide a part of a job's time without a core among the stages that had the core; return ns by (kind, stage).
+    """Divide `ns` of the `lacked_ns` in which a job of `stage` had no core; return ns by (kind, stage).
 
-    Each stage has the same share of `ns` as of `lacked_ns`. Time that no stage explains counts as preempted.
-
-    `stage`: stage of the job.
-    `ns`: length of the part in ns.
-    `taken`: part of `lacked_ns` in which each stage had the core, in ns.
-    `lacked_ns`: the job's whole time without a core, in ns.
+    `taken`: part of `lacked_ns` in which each other stage had the core, in ns. Each has the same share of `ns`. Time
+    that no stage explains counts as preempted.
     """
     found = {(TAKEN, other): ns * of_other // lacked_ns for other, of_other in taken.items()}
     left_ns = ns - sum(found.values())
@@ -424,10 +391,10 @@ class Budget:
         self._since: deque[int] = deque()
         self._from_ns: int | None = None
         self._newest: ExplainedJob | None = None
-        self._blocks: list[dict[Part, int]] = []  # one for each run of the same number of frames, in order
+        self._blocks: list[Counter[Part]] = []  # one for each run of the same number of frames, in order
         self._merged = 1  # number of blocks that were merged into one
-        self._open: list[dict[Part, int]] = []
-        self.ns_of: dict[Part, int] = {}
+        self._open: list[Counter[Part]] = []
+        self.ns_of: Counter[Part] = Counter()
 
     def present(self, shown: ExplainedJob) -> None:
         """Add the job that presented the next frame."""
@@ -486,7 +453,7 @@ class Budget:
 
         `name_of`: name of each part of the path, from `names`.
         """
-        share = _by_name(self.ns_of, name_of).get(name, 0) / sum(self.ns_of.values())
+        share = _by_name(self.ns_of, name_of)[name] / sum(self.ns_of.values())
         half = self._half_width(name_of, name)
         low, high = (None, None) if half is None else (max(share - half, 0.0), min(share + half, 1.0))
         return {"name": name, "share": share, "share_low": low, "share_high": high}
@@ -494,8 +461,7 @@ class Budget:
     def shares(self, name_of: Mapping[Part, str]) -> dict[str, float]:
         """Return the share of each name in the path (0 to 1), the largest first. `name_of`: as for `share`."""
         total = sum(self.ns_of.values())
-        sums = _by_name(self.ns_of, name_of)
-        return {name: ns / total for name, ns in sorted(sums.items(), key=lambda row: -row[1])}
+        return {name: ns / total for name, ns in _by_name(self.ns_of, name_of).most_common()}
 
     def _half_width(self, name_of: Mapping[Part, str], name: str, other: str = "") -> float | None:
         """Return half the 95 % interval of the share of `name`, less the share of `other` if one is given.
@@ -514,13 +480,13 @@ class Budget:
         assert self._newest is not None
         assert self._from_ns is not None
         bounds = [*zip([self._from_ns, *ends_ns], ends_ns, strict=False)]
-        blocks: list[dict[Part, int]] = [{} for _ in bounds]
+        blocks: list[Counter[Part]] = [Counter() for _ in bounds]
         for piece in self._paths.walk(self._newest, self._from_ns):
             for block, (begin_ns, end_ns) in zip(blocks, bounds, strict=True):
                 if piece.begin_ns < end_ns and piece.end_ns > begin_ns:
-                    _add(block, parts(piece, begin_ns, end_ns, self._sharing))
+                    block.update(parts(piece, begin_ns, end_ns, self._sharing))
         for block in blocks:
-            _add(self.ns_of, block)
+            self.ns_of.update(block)
         self._from_ns = ends_ns[-1]
         self._open += blocks if is_whole else blocks[:-1]
         self._keep()
@@ -528,26 +494,21 @@ class Budget:
     def _keep(self) -> None:
         """Store whole blocks. When there are MOST_BLOCKS, merge them in pairs of neighbours."""
         while len(self._open) >= self._merged:
-            block: dict[Part, int] = {}
+            block: Counter[Part] = Counter()
             for each in self._open[: self._merged]:
-                _add(block, each)
+                block.update(each)
             del self._open[: self._merged]
             self._blocks.append(block)
             if len(self._blocks) == MOST_BLOCKS:
                 for even, odd in zip(self._blocks[::2], self._blocks[1::2], strict=True):
-                    _add(even, odd)
+                    even.update(odd)
                 self._blocks = self._blocks[::2]
                 self._merged *= 2
 
 
-def _add(sums: dict[Part, int], more: Mapping[Part, int]) -> None:
-    for part, ns in more.items():
-        sums[part] = sums.get(part, 0) + ns
-
-
-def _by_name(ns_of: Mapping[Part, int], name_of: Mapping[Part, str]) -> dict[str, int]:
-    sums: dict[str, int] = {}
+def _by_name(ns_of: Mapping[Part, int], name_of: Mapping[Part, str]) -> Counter[str]:
+    sums: Counter[str] = Counter()
     for part, ns in ns_of.items():
         if part in name_of:
-            sums[name_of[part]] = sums.get(name_of[part], 0) + ns
+            sums[name_of[part]] += ns
     return sums

@@ -67,12 +67,10 @@ def _begins_with_frame_fields(dtype: np.dtype[Any]) -> bool:
     return [(name, dtype[name]) for name in names] == [(name, np.dtype(field)) for name, field in FRAME_FIELDS]
 
 
-def _header_text(dtype: np.dtype[Any]) -> str:
-    return repr(np.lib.format.dtype_to_descr(dtype))
-
-
 HeaderDtype = Annotated[
-    np.dtype[Any], PlainValidator(_header), PlainSerializer(_header_text, return_type=str, when_used="json")
+    np.dtype[Any],
+    PlainValidator(_header),
+    PlainSerializer(lambda dtype: repr(np.lib.format.dtype_to_descr(dtype)), return_type=str, when_used="json"),
 ]
 
 
@@ -211,16 +209,10 @@ class Pipeline(Described):
             if count > MOST_EDGES:
                 raise UnexpectedValue(f"unit {unit} at {count} edges", f"at most {MOST_EDGES}", "use more units")
         if self.bypass is not None:
-            self._check_headers(self.edges_into(self.bypass[1]))
-
-    def _check_headers(self, names: tuple[str, ...]) -> None:
-        """Raise UnexpectedValue if edges that meet at the end of a bypass have different headers.
-
-        `names`: names of these edges.
-        """
-        headers = {edge.header for name, edge in zip(self.edge_names, self.edges, strict=True) if name in names}
-        if len(headers) > 1:
-            raise UnexpectedValue(f"different headers of edges {', '.join(names)}", "one, as a bypass joins them")
+            names = self.edges_into(self.bypass[1])
+            headers = {edge.header for name, edge in zip(self.joints, self.edges, strict=True) if name in names}
+            if len(headers) > 1:
+                raise UnexpectedValue(f"different headers of edges {', '.join(names)}", "one, as a bypass joins them")
 
     def graph(self) -> Graph:
         """Return the graph of the pipeline for the scheduler."""
@@ -320,42 +312,26 @@ def tables_of(
     joints = list(pipeline.joints.values())
     rules = {before.name: edge.rule for (before, _), edge in zip(joints, pipeline.edges, strict=True)}
     sizes = {before.name: edge.payload_bytes for (before, _), edge in zip(joints, pipeline.edges, strict=True)}
-    alike = len(set(rules.values())) == 1
-    tables = {
-        "run": {**run, "latency_to": pipeline.latency_to or pipeline.stages[-1].name},
-        "stages": {
-            stage.name: _stage(pipeline, place, sizes.get(stage.name, 0), times_ms)
-            for place, stage in enumerate(pipeline.stages)
-        },
-    }
+    stages: dict[str, dict[str, Any]] = {}
+    for place, stage in enumerate(pipeline.stages):
+        keys = stages[stage.name] = {"python": stage.factory, "unit": stage.unit}
+        if reads := _reads(pipeline, place):
+            keys["in"] = reads
+        if size := sizes.get(stage.name):
+            keys["out"] = f"u8 {size}"
+        if stage.every > 1:
+            keys["every"] = stage.every
+        if stage.name in times_ms:
+            keys["time_ms"] = times_ms[stage.name]
     if pipeline.bypass is not None:
         begin, end = pipeline.bypass
-        tables["stages"][begin]["bypass"] = {"to": end, **taken} if taken else end
-    if alike:
+        stages[begin]["bypass"] = {"to": end, **taken} if taken else end
+    tables = {"run": {**run, "latency_to": pipeline.latency_to or pipeline.stages[-1].name}, "stages": stages}
+    if len({*rules.values()}) == 1:
         tables["run"]["edge"] = next(iter(rules.values()))
     elif rules:
         tables["edges"] = rules
     return tables
-
-
-def _stage(pipeline: Pipeline, place: int, payload_bytes: int, times_ms: Mapping[str, float]) -> dict[str, Any]:
-    """Return the keys of the table of one stage.
-
-    `place`: index of the stage.
-    `payload_bytes`: size of its output; 0: it has none.
-    `times_ms`: mean time of a job of each stage, in ms.
-    """
-    stage = pipeline.stages[place]
-    keys: dict[str, Any] = {"python": stage.factory, "unit": stage.unit}
-    if reads := _reads(pipeline, place):
-        keys["in"] = reads
-    if payload_bytes:
-        keys["out"] = f"u8 {payload_bytes}"
-    if stage.every > 1:
-        keys["every"] = stage.every
-    if stage.name in times_ms:
-        keys["time_ms"] = times_ms[stage.name]
-    return keys
 
 
 def _reads(pipeline: Pipeline, place: int) -> str | dict[str, Any] | None:
@@ -363,7 +339,7 @@ def _reads(pipeline: Pipeline, place: int) -> str | dict[str, Any] | None:
 
     In a chain the value is the name of the stage before; in a graph it is a table with a key for each stage read.
     """
-    stage: PipelineStage = pipeline.stages[place]
+    stage = pipeline.stages[place]
     if stage.inputs is None:
         return pipeline.stages[place - 1].name if place else None
     reads: dict[str, Any] = {}

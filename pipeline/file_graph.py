@@ -107,19 +107,16 @@ def edge_rules(file: PipelineFile, times_ns: Mapping[str, int] | None = None) ->
     given = {name: file.run.edge for name in file.readers} if file.run.edge else {}
     given |= file.edges
     rules = {name: given.get(name, DEFAULT_EDGE) for name in file.readers}
-    graph, in_flight, times_ns = graph_of(file, rules), in_flight_of(file), times_ns or _own_times_ns(file)
-    if not times_ns:
+    graph, in_flight = graph_of(file, rules), in_flight_of(file)
+    if times_ns is None:
+        known = {name: time.mean_ms for name, stage in file.stages.items() if (time := stage.own_time) is not None}
+        times_ns = {name: round(ms * NS_PER_MS) for name, ms in known.items()}
+    if len(times_ns) < len(file.stages):
         apart = tuple(replace(stage, unit=stage.name) for stage in graph.stages)
         graph, in_flight, times_ns = replace(graph, stages=apart), 0, dict.fromkeys(file.stages, 1)
     slots = fewest_slots(graph, times_ns, given, in_flight)
     pairs = zip(rules, slots, strict=True)
     return rules | {name: f"fifo:{count}" for name, count in pairs if name not in given and count > LEAST_SLOTS}
-
-
-def _own_times_ns(file: PipelineFile) -> dict[str, int]:
-    """Return the mean time of a job of each stage in ns; empty if the file does not state the times of all stages."""
-    known = {name: time.mean_ms for name, stage in file.stages.items() if (time := stage.own_time) is not None}
-    return {name: round(ms * NS_PER_MS) for name, ms in known.items()} if len(known) == len(file.stages) else {}
 
 
 def in_flight_of(file: PipelineFile) -> int:

@@ -91,7 +91,7 @@ def _as_tuple(value: object) -> object:
 EdgeRule = Annotated[str, AfterValidator(_rule)]
 Rate = Annotated[float, Field(ge=0.001, le=1e6, allow_inf_nan=False)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
-Side = Annotated[int, Field(ge=1, le=LONGEST_SIDE)]
+Ms = Annotated[float, Field(ge=0, le=LONGEST_MS, allow_inf_nan=False)]
 
 
 class Arrivals(Keys):
@@ -153,14 +153,10 @@ class PortType:
 
     @property
     def payload_bytes(self) -> int:
-        return math.prod(self.shape) * _bytes_of(self.dtype)
+        return math.prod(self.shape) * (1 if self.dtype == "bool" else int(self.dtype[1:]) // 8)
 
     def __str__(self) -> str:
         return " ".join([self.dtype, "x".join(map(str, self.shape))]).strip()
-
-
-def _bytes_of(dtype: str) -> int:
-    return 1 if dtype == "bool" else int(dtype[1:]) // 8
 
 
 def port_type(text: object) -> PortType:
@@ -178,10 +174,7 @@ def port_type(text: object) -> PortType:
 
 
 def _ports(value: object) -> object:
-    """Return the type of each port that a stage writes, by the port's name; a single port has an empty name.
-
-    `value`: value of the key `out`.
-    """
+    """Return the type of each port in a value of the key `out`, by name; a single port has an empty name."""
     if not isinstance(value, dict):
         return {"": port_type(value)}
     if not value:
@@ -242,13 +235,10 @@ def read_input(port: str, value: object) -> PortInput:
 
     Raises UnexpectedValue or pydantic's ValidationError.
     """
-    if isinstance(value, dict):
-        keys = InputKeys.model_validate(value)
-    elif isinstance(value, str):
-        keys = InputKeys.model_validate({"from": value})
-    else:
+    if not isinstance(value, dict | str):
         expected = "a stage, stage.port, or a table { from, sync, max_age_ms }"
         raise UnexpectedValue(shown(value), expected, 'such as in = "camera"')
+    keys = InputKeys.model_validate({"from": value} if isinstance(value, str) else value)
     stage, dot, from_port = keys.source.partition(".")
     if not stage or (dot and not from_port):
         raise UnexpectedValue(repr(keys.source), "a stage, or stage.port", "write both names, or the stage alone")
@@ -265,10 +255,7 @@ def _inside(text: str) -> str:
 
 
 def _mp4(text: str) -> str:
-    """Return the path `text`. Raise UnexpectedValue if it does not end with .mp4.
-
-    Without this rule, a run could replace code or a network in the folder.
-    """
+    """Return `text` if it ends with .mp4: otherwise a run could replace code or a network in the folder."""
     if not text.endswith(".mp4"):
         raise UnexpectedValue(repr(text), "a video to write, such as out.mp4", "let the name end with .mp4")
     return text
@@ -283,20 +270,12 @@ class StageTime(Keys):
     `sd` belongs to `mean`, and `name` to `source`. `pipeline_file.py` replaces `source` by the times of that file.
     """
 
-    mean: float | None = Field(default=None, ge=0, le=LONGEST_MS, allow_inf_nan=False, description="Mean time, ms.")
-    sd: float = Field(
-        default=0.0,
-        ge=0,
-        le=LONGEST_MS,
-        allow_inf_nan=False,
-        description="Standard deviation, ms, with the key mean; times are lognormal.",
+    mean: Ms | None = Field(default=None, description="Mean time, ms.")
+    sd: Ms = Field(default=0.0, description="Standard deviation, ms, with the key mean; times are lognormal.")
+    exponential: Ms | None = Field(default=None, description="Mean of exponential times, ms.")
+    samples: Annotated[tuple[Ms, ...], BeforeValidator(_as_tuple)] = Field(
+        default=(), description="Measured times, ms; each frame draws one of them."
     )
-    exponential: float | None = Field(
-        default=None, ge=0, le=LONGEST_MS, allow_inf_nan=False, description="Mean of exponential times, ms."
-    )
-    samples: Annotated[
-        tuple[Annotated[float, Field(ge=0, le=LONGEST_MS, allow_inf_nan=False)], ...], BeforeValidator(_as_tuple)
-    ] = Field(default=(), description="Measured times, ms; each frame draws one of them.")
     source: InsidePath | None = Field(
         default=None, alias="from", description="File of another tool with the times, in this folder."
     )
@@ -406,8 +385,10 @@ class BypassKeys(Keys):
         return int.from_bytes(drawn) < (self.share or 0.0) * (1 << 64)
 
 
-def _size(text: str) -> tuple[int, int]:
-    """Return (width, height) in pixels from a text such as `640x480`."""
+def _size(text: object) -> object:
+    """Return (width, height) in pixels from a text such as `640x480`; another value stays as it is."""
+    if not isinstance(text, str):
+        return text
     found = re.fullmatch(r"(\d{1,9})x(\d{1,9})", text)
     if found is None:
         raise UnexpectedValue(repr(text), "WIDTHxHEIGHT in pixels, such as 640x480")
@@ -417,13 +398,7 @@ def _size(text: str) -> tuple[int, int]:
     return sides
 
 
-def _read_size(value: object) -> object:
-    return _size(value) if isinstance(value, str) else value
-
-
-Size = Annotated[tuple[int, int], BeforeValidator(_read_size)]
-
-
+Size = Annotated[tuple[int, int], BeforeValidator(_size)]
 SIZE_HELP = "Width and height in pixels, such as '640x480'"
 
 
@@ -599,7 +574,7 @@ class DiscardBlock(BlockStage):
 class BusyBlock(BlockStage):
     """An artificial load."""
 
-    load_ms: float = Field(ge=0, le=LONGEST_MS, allow_inf_nan=False, description="How long a job works, ms.")
+    load_ms: Ms = Field(description="How long a job works, ms.")
 
     @property
     def own_time(self) -> StageTime | None:

@@ -81,11 +81,7 @@ def serve(requests: socket.socket) -> None:
 
 
 def _reap(codes: dict[int, int], options: int) -> None:
-    """Reap the units that have ended, and write their exit codes to their pipes.
-
-    `codes`: pipe of each living unit, by process id.
-    `options`: options of waitpid. WNOHANG: reap only units that have ended already; 0: wait for all units.
-    """
+    """Reap the units that have ended, and write their exit codes to their pipes. `options`: options of waitpid."""
     with contextlib.suppress(ChildProcessError):
         while (ended := os.waitpid(-1, options))[0]:
             writes = codes.pop(ended[0])
@@ -95,11 +91,7 @@ def _reap(codes: dict[int, int], options: int) -> None:
 
 
 def _run_unit(request: dict[str, Any], fds: Sequence[int]) -> int:
-    """Run the whole life of a unit in the forked process, and return its exit code.
-
-    `request`: JSON object of the request: name, cores and threads of the unit, and names of its descriptors.
-    `fds`: descriptors of the request.
-    """
+    """Run the whole life of a unit in the forked process, and return its exit code."""
     try:
         spec_fd, stderr_fd, lifeline, *passed = fds
         _die_with(lifeline)
@@ -123,10 +115,7 @@ def _run_unit(request: dict[str, Any], fds: Sequence[int]) -> int:
 
 
 def _call(request: dict[str, Any], fds: Sequence[int], server_pid: int) -> int:
-    """In a forked process, call the function `request["call"]`, and write its result to `fds[0]` as JSON.
-
-    Return the exit code of the process.
-    """
+    """Call the function `request["call"]`, write its result to `fds[0]` as JSON, and return the process's exit code."""
     _leave_server()
     die_with_parent(server_pid)
     module, _, name = request["call"].partition(":")

@@ -39,7 +39,7 @@ import struct
 import time
 from collections.abc import Callable, Sequence, Set
 from contextlib import closing
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 from trilane import machine
 from trilane.transport.messages import Done
@@ -203,19 +203,6 @@ HELD_NS: Final = 100_000  # longer than a hand-over takes
 JOBS_PER_LOOK: Final = 64  # jobs between two searches for new threads, if no job loses time
 
 
-class Meter(Protocol):
-    """The methods of `CoreMeter` that a `JobClock` uses."""
-
-    @property
-    def threads(self) -> int: ...
-
-    def cpu_ns(self) -> int: ...
-
-    def delay_ns(self) -> int: ...
-
-    def look(self) -> None: ...
-
-
 class JobClock:
     """Measures the jobs of a unit.
 
@@ -224,7 +211,9 @@ class JobClock:
     `now_ns`: function that returns the time in ns.
     """
 
-    def __init__(self, meter: Meter, cores: int, stages: int, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
+    def __init__(
+        self, meter: CoreMeter, cores: int, stages: int, now_ns: Callable[[], int] = time.monotonic_ns
+    ) -> None:
         self._meter, self._cores, self._now_ns = meter, cores, now_ns
         self._loses = [False] * stages  # whether the stage's last job may have lost more than LOSS_NS
         self._used_cores = 1  # most cores that the present threads use at a time

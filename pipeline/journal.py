@@ -376,10 +376,7 @@ _Checks = tuple[tuple[Callable[[Any], Any], ...], ...]
 
 
 def _checks(run: RunValues) -> _Checks:
-    """Return one function for each field of each type of record, in the order of RECORDS.
-
-    Each function takes a field's value from the file, and returns the checked value.
-    """
+    """Return functions that check, and return, the fields of each type of record, in the order of RECORDS."""
     of: dict[type[Any], tuple[Callable[[Any], Any], ...]] = {
         Begun: (),
         Stepped: (run.step_ns, run.events, run.actions),

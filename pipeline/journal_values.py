@@ -189,10 +189,7 @@ class RunValues:
         return found
 
     def _check_row(self, row: tuple[Any, ...]) -> None:
-        """Check that a row names only units and stages of the graph, and that its numbers are in range.
-
-        `row`: row of an event or action, whose types are already checked.
-        """
+        """Check that a row of checked types names only units and stages of the graph, with numbers in range."""
         unit, stage = _NAMED.get(row[0], (0, 0))
         if unit and row[unit] not in self._units:
             raise _unknown("unit", row[unit], self._units)
@@ -213,25 +210,20 @@ class RunValues:
         fields: tuple[Any, ...] = row
         stage, unit, frame, ready_ns, dispatch_ns, begin_ns, end_ns, *lost = fields
         if self._unit_of.get(stage) != unit:
-            self._refuse_place(stage, unit)
+            if stage not in self._unit_of:
+                raise _unknown("stage", stage, self._unit_of)
+            raise UnexpectedValue(f"stage {stage!r} on unit {self.unit(unit)!r}", f"unit {self._unit_of[stage]!r}")
         if (
             min(ready_ns, dispatch_ns, begin_ns, *lost) < 0
             or not max(ready_ns, dispatch_ns, begin_ns) <= end_ns <= NEVER
         ):
             raise UnexpectedValue(f"job {shown(row)}", f"times from 0 to its end, and that at most {NEVER} ns")
-        if max(lost) > NEVER or not self._last_frame[stage] < frame <= NEVER:
-            last = self._last_frame[stage]
-            raise UnexpectedValue(
-                f"frame {frame} of stage {stage!r}", f"one after its last, {last}: no job comes twice"
-            )
+        last = self._last_frame[stage]
+        if max(lost) > NEVER or not last < frame <= NEVER:
+            expected = f"one after its last, {last}: no job comes twice"
+            raise UnexpectedValue(f"frame {frame} of stage {stage!r}", expected)
         self._last_frame[stage] = frame
         return job
-
-    def _refuse_place(self, stage: str, unit: str) -> None:
-        if stage not in self._unit_of:
-            raise _unknown("stage", stage, self._unit_of)
-        self.unit(unit)
-        raise UnexpectedValue(f"stage {stage!r} on unit {unit!r}", f"unit {self._unit_of[stage]!r}")
 
 
 def _rows(rows: Any) -> tuple[Any, ...]:

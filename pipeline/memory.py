@@ -127,11 +127,7 @@ def map_assets(fd: int) -> dict[str, NDArray[Any]]:
 
 
 def _index(assets: Assets) -> tuple[dict[str, dict[str, Any]], int]:
-    """Return (index, end of the last array in bytes).
-
-    The index has `dtype`, `shape` and `offset` of each array, by the array's name. Offsets are bytes from the begin of
-    the first page after the index.
-    """
+    """Return (`dtype`, `shape` and `offset` in bytes of each array, by its name; end of the last array in bytes)."""
     index, offset = {}, 0
     for name, array in assets.items():
         if array.dtype.kind not in _KINDS:
@@ -226,13 +222,7 @@ def add_bytes(report: dict[str, Any], sums: Mapping[str, Mapping[str, float]]) -
 
 
 def _per_frame(sums: Mapping[str, float], frames: int) -> dict[str, float | None]:
-    """Return the mean bytes per frame by the keys of `NAMES`, and `ratio`: all moved bytes over the least.
-
-    `ratio` is None if the least is 0.
-
-    `sums`: sums over the run, by metric.
-    `frames`: number of presented frames.
-    """
+    """Return the mean bytes per frame by the keys of `NAMES`, and `ratio`: all moved bytes over the least, or None."""
     least = sums[NAMES[_LEAST]]
     means = {key: sums[name] / frames for key, name in NAMES.items()}
     return {**means, "ratio": _moved(sums) / least if least else None}

@@ -14,7 +14,6 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from difflib import get_close_matches
-from heapq import heapify, heappop, heappush
 from math import lcm
 from pathlib import Path
 from posixpath import normpath
@@ -219,16 +218,14 @@ def checked_tables(tables: Mapping[str, Any], path: Path) -> PipelineFile:
         for name in _table(tables, table, path):
             if not re.fullmatch(NAME, name):
                 raise BadInputError(f"{path}: {table}", f"the name {shown(name)}", FORMS[NAME], "choose another name")
-    stages = {name: _stage(name, keys, path) for name, keys in written.items()}
-    stages = _in_order(stages, path)
-    named = list(dict.fromkeys(stage.unit for stage in stages.values()))
+    stages = _in_order({name: _stage(name, keys, path) for name, keys in written.items()}, path)
     for name, stage in stages.items():
         if meant := _slip(stage.unit, [*units, *UNITS]):
             where, found = f"{path}: stages.{name}.unit", f"the unknown unit {stage.unit!r}"
             remedy = f"did you mean {meant!r}? if not, add {stage.unit} = {{}} to [units]"
             raise BadInputError(where, found, f"one of {', '.join(dict.fromkeys([*units, *UNITS]))}", remedy)
     edges = _table(tables, "edges", path)
-    used = {name: units.get(name, UnitKeys()) for name in named}
+    used = {stage.unit: units.get(stage.unit, UnitKeys()) for stage in stages.values()}
     file = PipelineFile(path, run, used, stages, edges, tables)
     _check_together(file)
     return file
@@ -242,8 +239,7 @@ def _slip(unit: str, known: Sequence[str]) -> str:
     stem = unit.rstrip("0123456789")
     if unit in known or any(stem == name.rstrip("0123456789") or unit[:-1] == name[:-1] for name in known):
         return ""
-    near = get_close_matches(unit, known, 1, LIKE)
-    return near[0] if near else ""
+    return next(iter(get_close_matches(unit, known, 1, LIKE)), "")
 
 
 def _table(tables: Mapping[str, Any], name: str, path: Path) -> Mapping[str, Any]:
@@ -254,13 +250,7 @@ def _table(tables: Mapping[str, Any], name: str, path: Path) -> Mapping[str, Any
 
 
 def _checked(model: type[AnyKeys], values: object, where: str) -> AnyKeys:
-    """Return a table of the file as an instance of `model`.
-
-    `values`: the table, not checked yet.
-    `where`: place of the table, for the error.
-
-    Raises BadInputError, which names the wrong key.
-    """
+    """Return a table of the file as an instance of `model`. Raises BadInputError, which names the wrong key."""
     if not isinstance(values, dict):
         raise BadInputError(where, shown(values), f"a table with {', '.join(model.known())}", IN_BRACES)
     try:
@@ -273,9 +263,6 @@ def _bad_input(model: type[Keys], error: ValidationError, where: str) -> BadInpu
     """Return the error for one of the defects that pydantic found: an unknown key, else the first defect.
 
     An unknown key may be misspelt, and so explain the other defects.
-
-    `model`: class of the checked table.
-    `where`: place of the table.
     """
     errors = error.errors(include_url=False)
     first = next((each for each in errors if each["type"] == "extra_forbidden"), errors[0])
@@ -304,10 +291,7 @@ def _meaning(model: type[Keys], key: str) -> str:
 
 
 def _stage(name: str, values: object, path: Path) -> StageKeys:
-    """Check the table of one stage, and return the stage as an instance of its kind. Raises BadInputError.
-
-    `name`: name of the stage. `values`: its table, not checked yet. `path`: path of the file.
-    """
+    """Check the table of one stage, and return the stage as an instance of its kind. Raises BadInputError."""
     where = f"{path}: stages.{name}"
     if not isinstance(values, dict):
         expected = "a table with a unit and one of onnx, python, block, time_ms"
@@ -330,19 +314,14 @@ def _stage(name: str, values: object, path: Path) -> StageKeys:
     inputs = _inputs(values["in"], f"{where}.in") if "in" in values else ()
     stage = _with_times(_checked(model, {**values, "in": inputs}, where), f"{where}.time_ms", path.parent)
     _check_ports(stage, where)
-    if isinstance(stage, OnnxStage) and not (path.parent / stage.onnx).is_file():
-        model_path = path.parent / stage.onnx
+    if isinstance(stage, OnnxStage) and not (model_path := path.parent / stage.onnx).is_file():
         found = f"{instead_of_file(model_path)} at {model_path}"
         raise BadInputError(f"{where}.onnx", found, "an ONNX file", f"put {stage.onnx} beside {path.name}")
     return stage
 
 
 def _with_times(stage: StageKeys, where: str, folder: Path) -> StageKeys:
-    """Return the stage; if its `time_ms` names a file, `time_ms` gets the times from this file. Raises BadInputError.
-
-    `where`: place of the key, for the error.
-    `folder`: folder of the pipeline file.
-    """
+    """Return the stage; if `time_ms` names a file, `time_ms` gets the times from this file. Raises BadInputError."""
     time = stage.time_ms
     if time is None or time.source is None:
         return stage
@@ -359,12 +338,11 @@ def time_of(measurement: Measurement) -> StageTime:
 
 
 def _inputs(value: object, where: str) -> tuple[PortInput, ...]:
-    """Return the inputs of a stage.
-
-    `value`: value of its key `in`: a stage, stage.port, or a table of ports.
-    `where`: place of the key, for errors.
-    """
-    ports = value if isinstance(value, dict) and not _is_input(value) else {"": value}
+    """Return the inputs of a stage. `value`: value of its key `in`: a stage, stage.port, or a table of ports."""
+    # A table is one input, such as { from = "camera", sync = "latest" }, or a table of ports.
+    ports = value if isinstance(value, dict) else {"": value}
+    if "from" in ports and ports.keys() <= {*InputKeys.known()}:
+        ports = {"": value}
     if not ports:
         raise BadInputError(where, "an empty table", "a port, such as { frame = 'camera' }", "a source has no `in`")
     found = []
@@ -381,18 +359,8 @@ def _inputs(value: object, where: str) -> tuple[PortInput, ...]:
     return tuple(found)
 
 
-def _is_input(value: Mapping[str, object]) -> bool:
-    """Return whether a table is one input, `{ from = "camera", sync = "latest" }`, and not a table of ports."""
-    return "from" in value and value.keys() <= set(InputKeys.known())
-
-
 def _check_ports(stage: StageKeys, where: str) -> None:
-    """Check the ports through which a stage reads. Raises BadInputError.
-
-    They must be ports of the stage's kind, and include all ports that the kind needs.
-
-    `where`: place of the stage, for errors.
-    """
+    """Check that a stage reads only through ports of its kind, and through all that the kind needs."""
     known = stage.in_ports
     if known is None:
         return
@@ -421,25 +389,16 @@ def _in_order(stages: Mapping[str, StageKeys], path: Path) -> dict[str, StageKey
     """
     for name, stage in stages.items():
         _check_sources(name, stage, stages, path)
-    places = {name: place for place, name in enumerate(stages)}
-    waits = {name: {each.stage for each in stage.inputs} for name, stage in stages.items()}
-    ready = [places[name] for name, sources in waits.items() if not sources]
-    heapify(ready)
-    names, done = list(stages), []
-    while ready:
-        name = names[heappop(ready)]
-        done.append(name)
-        for other, sources in waits.items():
-            if name in sources:
-                sources.remove(name)
-                if not sources:
-                    heappush(ready, places[other])
-    if len(done) < len(names):
-        circle = _circle({name: sources for name, sources in waits.items() if sources})
-        found = f"the circle {' -> '.join(circle)}"
-        remedy = "take one of these inputs away"
-        raise BadInputError(f"{path}: stages.{circle[-1]}.in", found, "stages that do not wait for themselves", remedy)
-    return {name: stages[name] for name in done}
+    left, done = dict(stages), dict[str, StageKeys]()
+    while left:
+        name = next((name for name, stage in left.items() if all(each.stage in done for each in stage.inputs)), "")
+        if not name:
+            circle = _circle(left)
+            where, found = f"{path}: stages.{circle[-1]}.in", f"the circle {' -> '.join(circle)}"
+            remedy = "take one of these inputs away"
+            raise BadInputError(where, found, "stages that do not wait for themselves", remedy)
+        done[name] = left.pop(name)
+    return done
 
 
 def _check_sources(name: str, stage: StageKeys, stages: Mapping[str, StageKeys], path: Path) -> None:
@@ -478,18 +437,16 @@ def _check_sources(name: str, stage: StageKeys, stages: Mapping[str, StageKeys],
         raise BadInputError(f"{path}: stages.{name}.in", found, f"at most {MOST_INPUTS}", "join some of them before")
 
 
-def _circle(waits: Mapping[str, set[str]]) -> list[str]:
-    """Return the names of stages that wait for each other in a circle, in the direction in which frames go.
+def _circle(stages: Mapping[str, StageKeys]) -> list[str]:
+    """Return the names of stages in a circle, in the direction of the frames; the first name comes again at the end.
 
-    The first name comes again at the end.
-
-    `waits`: for each stage, the stages for which it waits.
+    `stages`: stages that each wait for another one of them.
     """
     seen: list[str] = []
-    name = next(iter(waits))
+    name = next(iter(stages))
     while name not in seen:
         seen.append(name)
-        name = next(source for source in sorted(waits[name]) if source in waits)
+        name = min(each.stage for each in stages[name].inputs if each.stage in stages)
     return [name, *reversed(seen[seen.index(name) :])]
 
 
@@ -599,10 +556,7 @@ def assignments(text: str) -> list[str]:
 
 
 def _assigned(tables: Mapping[str, Any], text: str) -> dict[str, Any]:
-    """Return `tables` with one value changed. Raises BadInputError.
-
-    `text`: KEY=VALUE; a VALUE that is no TOML counts as text.
-    """
+    """Return `tables` with one value changed; a value that is no TOML counts as text. Raises BadInputError."""
     key, equals, value = text.partition("=")
     parts = [part.strip() for part in key.split(".")]
     if not equals or not all(parts) or parts[0] not in TABLES or len(parts) < 2:
@@ -617,11 +571,7 @@ def _assigned(tables: Mapping[str, Any], text: str) -> dict[str, Any]:
 
 
 def _check_new_stages(tables: Mapping[str, Any], names: Sequence[str]) -> None:
-    """Raise BadInputError for a new stage without a kind, because its name in --set is probably misspelt.
-
-    `tables`: tables after the assignments.
-    `names`: stages of the file before the assignments.
-    """
+    """Raise BadInputError for a new stage without a kind, because its name in --set is probably misspelt."""
     for name, keys in tables["stages"].items():
         if name not in names and isinstance(keys, dict) and not {*keys} & {*KINDS}:
             expected = f"a stage of the file: {', '.join(names)}"

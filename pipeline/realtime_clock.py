@@ -186,6 +186,7 @@ class RealtimeClock:
 
     `on_progress`: function that is called with (number of presented frames, number of frames of the run); None: none.
     `sketch`: function that makes a sketch, as for `trilane.scheduler.stats.Samples`.
+    `requests`, `controls`: requests for frames, and to the run; None: none.
     `metrics`: sums of each stage's metrics over the jobs that `ended` has returned, by stage and metric.
     `reported`: number of these jobs that reported each metric, by stage and metric.
     `cpu`: CPU time of units and stages in these jobs.
@@ -202,6 +203,7 @@ class RealtimeClock:
         governor: ClockGovernor | None,
         on_progress: Callable[[int, int], None] | None,
         sketch: Callable[[], Sketch] | None = None,
+        controls: RunControls | None = None,
     ) -> None:
         self.metrics: dict[str, dict[str, float]] = defaultdict(dict)
         self.reported: dict[str, Counter[str]] = defaultdict(Counter)
@@ -209,10 +211,10 @@ class RealtimeClock:
         self.first: list[Event] = []
         self._core, self._processes, self._interrupts, self._log = core, processes, interrupts, log
         self._requests, self._governor, self._on_progress = requests, governor, on_progress
+        self._controls = controls
         self._last_stage = core.graph.stages[-1].name
         self._open: dict[int, tuple[Job, int]] = {}
         self._unbooked: list[tuple[Job, int, int | None, Done]] = []
-        self._controls: RunControls | None = None
         self._held = HeldTime()
         self._to_end: set[str] = set()
         self._stopped_ns: dict[str, int] = {}
@@ -220,14 +222,9 @@ class RealtimeClock:
         self._begun = self._stopping = self._is_lost = False
         self._step_ns = self._ping_ns = self._continued = 0
         self._progress_s = 0.0
-        processes.watch(interrupts.fd)
-        if requests is not None:
-            processes.watch(requests.fd)
-
-    def heed(self, controls: RunControls) -> None:
-        """From now on, take requests from `controls`."""
-        self._controls = controls
-        self._processes.watch(controls.fd)
+        for watched in (interrupts, requests, controls):
+            if watched is not None:
+                processes.watch(watched.fd)
 
     def wait(self, deadline_ns: int) -> tuple[int, tuple[Event, ...]]:
         """Wait for an event, until `deadline_ns` at the latest, and return (time in ns, events)."""
@@ -254,7 +251,11 @@ class RealtimeClock:
                 self._to_end.add(action.unit)
                 self._processes.kill(action.unit)
             elif isinstance(action, Start):
-                self._start(action.unit)
+                try:
+                    self._processes.start(action.unit)
+                except (TrilaneError, OSError) as error:  # the next step aborts the run
+                    self._log.fail(str(error))
+                    self._is_lost = True
 
     @property
     def waiting(self) -> int:
@@ -303,14 +304,6 @@ class RealtimeClock:
         if held := self._held.sentence(time.monotonic_ns()):
             self._log.say(held)
         self._show_progress(final=True)
-
-    def _start(self, unit: str) -> None:
-        """Start the unit again; if no process can be made for the unit, the next step aborts the run."""
-        try:
-            self._processes.start(unit)
-        except (TrilaneError, OSError) as error:
-            self._log.fail(str(error))
-            self._is_lost = True
 
     def _begin(self) -> list[Event]:
         self._begun = True
@@ -387,10 +380,7 @@ class RealtimeClock:
             self._log.say(f"unit {unit} was stopped by a signal for about {seconds:.1f} s")
 
     def _tell_stalled(self, ns: int) -> None:
-        """If a signal had stopped this process, log for how long; do nothing if the process only had no core.
-
-        `ns`: time in ns for which the process did nothing.
-        """
+        """If a signal had stopped this process, log for how long; do nothing if the process only had no core."""
         if self._interrupts.continued > self._continued:
             frame = min(self._core.frames, default=self._core.ledger.presented_count)
             seconds = ns / NS_PER_S

@@ -95,11 +95,7 @@ class ReplayFindings(NamedTuple):
 
 
 class _Block(NamedTuple):
-    """LEAST_FRAMES presented frames in a row.
-
-    `needs`: for each frame, the needs of its jobs by stage.
-    `span_ns`: time from the last presented frame before the block to the block's last frame.
-    """
+    """LEAST_FRAMES presented frames in a row: needs of each frame's jobs by stage, and time since the frame before."""
 
     needs: tuple[Mapping[str, Need], ...]
     span_ns: int
@@ -172,14 +168,16 @@ class WhatIf:
         if not count or not measured_ns or not any(need.cpu_ns for needs in frames for need in needs.values()):
             return None
         plain_ns = replays.pop("")
-        costs = {name: _stage_cost(spans_ns[:count], plain_ns[:count]) for name, spans_ns in replays.items()}
+        costs = {}
+        for name, spans_ns in replays.items():
+            each = tuple(slow / plain - 1 for slow, plain in zip(spans_ns[:count], plain_ns[:count], strict=True))
+            costs[name] = Cost(sum(spans_ns[:count]) / sum(plain_ns[:count]) - 1, each)
         whole_ns = measured_ns / ((len(self._blocks) - 1) * LEAST_FRAMES)
         return ReplayFindings(costs, count * LEAST_FRAMES, sum(plain_ns) / len(plain_ns) / LEAST_FRAMES / whole_ns)
 
     def _replayed(self, frames: Sequence[Mapping[str, Need]], slowed: str, message_ns: int) -> list[int]:
         """Replay frames, and return the time in ns of each block of LEAST_FRAMES frames but the first and the last.
 
-        `frames`: for each frame, the needs of its jobs by stage.
         `slowed`: name of the slowed stage; "" for none.
         `message_ns`: time from the end of a job until the next job is handed over.
         """
@@ -196,11 +194,6 @@ class WhatIf:
         ends_ns = [end_ns for _, end_ns in run.run()]
         cuts = ends_ns[LEAST_FRAMES - 1 :: LEAST_FRAMES]
         return [after - before for before, after in pairwise(cuts[:-1])]
-
-
-def _stage_cost(slowed_ns: Sequence[int], plain_ns: Sequence[int]) -> Cost:
-    each = tuple(slow / plain - 1 for slow, plain in zip(slowed_ns, plain_ns, strict=True))
-    return Cost(sum(slowed_ns) / sum(plain_ns) - 1, each)
 
 
 class RunEfficiencies:
@@ -260,10 +253,7 @@ class RunEfficiencies:
         }
 
     def _book(self, jobs: Sequence[JobRecord], first_ns: int) -> None:
-        """Add the work and CPU time of `jobs` that must lie between the first and the last presented frame.
-
-        `first_ns`: time in ns of the first presented frame.
-        """
+        """Add the work and CPU time of `jobs` that must lie between the first and the last presented frame."""
         for job in jobs:
             cores, threads = self._places[job.unit]
             length_ns = job.end_ns - job.begin_ns
@@ -335,9 +325,6 @@ def _bound(budget: Budget, unit_of: Mapping[str, str], slowed: ReplayFindings | 
     The bound is the unit, and the stage, whose slowing costs most. If the replays cannot be trusted, the bound is the
     unit, and the stage, with the largest share of the path. If the largest share belongs to no unit (other programs,
     release), its name is the bottleneck even if the replays can be trusted.
-
-    `unit_of`: unit of each stage.
-    `slowed`: results of the replays; None: none were made.
     """
     names = budget.names(unit_of)
     path = {kind: budget.largest(name_of) for kind, name_of in names.items()}
@@ -366,10 +353,7 @@ def _bound(budget: Budget, unit_of: Mapping[str, str], slowed: ReplayFindings | 
 
 
 def _costs_most(costs: Mapping[str, Cost], name: str) -> dict[str, Any]:
-    """Return the keys of `_cost` for the largest cost, and `rivals`: the other names whose cost may be as large.
-
-    `name`: name with the largest cost.
-    """
+    """Return the keys of `_cost` for `name`, which costs most, and `rivals`: other names that may cost as much."""
     most = costs[name]
     rivals = None
     if most.half_width() is not None:

@@ -265,7 +265,11 @@ def try_in_turns(
         stack.enter_context(prompt_answers())
         stack.enter_context(awake())
         stack.enter_context(on_cores(tuple(cores)))
-        lives = [stack.enter_context(_started(group, assets, starter, interrupts)) for group in groups]
+        lives = []
+        for group in groups:
+            processes = stack.enter_context(unit_processes(group.pipeline, assets, starter, _Replaying))
+            start_units(processes, list(group.pipeline.units), interrupts)
+            lives.append(_Live(group, processes, interrupts))
         for turn, first in enumerate(windows):
             others = OtherPrograms(cores, [pid for live in lives for pid in live.pids])
             frame_ns = tuple(ns for live in lives for ns in live.one_round(turn, first))
@@ -284,13 +288,6 @@ class _Replaying(UnitProcesses):
         if isinstance(message, RunJob):
             message = message._replace(frame=self.first + message.frame % SLICE)
         super().send(unit, message)
-
-
-@contextlib.contextmanager
-def _started(group: Group, assets: Assets, starter: UnitStarter, interrupts: Interrupts) -> Iterator[_Live]:
-    with unit_processes(group.pipeline, assets, starter, _Replaying) as processes:
-        start_units(processes, list(group.pipeline.units), interrupts)
-        yield _Live(group, processes, interrupts)
 
 
 class _Live:
@@ -328,11 +325,7 @@ class _Live:
 
 
 class _Turns:
-    """A `trilane.scheduler.core.Clock` that moves the units to the next placement whenever SLICE frames are presented.
-
-    `clock`: clock that does all other work.
-    `places`: for each placement in the order of its turn, the cores of each unit.
-    """
+    """A `Clock` that moves the units to the next of `places` whenever SLICE frames are presented."""
 
     def __init__(self, core: Core, clock: RealtimeClock, processes: UnitProcesses, places: Sequence[Cores]) -> None:
         self._core, self._clock, self._processes, self._places = core, clock, processes, places

@@ -200,62 +200,34 @@ class CapReadings(Protocol):
         """The temperatures on which the governor's decisions depend, in degrees Celsius, by name."""
 
 
-class RunRecord(Protocol):
-    """The record of a run, which the scheduler's loop fills through `add`.
-
-    `recording`, `jobs`: steps and jobs of a run in memory; without content for a run with a journal.
-    `failure`: error after which nothing more can be recorded; None without one.
-    """
-
-    recording: Recording
-    jobs: list[JobRecord]
-
-    @property
-    def failure(self) -> UnwrittenError | None: ...
-
-    def begin(self, source: JobSource, pids: Callable[[], Mapping[str, int]]) -> None:
-        """Note that the scheduler's loop begins.
-
-        `source`: object that gives the jobs that have ended.
-        `pids`: function that returns the present process id of each unit.
-        """
-
-    def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
-        """Record a step of `core`, after its actions were carried out. If there is a `failure`, raise it."""
-
-    def say(self, text: str) -> None:
-        """Record a message of the run to its user."""
-
-    def reckoned(self, places: Placement) -> Reckoned:
-        """Return what bounded the whole run; called after the loop. `places`: cores and threads of the run's units.
-
-        Raises `failure` if the recorded steps and jobs are gone.
-        """
-
-    def end(self, report: Mapping[str, Any]) -> None:
-        """Record the end of the run, with its report."""
-
-
 class _KeptRun:
-    """A `RunRecord` in memory."""
+    """The record of a run in memory, which the scheduler's loop fills through `add`; it has no `failure`."""
 
     def __init__(self, graph: Graph, settings: Settings) -> None:
         self.recording = Recording(graph, settings)
         self.jobs: list[JobRecord] = []
-        self.failure = None
+        self.failure: UnwrittenError | None = None
         self._source: JobSource | None = None
 
-    def begin(self, source: JobSource, pids: Callable[[], Mapping[str, int]]) -> None:  # noqa: ARG002 - a `RunRecord`
-        """Keep the source. Its jobs are read after the run, so that units on the scheduler's core are not slowed."""
+    def begin(self, source: JobSource, pids: Callable[[], Mapping[str, int]]) -> None:  # noqa: ARG002 - a journal has them
+        """Note that the scheduler's loop begins. The jobs that `source` gives are read after the run.
+
+        They would slow units on the scheduler's core. `pids`: function that returns the present process ids.
+        """
         self._source = source
 
     def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
+        """Record a step of `core`, after its actions were carried out. If there is a `failure`, raise it."""
         self.recording.add(now_ns, events, actions, core)
 
     def say(self, text: str) -> None:
         """Do nothing, because the log of the run keeps the messages."""
 
     def reckoned(self, places: Placement) -> Reckoned:
+        """Return what bounded the whole run; called after the loop. `places`: cores and threads of the run's units.
+
+        Raises `failure` if the recorded steps and jobs are gone.
+        """
         if self._source is not None:
             self.jobs += [worked.job for worked in self._source.ended() if worked is not None]
         recording = self.recording
@@ -270,7 +242,7 @@ _Step = tuple[Stepped, list[Accounted | Counted], int]
 
 
 class _JournaledRun:
-    """A `RunRecord` in the journal `file`. Its `recording` has no steps, and its `jobs` stay empty.
+    """The record of a run in the journal `file`. Its `recording` has no steps, and its `jobs` stay empty.
 
     `writer`: writer of the journal.
     `caps`: governor that sets the units' duties; duties and temperatures are sampled.
@@ -380,6 +352,9 @@ class _JournaledRun:
         if values:
             self._writer.add(Sampled(now_ns, values))
         self._writer.flush()
+
+
+RunRecord = _KeptRun | _JournaledRun
 
 
 @contextmanager

@@ -145,7 +145,9 @@ def run_pipeline(
     check_open_files()
     check_cores(pipeline)
     if settings is None:
-        settings = _stepped(_settings(policy, frames, fps, pace_fps, hang_ns, latch_ms, requests), works, follow)
+        settings = _settings(policy, frames, fps, pace_fps, hang_ns, latch_ms, requests)
+        if works and settings.period_ns:  # without a rate no frame can be late
+            settings = replace(settings, works=works, follow=follow)
         target_ns = 0 if settings.deadline_ns else round(NS_PER_S / fps)
     else:
         target_ns = 0 if settings.deadline_ns else settings.period_ns or round(NS_PER_S / fps)
@@ -166,18 +168,18 @@ def run_pipeline(
             # A run with a journal may last for days, so the ledger keeps sketches instead of all values.
             sketch = None if journal is None else DdSketch
             core = Core(pipeline.graph(), settings, Books(target_ns, sketch))
-            clock = RealtimeClock(core, processes, interrupts, log, requests, governor, on_progress, sketch)
-            cores = sorted({core for unit in pipeline.units.values() for core in unit.cores})
-            if controls is not None:
-                clock.heed(controls)
-            run = _Run(core, clock, processes, interrupts, log, record, cores, pipeline.warms_up)
+            clock = RealtimeClock(core, processes, interrupts, log, requests, governor, on_progress, sketch, controls)
+            run = _Run(core, clock, processes, interrupts, log, record, pipeline.run_cores, pipeline.warms_up)
             run.execute()
         is_open = requests is not None or controls is not None
         report = core.report(clock="host", requested=core.source.released if is_open else None)
         report["percentiles"] = EXACT if core.ledger.is_exact else SKETCHED
         report.update(policy=settings.policy, edge=pipeline.rule, idle_cores=idle_cores)
         report.update(other_programs=run.other_programs, processor=run.processor)
-        _add_caps(report, governor)
+        if governor is not None:
+            report.update(governor.report())
+            if governor.power_w is not None and report["fps"]:
+                report["xrbench"]["energy"] = energy_score(1e3 * governor.power_w / report["fps"])
         for unit, row in report["units"].items():
             row.update(pid=run.pids[unit], **pipeline.units[unit].model_dump(mode="json"))
         report.update(record.reckoned(pipeline.places()).figures)
@@ -188,15 +190,6 @@ def run_pipeline(
         if record.failure is not None:
             log.fail(str(record.failure))
     return run.result(metrics)
-
-
-def _add_caps(report: dict[str, Any], governor: ReportingGovernor | None) -> None:
-    """Add the governor's caps and temperatures to `report`, and the score of the modelled energy."""
-    if governor is None:
-        return
-    report.update(governor.report())
-    if governor.power_w is not None and report["fps"]:
-        report["xrbench"]["energy"] = energy_score(1e3 * governor.power_w / report["fps"])
 
 
 class _Run:
@@ -231,7 +224,8 @@ class _Run:
             # The last stage writes files, so the frames before the run leave it out.
             chain = Chain(graph, dict.fromkeys(graph.units, self._processes), self._interrupts, whole=False)
             if settings.works:
-                few = _spread(settings.frames, FRAMES_ON_RUNGS)
+                count = min(FRAMES_ON_RUNGS, settings.frames)
+                few = [index * settings.frames // count for index in range(count)]
                 self._clock.first += on_rungs(chain, few, len(settings.works), settings.follow)
             chain.frame(0)
         others, processor = beside_units(self._cores, self.pids), processor_of(self._cores)
@@ -250,7 +244,7 @@ class _Run:
             close_units(self._processes, self._log, self._interrupts)
 
     def result(self, report: RunMetrics) -> RunResult:
-        ledger = self._core.ledger
+        ledger, reported = self._core.ledger, self._clock.reported
         stopped = self._outcome.kind in (OutcomeKind.STOPPED, OutcomeKind.ABORTED)
         return RunResult(
             report=report,
@@ -262,24 +256,16 @@ class _Run:
             startup_ms=self._startup_ms,
             jobs=tuple(self._record.jobs),
             recording=self._record.recording,
-            metrics=self._mean_metrics(),
+            metrics={
+                stage: {name: total / reported[stage][name] for name, total in sums.items() if name not in BYTES}
+                for stage, sums in self._clock.metrics.items()
+            },
             rungs=dict(ledger.rungs) if self._core.ladder is not None else {},
             rung_switches=ledger.rung_switches,
             messages=tuple(self._log.messages),
             interrupted=stopped and self._interrupts.count > 0,
             failure=self._log.failure,
         )
-
-    def _mean_metrics(self) -> Mapping[str, Mapping[str, float]]:
-        """Return the mean of each metric, over the jobs that reported it, by stage and metric.
-
-        Counts of bytes are left out, because `add_bytes` reports them.
-        """
-        reported = self._clock.reported
-        return {
-            stage: {name: total / reported[stage][name] for name, total in sums.items() if name not in BYTES}
-            for stage, sums in self._clock.metrics.items()
-        }
 
 
 def _settings(
@@ -304,14 +290,3 @@ def _settings(
         )
     except UnexpectedValue as error:
         raise BadInputError.at("the run's settings", error) from None
-
-
-def _stepped(settings: Settings, works: tuple[int, ...], follow: tuple[str, ...]) -> Settings:
-    """Return the settings, with the ladder `works` if frames are released at a rate; else no frame can be late."""
-    return replace(settings, works=works, follow=follow) if works and settings.period_ns else settings
-
-
-def _spread(frames: int, count: int) -> list[int]:
-    """Return at most `count` frame numbers, spread evenly over a run of `frames` frames."""
-    count = min(count, frames)
-    return [index * frames // count for index in range(count)]

@@ -267,13 +267,9 @@ class PortedStage:
         self.ready()
 
     def _views(self, place: int, packet: Packet, ports: Mapping[str, PortType]) -> Mapping[str, NDArray[Any] | None]:
-        """Return the read-only arrays of a slot, by port.
+        """Return the read-only arrays of a slot, by port. `place`: number of the slot.
 
         The stage at which a bypass begins may lack a port; in its slots the port has None in place of an array.
-
-        `place`: number of the slot.
-        `packet`: the slot.
-        `ports`: types of the ports of the stream.
         """
         passed = self.settings.bypass
         if passed is None or place < passed.behind:

@@ -23,7 +23,6 @@ from trilane.scheduler.events import (
     Finish,
     Graph,
     Hold,
-    Job,
     JobDone,
     JobFailed,
     Kill,
@@ -252,7 +251,8 @@ class Timeline:
 
     def _act(self, action: Action, after: tuple[Key, ...]) -> None:
         if type(action) is Dispatch:
-            self._begin(action.job, after)
+            heard_ns = self._track.begin(action.job, self._now_ns)
+            self.units[action.job.unit].held.append(Handed(action.job, self._now_ns, heard_ns, after))
         elif type(action) is Kill:
             self.units[action.unit].fall(self._now_ns, is_gone=False)
         elif type(action) is Finish:
@@ -298,16 +298,8 @@ class Timeline:
 
     # jobs and frames
 
-    def _begin(self, job: Job, after: tuple[Key, ...]) -> None:
-        """Note that the job is handed to its unit."""
-        heard_ns = self._track.begin(job, self._now_ns)
-        self.units[job.unit].held.append(Handed(job, self._now_ns, heard_ns, after))
-
     def _end(self, event: JobDone, after: list[Key]) -> Iterator[Fact]:
-        """Note the end of a job, and yield the facts that follow. Its frame waits for the next stages or is presented.
-
-        `after`: list that gets the key of the job.
-        """
+        """Note the end of a job, add its key to `after`, and yield the facts that follow."""
         handed = self.units[event.unit].take(event.job)
         if handed is None:
             return

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Mapping
 from itertools import pairwise
-from typing import Final, NamedTuple, Protocol
+from typing import Final, NamedTuple
 
 from trilane.scheduler.core import Core
 from trilane.scheduler.events import (
@@ -40,67 +40,18 @@ class GoneFrame(NamedTuple):
     release_ns: int
 
 
-class Track(Protocol):
-    """Follows the frames of a run; its methods are called in the order of the journal.
+class ChainTrack:
+    """Follows the frames of a chain by the jobs in the journal; its methods are called in the order of the journal.
 
     `frames`: frames in flight that are not yet presented, by number.
     """
 
-    @property
-    def frames(self) -> Mapping[int, FrameState]: ...
-
-    def step(self, now_ns: int, events: tuple[Event, ...]) -> None:
-        """Note a step of the scheduler; called before the methods for its events and actions."""
-
-    def start(self, now_ns: int) -> None:
-        """Note that the last unit got ready, so that the run starts."""
-
-    def advance(self, now_ns: int) -> None:
-        """Release the frames that are due; called after the methods for a step's events, and before its actions."""
-
-    def stop(self) -> None:
-        """Note that no more frames are released, because a job failed."""
-
-    @property
-    def left(self) -> int:
-        """The number of frames that were put in flight, or were dropped before that."""
-
-    def begin(self, job: Job, now_ns: int) -> int:
-        """Note that a job is handed to its unit. Return when, in ns, the scheduler heard of the job's last input."""
-
-    def end(self, job: Job, event: JobDone, now_ns: int) -> FrameState | None:
-        """Note that a job has ended. Return the job's frame if the job presents it; else None."""
-
-    def give_back(self, job: Job) -> None:
-        """Note that the frame of a job waits again, because the job's unit died."""
-
-    def lose(self, frame: int, now_ns: int) -> GoneFrame | None:
-        """Note that a frame is lost, and return it. A track whose `lost_for` returns lost frames returns None here."""
-
-    def lost_for(self, cause: str, now_ns: int) -> GoneFrame | None:
-        """Return the next frame that was lost for `cause`, a key of the report; None if `lose` returns lost frames."""
-
-    def dropped_for(self, cause: str, now_ns: int) -> GoneFrame:
-        """Return the next frame that was dropped for `cause`, a key of the report."""
-
-    def waiting(self, stage: str) -> list[int]:
-        """Return the numbers of the frames that wait for a stage, the oldest first."""
-
-    def late(self, unit: str) -> list[str]:
-        """Return the names of the stages whose output the unit lacks for the oldest frame that has only some inputs.
-
-        If each frame before the unit has all inputs or none, the list is empty.
-        """
-
-
-class ChainTrack:
-    """A `Track` of a chain, which follows the jobs in the journal."""
-
     def __init__(self, graph: Graph, settings: Settings) -> None:
         names = [stage.name for stage in graph.stages]
         self.frames: dict[int, FrameState] = {}
-        self._source = Source(settings, self._turn_away)
-        self._turned_away: dict[str, deque[tuple[int, int]]] = {cause: deque() for cause in DropCause}
+        turned_away: dict[str, deque[tuple[int, int]]] = {cause: deque() for cause in DropCause}
+        self._source = Source(settings, lambda frame, ns, cause: turned_away[cause].append((frame, ns)))
+        self._turned_away = turned_away
         self._bypass, self._latency_to = graph.bypass, graph.latency_to
         self._from_release = graph.from_release
         self._first, self._last = names[0], names[-1]
@@ -109,10 +60,11 @@ class ChainTrack:
         self._heard_ns: dict[int, int] = {}
 
     def waiting(self, stage: str) -> list[int]:
+        """Return the numbers of the frames that wait for a stage, the oldest first."""
         return [frame for frame, _ in self._source.queue] if stage == self._first else [*self._waiting[stage]]
 
     def step(self, now_ns: int, events: tuple[Event, ...]) -> None:
-        """Pass requests, holds and stops to the source. Other events do not matter here."""
+        """Note a step of the scheduler; called before the methods for its events and actions."""
         for event in events:
             if type(event) is FrameRequest:
                 self._source.request(event.frames, now_ns)
@@ -122,19 +74,24 @@ class ChainTrack:
                 self._source.stop()
 
     def start(self, now_ns: int) -> None:
+        """Note that the last unit got ready, so that the run starts."""
         self._source.start(now_ns)
 
     def advance(self, now_ns: int) -> None:
+        """Release the frames that are due; called after the methods for a step's events, and before its actions."""
         self._source.advance(now_ns)
 
     def stop(self) -> None:
+        """Note that no more frames are released, because a job failed."""
         self._source.stop()
 
     @property
     def left(self) -> int:
+        """The number of frames that were put in flight, or were dropped before that."""
         return self._source.left
 
     def begin(self, job: Job, now_ns: int) -> int:
+        """Note that a job is handed to its unit. Return when, in ns, the scheduler heard of the job's last input."""
         if job.stage == self._first:
             self.frames[job.frame] = FrameState(self._take(job.frame, now_ns), NEVER, job.rung)
         elif job.frame in self._waiting[job.stage]:
@@ -142,6 +99,7 @@ class ChainTrack:
         return self._heard_ns.get(job.frame, 0)
 
     def end(self, job: Job, event: JobDone, now_ns: int) -> FrameState | None:
+        """Note that a job has ended. Return the job's frame if the job presents it; else None."""
         self._heard_ns[job.frame] = now_ns
         frame = self._frame(job.frame, now_ns)
         # The scheduler's own record computes the latency, so that it is defined once.
@@ -158,16 +116,20 @@ class ChainTrack:
         return None
 
     def give_back(self, job: Job) -> None:
+        """Note that the frame of a job waits again, because the job's unit died."""
         self._waiting[job.stage].append(job.frame)
         self._waiting[job.stage].sort()
 
     def lose(self, frame: int, now_ns: int) -> GoneFrame:
+        """Note that a frame is lost, and return it. A track whose `lost_for` returns lost frames returns None here."""
         return GoneFrame(frame, self._leave(frame, now_ns))
 
     def lost_for(self, _cause: str, _now_ns: int) -> GoneFrame | None:
+        """Return the next frame that was lost for a key of the report; None, as `lose` returns lost frames."""
         return None
 
     def dropped_for(self, cause: str, now_ns: int) -> GoneFrame:
+        """Return the next frame that was dropped for `cause`, a key of the report."""
         edge, _, kind = cause.rpartition(":")
         producer, _, consumer = edge.partition("->")
         if producer == SOURCE:
@@ -180,11 +142,8 @@ class ChainTrack:
         return GoneFrame(UNKNOWN, now_ns)
 
     def late(self, _unit: str) -> list[str]:
-        """Return an empty list, because no stage of a chain has several inputs."""
+        """Return the stages whose output the unit lacks for the oldest frame that has only some inputs: none."""
         return []
-
-    def _turn_away(self, frame: int, release_ns: int, cause: DropCause) -> None:
-        self._turned_away[cause].append((frame, release_ns))
 
     def _frame(self, number: int, now_ns: int) -> FrameState:
         """Return the state of a frame in flight. If the journal lacks the frame's first job, make the state now."""
@@ -211,7 +170,7 @@ class ChainTrack:
 
 
 class GraphTrack:
-    """A `Track` of a graph, which asks a second scheduler that takes the run's events."""
+    """Does for a graph what `ChainTrack` does for a chain: a second scheduler takes the run's events."""
 
     def __init__(self, graph: Graph, settings: Settings) -> None:
         self._core = Core(graph, settings)
@@ -290,6 +249,9 @@ class GraphTrack:
 
     def dropped_for(self, cause: str, now_ns: int) -> GoneFrame:
         return self.lost_for(cause, now_ns)
+
+
+Track = ChainTrack | GraphTrack
 
 
 def track_of(graph: Graph, settings: Settings) -> Track:

@@ -83,6 +83,7 @@ class UnitHistory:
     `late`: stages for whose output the unit waits, joined by commas, while `account` is JOIN.
     `is_up`: whether the unit's process is up and ready, and no kill is under way.
     `stopped_ns`: last time at which the unit's process was seen stopped by a signal; 0: never.
+    `cut_ns`: time up to which the unit's time is already divided; no slice can end earlier from now on.
     """
 
     def __init__(self, name: str, kept: int = KEPT) -> None:
@@ -96,7 +97,7 @@ class UnitHistory:
         self._jobs: deque[JobRecord] = deque(maxlen=kept)
         self._changes: deque[tuple[int, str]] = deque(maxlen=kept)
         self._idle_cause = self._idle_late = ""
-        self._cut_ns = 0
+        self.cut_ns = 0
 
     # its process
 
@@ -145,7 +146,11 @@ class UnitHistory:
         others = list(self._during(job.ready_ns, job.begin_ns))
         waits_ns = self._waits(job, heard_ns, others)
         self._jobs.append(job)
-        return waits_ns, max(others, key=lambda other: _overlap(other, job), default=None)
+
+        def overlap_ns(other: JobRecord) -> int:
+            return min(other.end_ns, job.begin_ns) - max(other.begin_ns, job.ready_ns)
+
+        return waits_ns, max(others, key=overlap_ns, default=None)
 
     def _change(self, now_ns: int) -> None:
         cause = MEANING[self.account] if self.is_up else DOWN
@@ -193,10 +198,7 @@ class UnitHistory:
         return {cause: ns for cause, ns in found.items() if ns}
 
     def _add_not_handed(self, found: dict[str, int], begin_ns: int, end_ns: int, heard_ns: int) -> None:
-        """Add to `found` the causes of a time in which the job was not handed over, and the unit did no other job.
-
-        `found`: time in ns by cause.
-        """
+        """Add to `found` the causes of a time in which the unit had neither the job nor another one."""
         if end_ns <= begin_ns:
             return
         explained_ns = 0
@@ -208,10 +210,7 @@ class UnitHistory:
         found[OVERHEAD] += end_ns - begin_ns - explained_ns
 
     def _causes(self, begin_ns: int, end_ns: int) -> Iterator[tuple[str, int, int]]:
-        """Yield (cause, begin in ns, end in ns) for the time between two times, the latest first.
-
-        Time before the first kept change is left out.
-        """
+        """Yield (cause, begin in ns, end in ns) of a time, the latest first, from the first kept change on."""
         for since_ns, cause in reversed(self._changes):
             if since_ns < end_ns:
                 yield cause, max(since_ns, begin_ns), end_ns
@@ -226,17 +225,12 @@ class UnitHistory:
         """The cause of the unit's idle time now: OVERHEAD while the unit has a job, or its process is not up."""
         return OVERHEAD if self.held or not self.is_up else NAMES.get(self.account, UNEXPLAINED)
 
-    @property
-    def cut_until_ns(self) -> int:
-        """The time in ns up to which the unit's time is already divided; no slice can end earlier from now on."""
-        return self._cut_ns
-
     def note_idle(self, now_ns: int, cause: str) -> Iterator[IdleSlice]:
         """Set the cause of idle time from `now_ns` on. If the cause changes, yield the slice that ends now."""
         if cause != self._idle_cause:
-            if self._idle_cause and now_ns > self._cut_ns:
-                yield IdleSlice(self.name, self._idle_cause, self._cut_ns, now_ns, late=self._idle_late)
-            self._idle_cause, self._cut_ns = cause, now_ns
+            if self._idle_cause and now_ns > self.cut_ns:
+                yield IdleSlice(self.name, self._idle_cause, self.cut_ns, now_ns, late=self._idle_late)
+            self._idle_cause, self.cut_ns = cause, now_ns
             self._idle_late = self.late if cause == JOIN else ""
 
     def cut(self, job: JobRecord) -> Iterator[IdleSlice]:
@@ -245,10 +239,10 @@ class UnitHistory:
         Only the cause OVERHEAD has slices between jobs: during any other cause the unit has no job.
         """
         if self._idle_cause == OVERHEAD:
-            if job.begin_ns > self._cut_ns:
-                lost_ns = min(job.preempted_before_ns, job.begin_ns - self._cut_ns)
-                yield IdleSlice(self.name, OVERHEAD, self._cut_ns, job.begin_ns, lost_ns)
-            self._cut_ns = max(self._cut_ns, job.end_ns)
+            if job.begin_ns > self.cut_ns:
+                lost_ns = min(job.preempted_before_ns, job.begin_ns - self.cut_ns)
+                yield IdleSlice(self.name, OVERHEAD, self.cut_ns, job.begin_ns, lost_ns)
+            self.cut_ns = max(self.cut_ns, job.end_ns)
 
 
 class IdleCutter:
@@ -275,7 +269,7 @@ class IdleCutter:
         until_ns = NEVER
         for unit in self._units:
             self._hold(unit.note_idle(self._now_ns, unit.idle_cause))
-            until_ns = min(until_ns, unit.cut_until_ns if unit.held else self._now_ns)
+            until_ns = min(until_ns, unit.cut_ns if unit.held else self._now_ns)
         return self._take(until_ns)
 
     def step(self, now_ns: int) -> None:
@@ -311,8 +305,3 @@ class IdleCutter:
         while self._held and self._held[0][0] <= until_ns:
             taken.append(heappop(self._held)[2])
         return taken
-
-
-def _overlap(other: JobRecord, job: JobRecord) -> int:
-    """Return the time in ns that the unit spent on `other` while `job` waited."""
-    return min(other.end_ns, job.begin_ns) - max(other.begin_ns, job.ready_ns)

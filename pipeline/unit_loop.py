@@ -196,17 +196,14 @@ class Join:
     """The inputs of a `JoiningStage`, which takes one slot of each input for a job.
 
     `inputs`: slots of each input.
+    `is_source`: whether all inputs take the newest frame, so that the source gives the stage's frames.
     """
 
     def __init__(self, inputs: Sequence[list[Packet]], latest: Sequence[bool]) -> None:
         """Keep the slots. `latest`: for each input, whether it takes the newest frame."""
         self.inputs = list(inputs)
         self._by_frame = [place for place, is_latest in enumerate(latest) if not is_latest]
-
-    @property
-    def is_source(self) -> bool:
-        """Whether all inputs take the newest frame, so that the source gives the stage's frames."""
-        return not self._by_frame
+        self.is_source = not self._by_frame
 
     def slots(self, packed: int) -> tuple[int | None, ...]:
         """Return the slot of each input of a job; None for an input without a frame. `packed`: `Job.slot_in`."""
@@ -230,10 +227,7 @@ def hold_until(end_ns: int) -> None:
 
 
 def _header_copier(inputs: list[Packet], outputs: list[Packet]) -> Callable[[int, int], None]:
-    """Return a function of (input slot, output slot) that copies the header from the first to the second.
-
-    If the edges have different kinds of headers, the function copies only FRAME_FIELDS.
-    """
+    """Return a function of (input slot, output slot) that copies the header; of different kinds only FRAME_FIELDS."""
     if inputs and outputs and inputs[0].header.dtype != outputs[0].header.dtype:
         return lambda slot_in, slot_out: _copy_fields(inputs[slot_in].header, outputs[slot_out].header)
     sources, targets = [_bytes_of(packet) for packet in inputs], [_bytes_of(packet) for packet in outputs]
@@ -379,11 +373,7 @@ def _close(unit: str, link: Link, stages: Iterable[BoundStage]) -> int:
 
 
 def _fail(link: Link, job_id: int, where: str, error: Exception) -> int:
-    """Send the error to the scheduler as one sentence, and return its exit code. The traceback goes to stderr.
-
-    `job_id`: id of the failed job; BUILDING or CLOSING outside a job.
-    `where`: place of the error, for the sentence.
-    """
+    """Send the error to the scheduler as one sentence, and return its exit code. The traceback goes to stderr."""
     traceback.print_exception(error)
     known = isinstance(error, TrilaneError)
     text = str(error) if known else f"{where}: {type(error).__name__}: {error}"

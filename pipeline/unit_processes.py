@@ -246,10 +246,7 @@ class UnitProcesses:
             self.listen(50)
 
     def _job_messages(self, process: _Process) -> list[UnitMessage]:
-        """Return the next message of the job pipe as a list; empty if there is none.
-
-        As long as more messages wait, the pipe stays readable.
-        """
+        """Return the next message of the job pipe, if any, as a list. While more wait, the pipe stays readable."""
         try:
             message = process.link.job_pipe.receive()
         except MessageError as error:

@@ -190,10 +190,7 @@ class UnitStarter:
         raise TrilaneError(f"unit {spec.unit} could not be started: {why}")
 
     def _ask(self, spec: UnitSpec, fds: Sequence[int]) -> StartedUnit:
-        """Request the unit's process from the fork server, and return it. After an error no process is left.
-
-        `fds`: descriptors of the unit's spec and its stderr.
-        """
+        """Request the unit's process from the fork server, and return it. After an error no process is left."""
         self._has_units = True
         settings = spec.settings
         request = {"unit": spec.unit, "cores": settings.cores, "threads": settings.threads, "fds": spec.fds}
@@ -217,10 +214,7 @@ class UnitStarter:
         return StartedUnit(int(answer), received[0], lifeline, received[1])
 
     def _received(self) -> tuple[bytes, list[int]]:
-        """Return (answer, descriptors that came with the answer).
-
-        Both are empty if the server has ended, was stopped, or takes longer than ANSWER_S.
-        """
+        """Return (answer, descriptors with it); both are empty if the server is gone, or takes longer than ANSWER_S."""
         end = time.monotonic() + ANSWER_S
         while time.monotonic() < end:
             with contextlib.suppress(TimeoutError, ConnectionResetError):

@@ -184,12 +184,7 @@ class Choice:
 
 
 class _LateFrames:
-    """Drops waiting frames that are stale, or can no longer meet their deadline.
-
-    `policy`: policy that says which frames are dropped.
-    `flow`, `source`: frames in flight, and released frames that are not in flight yet.
-    `choice`: object that says whether a frame can still be in time.
-    """
+    """Drops waiting frames that are stale, or can no longer meet their deadline."""
 
     def __init__(self, policy: Policy, flow: Flow, source: Source, choice: Choice) -> None:
         self._policy, self._flow, self._source, self._choice = policy, flow, source, choice
@@ -238,12 +233,12 @@ class _LateFrames:
                 self._source.drop_late_head()
 
     def _expect_less(self) -> None:
-        """Lower the estimates of all stages, because a frame seems late although no other frame is in flight.
+        """Lower all estimates by a sixteenth: they are too high if a frame seems late while no other is in flight.
 
-        In this case the estimates must be too high.
+        An estimate may come from one slow job. While every frame is dropped as late, no other job corrects it.
         """
         for stage in self._flow.stages:
-            stage.lower_estimate()
+            stage.estimate_ns -= stage.estimate_ns >> 4
 
 
 class Assignment:
@@ -328,8 +323,6 @@ class Assignment:
                 self._late.drop(stage, now_ns)
             if self._choice.can_begin(stage, now_ns):
                 runnable.append(stage)
-        if self._drops and not self._flow.is_chain:  # a frame dropped for one stage may have waited for another stage
-            runnable = [stage for stage in unit.stages if self._choice.can_begin(stage, now_ns)]
         if len(runnable) > 1:
             return self._choice.preferred(runnable, now_ns)
         return runnable[0] if runnable else None

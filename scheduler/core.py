@@ -80,13 +80,13 @@ from trilane.scheduler.state import (
     READY,
     RESUME,
     START,
+    STARTING,
     STOPPING,
     DeadlinePassed,
     FrameState,
     StageState,
     UnitState,
     back_off_ns,
-    extended_deadline_ns,
     next_alarm_ns,
     verdict,
 )
@@ -240,7 +240,9 @@ class Core:
         frame = self.frames.get(job.frame) or self.flow.gone[job.frame]
         service_ns = end_ns - begin_ns
         if skips:
-            self._on_skip(stage, frame)
+            if self.bypass is None or stage is not self.bypass.begin:
+                raise ValueError(f"stage {stage.name} skips, but no bypass begins there")
+            frame.skips = True
         ready_ns = frame.ready_ns[stage.position]
         self.ledger.job(job, ready_ns, begin_ns, end_ns, preempted_ns, asleep_ns, preempted_before_ns)
         if self._estimates:
@@ -261,17 +263,8 @@ class Core:
         frame = self.frames.get(job.frame) or self.flow.gone.get(job.frame)
         return None if frame is None else frame.ready_ns[self._stage_named[job.stage].position]
 
-    def _on_skip(self, stage: StageState, frame: FrameState) -> None:
-        """Note that the frame takes the bypass. Raises ValueError if no bypass begins at `stage`."""
-        if self.bypass is None or stage is not self.bypass.begin:
-            raise ValueError(f"stage {stage.name} skips, but no bypass begins there")
-        frame.skips = True
-
     def _step_work(self, ladder: WorkLadder, stage: StageState, frame: FrameState, service_ns: int) -> None:
-        """Give the ladder a measured service time; if this changes the rung, set the estimates of all stages to it.
-
-        `stage`: stage that took `service_ns` for `frame`.
-        """
+        """Give the ladder a measured service time; if this changes the rung, set the estimates of all stages to it."""
         ladder.learn(stage.position, frame.rung, service_ns)
         if stage.position == ladder.last and ladder.consider():
             self.flow.rung = ladder.rung
@@ -366,7 +359,8 @@ class Core:
     def _on_stalled(self, event: SchedulerStalled) -> None:
         # The units could not be heard in that time, so their deadlines and expected ends do not count it.
         for unit in self.units.values():
-            unit.deadline_ns = extended_deadline_ns(unit, event.ns)
+            if unit.deadline_ns != NEVER and unit.life in (STARTING, READY):  # restarts are not delayed
+                unit.deadline_ns += event.ns
             unit.head_since_ns += event.ns
         self._reset_alarm()
 
@@ -402,11 +396,9 @@ class Clock(Protocol):
 
         `deadline_ns`: latest time of return; NEVER: wait for an event, as in the first call of a run.
         """
-        ...
 
     def perform(self, now_ns: int, actions: tuple[Action, ...]) -> None:
         """Carry out the actions that the core returned at `now_ns`; there is at least one."""
-        ...
 
 
 class Recorder(Protocol):
@@ -414,7 +406,6 @@ class Recorder(Protocol):
 
     def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
         """Add the step that `core` has just taken, after its actions were performed."""
-        ...
 
 
 def run_loop(core: Core, clock: Clock, recording: Recorder | None = None) -> Outcome:

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from enum import StrEnum
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, get_args
 
 from trilane.unexpected_value import UnexpectedValue
 
@@ -253,27 +253,10 @@ class Finish(NamedTuple):
     outcome: Outcome
 
 
-UnitEvent = UnitReady | UnitDied | Pinged | Pong | SetDuty
-RunEvent = SchedulerStalled | StageAlone | Stop | FrameRequest | Hold | Abort
-Event = JobDone | JobFailed | UnitEvent | RunEvent
+UnitEvent = UnitReady | JobDone | JobFailed | UnitDied | Pinged | Pong | SchedulerStalled | SetDuty
+Event = UnitEvent | StageAlone | Stop | FrameRequest | Hold | Abort
 Action = Dispatch | Kill | Start | Finish
-
-EVENTS = (
-    UnitReady,
-    JobDone,
-    JobFailed,
-    UnitDied,
-    Pinged,
-    Pong,
-    SchedulerStalled,
-    SetDuty,
-    StageAlone,
-    Stop,
-    FrameRequest,
-    Hold,
-    Abort,
-)
-ACTIONS = (Dispatch, Kill, Start, Finish)
+EVENTS, ACTIONS = get_args(Event), get_args(Action)
 
 
 class Decision(NamedTuple):
@@ -373,10 +356,7 @@ class Graph:
             self._check_bypass(names, self.bypass)
 
     def _check_inputs(self) -> None:
-        """Raise UnexpectedValue for a stage with wrong inputs, or with `every` below 1.
-
-        Inputs are wrong if they are missing, repeat, are too many, or are not earlier stages.
-        """
+        """Raise UnexpectedValue for a stage whose inputs are not a few different earlier stages, or a wrong `every`."""
         known: set[str] = set()
         for stage in self.stages:
             if stage.inputs is None:

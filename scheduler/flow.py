@@ -70,19 +70,14 @@ def next_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
     if own.ready:
         if own.frame[own.ready[0]] < frame:
             return own.ready[0]
-    elif _is_older_before(stage, frame, frames):
+    elif _is_on_way(stage, -1, frame, frames):
         return -1
     return own_slots(stage) + slot
 
 
-def _is_older_before(stage: StageState, frame: int, frames: Mapping[int, FrameState]) -> bool:
-    """Return whether a frame older than `frame` has yet to come to `stage`."""
-    for number, state in frames.items():
-        if number >= frame:
-            return False
-        if state.position < stage.position:
-            return True
-    return False
+def _is_on_way(stage: StageState, older: int, newer: int, frames: Mapping[int, FrameState]) -> bool:
+    """Return whether a frame with a number between `older` and `newer` has yet to come to the stage."""
+    return any(older < number < newer and state.position < stage.position for number, state in frames.items())
 
 
 def own_slots(stage: StageState) -> int:
@@ -112,17 +107,9 @@ def stale_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
     passing = bypassed.lines[SKIPPING]
     frame = bypassed.frame[passing[0]]
     newest = own.frame[own.ready[-1]] if own.ready else -1
-    if newest > frame or (len(passing) > 1 and not _parts(stage, frame, bypassed.frame[passing[1]], frames)):
+    if newest > frame or (len(passing) > 1 and not _is_on_way(stage, frame, bypassed.frame[passing[1]], frames)):
         return own_slots(stage) + passing[0]
     return -1
-
-
-def _parts(stage: StageState, frame: int, newer: int, frames: Mapping[int, FrameState]) -> bool:
-    """Return whether a frame with a number between `frame` and `newer` is still on its way to the stage.
-
-    `frame`, `newer`: two frames that skip.
-    """
-    return any(frame < number < newer and state.position < stage.position for number, state in frames.items())
 
 
 class Flow:

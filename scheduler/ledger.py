@@ -318,15 +318,12 @@ class Ledger:
         if latency_ns >= 0:
             self._latency.add(latency_ns)
         if self._books.sketch is None:
-            self._keep(frame, end_ns, deadline_ns)
+            self.presented_frames.append(frame)
+            self.presented_ns.append(end_ns)
+            if deadline_ns != NEVER:
+                self.lateness_ns.append(end_ns - deadline_ns)
         if self.left is not None:
             self.left.append(FrameLeft(frame, release_ns, "", end_ns, latency_ns, rung))
-
-    def _keep(self, frame: int, end_ns: int, deadline_ns: int) -> None:
-        self.presented_frames.append(frame)
-        self.presented_ns.append(end_ns)
-        if deadline_ns != NEVER:
-            self.lateness_ns.append(end_ns - deadline_ns)
 
     @property
     def shown_ns(self) -> dict[int, int]:

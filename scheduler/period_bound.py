@@ -22,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import compress
 from math import ceil, lcm
 from typing import Final, NamedTuple
 
@@ -121,11 +122,9 @@ class _Waits:
         """Yield the waits of stages without inputs that come from the limit of frames in flight."""
         read = self.graph.streams
         ends = [name for name in self.names if name not in read]
-        roots = [
-            name for index, name in enumerate(self.names) if all(one.latest for one in self.graph.inputs_of(index))
-        ]
+        is_root = [all(one.latest for one in self.graph.inputs_of(index)) for index in range(len(self.names))]
         for end in ends:
-            for root in roots:
+            for root in compress(self.names, is_root):
                 yield from self._behind(end, root, in_flight, 1, in_flight=True)
 
     def _behind(
@@ -134,11 +133,7 @@ class _Waits:
         """Yield the waits of `writer` for one of `count` places (slots, or frames in flight) that `reader` frees.
 
         If the reader takes every q-th frame, its frames f, f + q, ..., f + (count - 1) q fill all places. Therefore the
-        writer's next frame waits until the reader has ended f.
-
-        `reader`, `writer`: names of stages.
-        `step`: number of frames from frame f + (count - 1) q to the writer's next frame.
-        `stream`, `in_flight`: as in `_Arc`.
+        writer's next frame, `step` frames after the last of these, waits until the reader has ended f.
         """
         period, own = self.periods[reader], self.periods[writer]
         for frame in range(0, self.hyperperiod, period):
@@ -219,7 +214,6 @@ def _of_cycle(waits: _Waits, cycle: Sequence[_Arc], period_ns: Fraction) -> Peri
 def _positive_cycle(jobs: int, arcs: Sequence[_Arc], ratio: Fraction) -> list[_Arc]:
     """Return the arcs of a cycle that takes longer than `ratio` ns for each hyperperiod; without one, an empty list.
 
-    `jobs`: number of jobs.
     `arcs`: waits, sorted by `_Arc.job`, so that one round of the search follows most of them.
     """
     weights = [(arc.job, arc.to, arc.ns * ratio.denominator - arc.tokens * ratio.numerator) for arc in arcs]

@@ -144,27 +144,19 @@ def placements(cores: Sequence[CpuCore], times: Times, fixed: Placement) -> Iter
                 for users, placed in states
                 for threads, count in _forms(times[unit], len(cores))
                 for after, chosen in _choices(cores, users, unit, count)
-                if threads == count or _equally_fast(cores, chosen)
+                if threads == count or len({core.permille for core in cores if core.number in chosen}) == 1
             ]
     for _, placed in states:
         yield {unit: placed[unit] for unit in times}
 
 
 def _forms(works: Mapping[int, UnitWork], most: int) -> Iterator[tuple[int, int]]:
-    """Yield the pairs (number of threads, number of cores) that a unit may have.
-
-    `works`: work of the unit by its number of threads.
-    `most`: number of cores of the run.
-    """
+    """Yield the pairs (number of threads, number of cores) that a unit may have, with at most `most` cores."""
     for threads in works:
         if threads <= most:
             yield threads, threads
     if 1 in works and 1 < most <= MOST_FLOATING:
         yield 1, 2
-
-
-def _equally_fast(cores: Sequence[CpuCore], chosen: Sequence[int]) -> bool:
-    return len({core.permille for core in cores if core.number in chosen}) == 1
 
 
 #: The units that have each core, by the core's number.
@@ -181,8 +173,6 @@ def _choices(
     """Yield each choice of `count` cores for `unit`, as (`users` after the choice, numbers of the chosen cores).
 
     Choices that differ only by an exchange of equal cores count as one.
-
-    `users`: units that each core has before the choice, by the core's number.
     """
     states = [dict(users)]
     for _ in range(count):
@@ -351,24 +341,17 @@ class _Model:
             for some in combinations(floating, count):
                 sets[frozenset().union(*(load.cores for load in some))] = ROOM_USED
         for these, used in sets.items():
-            yield sum(self._within(load, these) for load in self._loads) / (self._capacity(these) * used)
+            within_ns = sum(
+                share_ns(load.cores, load.core_ns if len(these) == 1 else load.work_ns, load.floats, these)
+                for load in self._loads
+            )
+            # The cores' speeds do not matter here, because the loads are already scaled to them.
+            counts = [sum(self._physical[core] == one for core in these) for one in self._physical_cores]
+            yield within_ns / (sum(SIBLINGS if count > 1 else count for count in counts) * used)
 
     @property
     def _physical_cores(self) -> Iterable[int]:
         return dict.fromkeys(self._physical.values())
-
-    @staticmethod
-    def _within(load: _Load, these: frozenset[int]) -> float:
-        """Return the part of a load that must be done on `these` cores, in ns."""
-        return share_ns(load.cores, load.core_ns if len(these) == 1 else load.work_ns, load.floats, these)
-
-    def _capacity(self, these: frozenset[int]) -> float:
-        """Return how many cores the set `these` is worth: siblings together count SIBLINGS, every other core 1.
-
-        The cores' speeds do not matter here, because the loads are already scaled to them.
-        """
-        counts = [sum(self._physical[core] == one for core in these) for one in self._physical_cores]
-        return sum(SIBLINGS if count > 1 else count for count in counts)
 
     def _gang(self, unit: _Load) -> _Gang:
         others = [load for load in self._loads if load is not unit]

@@ -374,8 +374,5 @@ class WorkLadder:
 
 def _first_that_does(uses: Sequence[int]) -> int:
     """Return the first rung whose use is at most `FULL`; without one, the first within a twentieth of the least use."""
-    for rung, use in enumerate(uses):
-        if use <= FULL:
-            return rung
-    enough = min(uses) + min(uses) // TWENTIETH
-    return [use <= enough for use in uses].index(True)
+    enough = FULL if min(uses) <= FULL else min(uses) + min(uses) // TWENTIETH
+    return next(rung for rung, use in enumerate(uses) if use <= enough)

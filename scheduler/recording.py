@@ -37,10 +37,7 @@ CARRIED: dict[Any, Any] = {Dispatch: Job, Finish: Outcome}
 
 
 def _forms(kinds: tuple[Any, ...]) -> dict[str, tuple[Any, dict[str, Any]]]:
-    """Return, for each class of event or action by its name, (class, types of its fields by name).
-
-    The fields are in the order of a row (`row_of`).
-    """
+    """Return (class, types of its fields by name, in the order of a row) of each event or action, by its name."""
     return {kind.__name__: (kind, get_type_hints(CARRIED.get(kind, kind))) for kind in kinds}
 
 
@@ -160,14 +157,7 @@ def actions_of(rows: Iterable[Sequence[Any]]) -> tuple[Action, ...]:
 
 
 def _listed(row: Mapping[str, Any], key: str, forms: dict[str, tuple[Any, dict[str, Any]]]) -> list[Any]:
-    """Return the row (`row_of`) of an event or action.
-
-    `row`: its JSON object.
-    `key`: key of its name, "event" or "action".
-    `forms`: result of `_forms`.
-
-    Raises UnexpectedValue for an unknown name, and for missing or further fields.
-    """
+    """Return the row (`row_of`) of an event or action from its JSON object, whose key `key` has the name."""
     name = row[key]
     _, types = _form(name, forms)
     if row.keys() != {key, *types}:
@@ -183,10 +173,7 @@ def _form(name: Any, forms: dict[str, tuple[Any, dict[str, Any]]]) -> tuple[Any,
 
 
 def _parse(row: Sequence[Any], forms: dict[str, tuple[Any, dict[str, Any]]]) -> Any:
-    """Return the event or action that was written as `row` (`row_of`).
-
-    Raises UnexpectedValue for an unknown name, a field of a wrong type, or an unknown kind of outcome.
-    """
+    """Return the event or action that was written as `row` (`row_of`); `forms` has the known ones."""
     name, *fields = row
     kind, hints = _form(name, forms)
     types = list(hints.values())

@@ -30,7 +30,7 @@ from heapq import heappop, heappush
 from typing import Any, Final, NamedTuple
 
 from trilane.scheduler.core import Core
-from trilane.scheduler.events import NEVER, Action, Dispatch, Event, Graph, Job, JobDone, Outcome, Settings, UnitReady
+from trilane.scheduler.events import NEVER, Dispatch, Event, Graph, Job, JobDone, Outcome, Settings, UnitReady
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.recording import Recording
 from trilane.scheduler.stats import summary_ms
@@ -54,30 +54,13 @@ class Waiting(NamedTuple):
     order: int
 
 
-def _in_turn(waiting: Sequence[Waiting]) -> Waiting:
-    """Choose the job of the next pipeline in turn, so that waiting pipelines get one job each, one after another."""
-    return min(waiting, key=lambda job: (job.behind, job.order))
-
-
-def _earliest_deadline(waiting: Sequence[Waiting]) -> Waiting:
-    """Choose the job whose frame has the earliest deadline; of equal deadlines, the next in turn.
-
-    Jobs without a deadline come last. If the other pipelines keep the seat busy, these jobs never run.
-    """
-    return min(waiting, key=lambda job: (job.deadline_ns, job.behind, job.order))
-
-
-TURNS: Final[dict[str, Callable[[Sequence[Waiting]], Waiting]]] = {
-    ROUND_ROBIN: _in_turn,
-    "deadline": _earliest_deadline,
+#: Of the waiting jobs, the one with the least of these values comes next. With round-robin, waiting pipelines get one
+#: job each, one after another. With deadline, jobs without a deadline come last: if the other pipelines keep the seat
+#: busy, these jobs never run.
+TURNS: Final[dict[str, Callable[[Waiting], tuple[int, ...]]]] = {
+    ROUND_ROBIN: lambda job: (job.behind, job.order),
+    "deadline": lambda job: (job.deadline_ns, job.behind, job.order),
 }
-
-
-def _turns_named(name: str) -> Callable[[Sequence[Waiting]], Waiting]:
-    """Return the rule of `TURNS` with this name. Raises UnexpectedValue for an unknown name."""
-    if name not in TURNS:
-        raise UnexpectedValue(f"turns {name!r}", f"one of {', '.join(TURNS)}")
-    return TURNS[name]
 
 
 #: The speed of a job that nothing slows; divisible by 1 to 10, so that equal shares of a core are exact.
@@ -198,7 +181,9 @@ class BesideDriver:
 
         Raises ValueError for an unknown policy, edge or rule of turns.
         """
-        self._choose, self._divided, self._speed = _turns_named(turns), frozenset(divided), speed
+        if turns not in TURNS:
+            raise UnexpectedValue(f"turns {turns!r}", f"one of {', '.join(TURNS)}")
+        self._turn, self._divided, self._speed = TURNS[turns], frozenset(divided), speed
         self.lines = [_Line(number, member, keep) for number, member in enumerate(members)]
         self._heap: list[tuple[int, int, int, Event]] = []
         self._running: list[_Running] = []
@@ -244,17 +229,13 @@ class BesideDriver:
                 running.had += passed_ns * running.held
 
     def _step_one(self) -> bool:
-        """Let one `Core` take one step for an event, a job's end or a deadline that is due now.
-
-        Return False if nothing is due any more.
-        """
+        """Let one `Core` take a step for an event, an end or a deadline that is due; return False if nothing is."""
         now_ns = self._now_ns
         if self._heap and self._heap[0][0] <= now_ns:
             _, _, number, event = heappop(self._heap)
             self._step(self.lines[number], (event,))
             return True
-        ended = [running for running in self._running if running.left <= 0]
-        if ended:
+        if ended := [running for running in self._running if running.left <= 0]:
             # Jobs that end at one time end in the order of their hand-over, so that equal inputs give equal runs.
             self._end(min(ended, key=lambda running: running.waited.order))
             return True
@@ -272,19 +253,11 @@ class BesideDriver:
             if type(action) is Dispatch:
                 self._order += 1
                 line.units[action.job.unit].queue.append(_Waits(action.job, self._order, self._now_ns))
-            else:
-                self._check(line, action)
+            elif not line.core.finished:
+                # A core kills only a unit that seems to hang, and in virtual time every job ends.
+                raise RuntimeError(f"{action} of pipeline {line.number}: its hang_ns is shorter than a job takes")
         if line.recording is not None:
             line.recording.add(self._now_ns, events, actions, line.core)
-
-    @staticmethod
-    def _check(line: _Line, action: Action) -> None:
-        """Raise RuntimeError if a core returns an action other than a dispatch before it has finished.
-
-        A core does so only for a unit that seems to hang. In virtual time every job ends, so `hang_ns` is too short.
-        """
-        if not line.core.finished:
-            raise RuntimeError(f"{action} of pipeline {line.number}: its hang_ns is shorter than a job takes")
 
     def _end(self, running: _Running) -> None:
         """End a job: free its seat, and give its `Core` a `JobDone`."""
@@ -326,12 +299,11 @@ class BesideDriver:
             job, order, _ = unit.queue[0]
             behind = (line.number - last - 1) % count
             found[Waiting(behind, line.core.frames[job.frame].deadline_ns, order)] = line, unit
-        return found[self._choose(list(found))]
+        return found[min(found, key=self._turn)]
 
     def _begin(self, line: _Line, unit: _Unit) -> None:
-        waited = unit.queue.popleft()
+        waited, now_ns = unit.queue.popleft(), self._now_ns
         job = waited.job
-        now_ns = self._now_ns
         unit.is_running = self._is_changed = True
         self._last[unit.seat] = line.number
         service_ns = line.member.service(job.stage, unit.name, job.frame, now_ns)

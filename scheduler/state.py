@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from math import lcm
 from typing import Final
 
-from trilane.scheduler.events import NEVER, Graph, Input, Job, JobDone, JobFailed, Pinged, Pong, UnitDied, UnitReady
+from trilane.scheduler.events import NEVER, Graph, Job, JobDone, JobFailed, Pinged, Pong, UnitDied, UnitReady
 from trilane.scheduler.ledger import STARVED
 from trilane.transport.slots import EdgeSlots, Keeps, edge_rule
 from trilane.unexpected_value import UnexpectedValue
@@ -122,11 +122,6 @@ class UnitState:
         self.duty = FULL_DUTY
         self.account = STARVED
         self.account_ns = 0
-
-    @property
-    def is_ready(self) -> bool:
-        """Whether the unit's process is up, and does not stop."""
-        return self.life == READY
 
     @property
     def awaits_nothing(self) -> bool:
@@ -296,13 +291,6 @@ class StageState:
         """Add a measured service time in ns to the running mean."""
         self.estimate_ns += (service_ns - self.estimate_ns) >> 3 if self.estimate_ns else service_ns
 
-    def lower_estimate(self) -> None:
-        """Lower the estimate by a sixteenth.
-
-        The estimate may come from one slow job. While every frame is dropped as late, no other job corrects it.
-        """
-        self.estimate_ns -= self.estimate_ns >> 4
-
     def set_inlets(self, inlets: Sequence[Inlet], slots_of: Sequence[Inlet | NewestInlet]) -> None:
         """Set the inputs.
 
@@ -386,7 +374,7 @@ def build(graph: Graph) -> tuple[list[StageState], dict[str, UnitState], list[Ed
     edges = []
     for (name, readers), text in zip(graph.streams.items(), graph.edges, strict=True):
         producer = named[name]
-        by_frame = [reader for reader in readers if not _input(read[reader], name).latest]
+        by_frame = [reader for reader in readers if not any(each.latest for each in read[reader] if each.stage == name)]
         producer.readers = [named[reader] for reader in by_frame]
         lines = len(by_frame) + (graph.bypass is not None and graph.bypass[0] == name)
         producer.output = EdgeSlots(edge_rule(text), lines, len(readers) - len(by_frame))
@@ -418,11 +406,6 @@ def build(graph: Graph) -> tuple[list[StageState], dict[str, UnitState], list[Ed
     for stage in reversed(stages):
         stage.is_main = stage.output is None or any(reader.is_main for reader in stage.readers)
     return stages, units, edges
-
-
-def _input(inputs: Sequence[Input], stage: str) -> Input:
-    """Return the input that reads `stage`."""
-    return next(each for each in inputs if each.stage == stage)
 
 
 #: Verdicts on a unit: leave it alone, kill its process, start its process, end its pause, see if it takes a job.
@@ -480,10 +463,3 @@ def fates(jobs: Iterable[Job], sources: Container[str]) -> list[tuple[Job, bool]
 def back_off_ns(failures: int) -> int:
     """Return the time in ns for which a unit stays down. `failures`: number of failures in a row, at least 1."""
     return BACK_OFF_NS[min(failures, len(BACK_OFF_NS)) - 1]
-
-
-def extended_deadline_ns(unit: UnitState, ns: int) -> int:
-    """Return the unit's deadline, moved by the `ns` for which the scheduler did nothing; restarts are not delayed."""
-    if unit.deadline_ns == NEVER or unit.life not in (STARTING, READY):
-        return unit.deadline_ns
-    return unit.deadline_ns + ns

@@ -54,11 +54,7 @@ def summary_ms(values_ns: Iterable[int]) -> dict[str, float]:
 
 
 def _summary_row(count: int, total: int, largest: int, percentile_of: Callable[[float], float]) -> dict[str, float]:
-    """Return `summary_ms` of `count` values in ns.
-
-    `total`, `largest`: their sum and the largest of them, in ns.
-    `percentile_of`: function that returns their percentile at a share, in ns.
-    """
+    """Return `summary_ms` of `count` values in ns, from their sum, the largest and a function for percentiles."""
     if not count:
         return dict.fromkeys(("mean", *PERCENTILES, "max", "samples"), 0)
     percentiles = {name: percentile_of(share) for name, share in PERCENTILES.items()}
@@ -142,10 +138,7 @@ def batch_interval(values: Sequence[float]) -> float | None:
 
 
 def _half_width(values: Sequence[float], batches: int) -> float:
-    """Return half the width of the 95 % interval: Student's t over the means of `batches` batches.
-
-    The first values, which fill no batch, do not count.
-    """
+    """Return half the 95 % interval, by Student's t over the means of batches; the first values may fill none."""
     length = len(values) // batches
     first = len(values) - batches * length
     means = [fmean(values[first + batch * length : first + (batch + 1) * length]) for batch in range(batches)]
@@ -182,11 +175,9 @@ class Sketch(Protocol):
 
     def add(self, value: int) -> None:
         """Add one value."""
-        ...
 
     def percentile(self, share: float) -> float:
         """Return the percentile at `share` (0 to 1), within the error of the sketch."""
-        ...
 
 
 class Samples:

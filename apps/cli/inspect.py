@@ -19,8 +19,7 @@ from trilane.errors import BadInputError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from trilane.pipeline.measurements.measurement import Measurement
-    from trilane.pipeline.measurements.read_file import Measurements
+    from trilane.pipeline.measurements.measurement import Measurement, Measurements
 
 app = Commands()
 

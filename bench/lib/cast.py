@@ -74,8 +74,9 @@ class Cast:
             folder: MeshBounds(data.shaped, standoff_m=CLOTHES_STANDOFF_M) for folder, data in self.avatars.items()
         }
         self._actors = [
-            _Actor(index, folder, mover, data := self.avatars[folder], _skeleton(data), bounds[folder])
+            _Actor(index, folder, mover, data, Skeleton(data.shaped.joints, data.shaped.body.parents), bounds[folder])
             for index, (folder, mover) in enumerate(zip(folders, staged.movers, strict=True))
+            for data in [self.avatars[folder]]
         ]
 
     def seen(self, frame: int) -> list[CastView]:
@@ -106,10 +107,6 @@ class Cast:
         depth = float(view[2] @ pelvis)
         joints = posed.matrices.copy()
         return CastView(actor.index, actor.folder, pose, translation, world, joints, box, depth, view, projection)
-
-
-def _skeleton(data: AvatarData) -> Skeleton:
-    return Skeleton(data.shaped.joints, data.shaped.body.parents)
 
 
 # Layers of a picture, blended in linear light in float64: a second implementation of the composite.
@@ -241,9 +238,8 @@ def _reads(begin: float, end: float, count: int, side: int, taps: int) -> tuple[
     """Return (first, weights): how a layer is resampled along one axis of a picture.
 
     The n pixels of the picture with centres in [begin, end) get values; `first` is the number of the first of them. Row
-    k of `weights` (n, count) says how much each pixel of the layer counts for pixel `first` + k of the picture.
-    `begin`, `end`: place of the layer in pixels of the picture. `count`: number of the layer's pixels. `side`: number
-    of the picture's pixels. `taps`: number of reads for each pixel.
+    k of `weights` (n, count) says how much each pixel of the layer counts for pixel `first` + k of the picture, by
+    `taps` reads.
     """
     first, last = (min(max(int(np.ceil(place - 0.5)), 0), side) for place in (begin, end))
     middles = np.arange(first, last)[:, None] + 0.5

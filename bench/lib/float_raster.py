@@ -114,11 +114,7 @@ def tensor(image: ReferenceImage, texture: F64, scale: float, zero_point: int) -
 
 
 def _target_corners(world: F64, clip: F64, shape: tuple[int, int]) -> F64:
-    """Return the vertices (N,4) as (column, row, z, w).
-
-    The place in the picture is column / w and row / w, in pixels. z and w are clip coordinates.
-    `world`: vertices (N,3). `clip`: matrix projection @ view, (4,4). `shape`: (height, width) of the picture.
-    """
+    """Return the vertices (N,4) as (column * w, row * w, z, w): place in the picture in pixels, clip coordinates."""
     x, y, z, w = np.moveaxis(np.c_[world, np.ones(len(world))] @ (FLIP_Y @ clip).T, -1, 0)
     return np.stack([(x + w) * shape[1] / 2, (y + w) * shape[0] / 2, z, w], axis=-1)
 
@@ -149,10 +145,7 @@ def _fragments(
 
 
 def _boxes(corners: F64, shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return (first, side) of a square around each triangle: first column and row (F,2), and side (F,), in pixels.
-
-    The side is 0 for a triangle outside of the picture. `corners`, `shape`: see `_fragments`.
-    """
+    """Return (first column and row (F,2), side (F,)) of a square around each triangle; the side is 0 for none."""
     limit = np.array([shape[1], shape[0]])
     w = corners[..., 3]
     in_front = (w > 0).all(axis=1)
@@ -176,7 +169,9 @@ def _covered(corners: F64, members: Any, low: Any, side: int, shape: tuple[int, 
     row = low[members, 1][:, None, None] + np.arange(side)[None, :, None]
     value = edges[:, :, 0, None, None] * (column + 0.5)[:, None]
     value = value + edges[:, :, 1, None, None] * (row + 0.5)[:, None] + edges[:, :, 2, None, None]
-    owned = (value > 0) | ((value == 0) & _top_left(edges)[:, :, None, None])
+    # Left edges own the samples that lie exactly on them, and so do horizontal edges at the top.
+    top_left = (edges[..., 0] > 0) | ((edges[..., 0] == 0) & (edges[..., 1] > 0))
+    owned = (value > 0) | ((value == 0) & top_left[:, :, None, None])
     inside = owned.all(axis=1) & (column < shape[1]) & (row < shape[0]) & (determinant != 0)[:, None, None]
     which, y, x = np.nonzero(inside)
     share = value[which, :, y, x]
@@ -192,17 +187,5 @@ def _cross(points: F64, first: int, second: int) -> F64:
 
 
 def _determinant(points: F64) -> F64:
-    """Return a determinant (F,) for each triangle, which is positive if the triangle winds clockwise in the picture.
-
-    `points`: corners of the triangles as in `_fragments`, (F,3,4).
-    """
+    """Return a determinant (F,) for each triangle, which is positive if it winds clockwise in the picture."""
     return np.asarray((_cross(points, 1, 2) * points[:, 0][:, [0, 1, 3]]).sum(axis=-1))
-
-
-def _top_left(edges: F64) -> NDArray[np.bool_]:
-    """Return a mask (F,3): whether an edge of a triangle owns the samples that lie exactly on the edge.
-
-    Left edges own their samples, and horizontal edges at the top of a triangle.
-    `edges`: coefficients (F,3,3) of the edge functions. These functions are positive inside of the triangle.
-    """
-    return np.asarray((edges[..., 0] > 0) | ((edges[..., 0] == 0) & (edges[..., 1] > 0)))

@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cache
 from math import isqrt
 from pathlib import Path
 from typing import Any
@@ -83,10 +84,7 @@ class FullBody:
         return np.asarray(np.einsum("vab,vb->va", moved[:, :, :3], rest) + moved[:, :, 3])
 
     def _placed(self, turns: F64, translation: F64, world: F64) -> F64:
-        """Return the matrices (55,3,4) of the joints from the body at rest to the world.
-
-        `turns`: rotation matrices (55,3,3) of the joints. `translation`, `world`: see `vertices`.
-        """
+        """Return the matrices (55,3,4) of the joints from the body at rest to the world."""
         placed: dict[int, F64] = {}
 
         def place(joint: int) -> F64:
@@ -111,12 +109,7 @@ def _shift(by: F64) -> F64:
 
 @dataclass(frozen=True)
 class _Avatar:
-    """The parts of an avatar that the plan `full` draws with.
-
-    `body`: body with every blend shape. `mesh`: triangles and texture coordinates. `texture`: neural texture (H,W,C).
-    `paint`: FP32 network. `area`: number of pixels of the tensor that the network was trained for. `network`: source of
-    the network in words.
-    """
+    """The parts of an avatar that the plan `full` draws with. `area`: tensor pixels of its FP32 network's training."""
 
     body: FullBody
     mesh: MeshArrays
@@ -265,9 +258,8 @@ def float_network(bundle: Bundle) -> tuple[Paint, str]:
     """
     weights = require_float_network(bundle)
     if weights is None:
-        return dequantised(
-            bundle.read_network()
-        ), "the integer network's weights in FP32, nothing rounded between layers"
+        source = "the integer network's weights in FP32, nothing rounded between layers"
+        return dequantised(bundle.read_network()), source
     return trained(bundle, weights), f"the FP32 network it was quantised from, {weights.name}"
 
 
@@ -320,19 +312,7 @@ def trained(bundle: Bundle, weights: Path) -> Paint:
 
 def dequantised(network: NetworkFile) -> Paint:
     """Return a function that runs `network` without rounding (`unrounded`), by ONNX Runtime in FP32."""
-    sessions: dict[Shape, onnxruntime.InferenceSession] = {}
-
-    def paint(tensor: F64) -> F32:
-        shape = (tensor.shape[0], tensor.shape[1])
-        if shape not in sessions:
-            model = unrounded(reshaped(network, *shape))
-            sessions[shape] = onnxruntime.InferenceSession(
-                model.SerializeToString(), providers=["CPUExecutionProvider"]
-            )
-        rgba: F32 = sessions[shape].run([OUT], {IN: tensor.astype(np.float32)[None]})[0][0]
-        return rgba
-
-    return paint
+    return _painted(lambda *shape: unrounded(reshaped(network, *shape)), None)
 
 
 def as_written(network: NetworkFile) -> Paint:
@@ -344,15 +324,24 @@ def as_written(network: NetworkFile) -> Paint:
     settings = onnxruntime.SessionOptions()
     settings.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     settings.intra_op_num_threads = 1
-    sessions: dict[Shape, onnxruntime.InferenceSession] = {}
+    paint = _painted(lambda *shape: from_real(reshaped(network, *shape)), settings)
+    return lambda tensor: np.asarray(paint(tensor) / np.float32(255))
+
+
+def _painted(model_of: Callable[..., onnx.ModelProto], settings: onnxruntime.SessionOptions | None) -> Paint:
+    """Return a function that runs a model of a network with an input of real numbers by ONNX Runtime.
+
+    `model_of`: function that returns the model for a tensor's height and width.
+    """
+    session_of = cache(
+        lambda *shape: onnxruntime.InferenceSession(
+            model_of(*shape).SerializeToString(), settings, providers=["CPUExecutionProvider"]
+        )
+    )
 
     def paint(tensor: F64) -> F32:
-        shape = (tensor.shape[0], tensor.shape[1])
-        if shape not in sessions:
-            model = from_real(reshaped(network, *shape)).SerializeToString()
-            sessions[shape] = onnxruntime.InferenceSession(model, settings, providers=["CPUExecutionProvider"])
-        (picture,) = sessions[shape].run(None, {IN: tensor.astype(np.float32)[None]})
-        return np.asarray(picture[0] / np.float32(255))
+        rgba: F32 = session_of(*tensor.shape[:2]).run(None, {IN: tensor.astype(np.float32)[None]})[0][0]
+        return rgba
 
     return paint
 
@@ -415,10 +404,7 @@ def _keep_what_is_read(graph: onnx.GraphProto) -> None:
 
 
 def _range(node: onnx.NodeProto, constants: Mapping[str, onnx.TensorProto]) -> tuple[float, float]:
-    """Return (least, largest) of the real numbers that the output bytes of `node`, a QuantizeLinear, can represent.
-
-    `constants`: constants of the network by name.
-    """
+    """Return (least, largest) of the real numbers that the output bytes of `node`, a QuantizeLinear, can represent."""
     scale = float(numpy_helper.to_array(constants[node.input[1]]).item())
     zero = numpy_helper.to_array(constants[node.input[2]])
     limits = np.iinfo(zero.dtype)

@@ -127,10 +127,7 @@ class _SlotEnd:
 
 
 class _OwnEnd:
-    """An end of a channel that copies bytes. Its array belongs to its own process.
-
-    `size`: number of bytes of the array.
-    """
+    """An end of a channel that copies bytes. Its array of `size` bytes belongs to its own process."""
 
     def __init__(self, size: int) -> None:
         self._own = np.zeros(size, np.uint8)

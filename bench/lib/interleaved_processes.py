@@ -162,10 +162,7 @@ def _timed(runs: Runs, count: int) -> list[float]:
 
 
 def _runtime(variant: ProcessVariant) -> Runs:
-    """Return an endless iterator of calls, each of which infers once with the Trilane runtime of `variant`.
-
-    As in a run, the arrays of each slot are bound once.
-    """
+    """Return endless calls that each infer once with the Trilane runtime of `variant`, with slots bound once."""
     from trilane.avatars.network_file import read_network
     from trilane.bench.lib.networks import random_tensors
     from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
@@ -185,10 +182,7 @@ def _runtime(variant: ProcessVariant) -> Runs:
 
 
 def _ort_default(variant: ProcessVariant) -> Runs:
-    """Return an endless iterator of calls, each of which infers once as in ONNX Runtime's introductory example.
-
-    The session has the library's defaults, except for the threads of `variant`, and its `run` gets an array.
-    """
+    """Return endless calls that each infer once as in ONNX Runtime's introductory example, with its defaults."""
     import onnxruntime
 
     settings = onnxruntime.SessionOptions()
@@ -206,10 +200,7 @@ def _ort_default(variant: ProcessVariant) -> Runs:
 
 
 def _openvino_default(variant: ProcessVariant) -> Runs:
-    """Return an endless iterator of calls, each of which infers once as in OpenVINO's introductory example.
-
-    The file is compiled with the library's defaults, except for the threads of `variant`. Each call gets an array.
-    """
+    """Return endless calls that each infer once as in OpenVINO's introductory example, with its defaults."""
     from trilane.stages.dsp.runtime import quiet_openvino
 
     openvino = quiet_openvino()

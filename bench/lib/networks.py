@@ -109,10 +109,7 @@ def _unet(encoder: str, norm: str, width: int, channels: int) -> tuple[Any, Any]
 
 
 def _defined_macs(network: Any, torch: Any, channels: int) -> float:
-    """Return the multiply-accumulates of all convolutions of `network`, divided by the number of the tensor's pixels.
-
-    `torch`: the module. `channels`: number of channels of the tensor.
-    """
+    """Return the multiply-accumulates of all convolutions of `network`, divided by the tensor's pixels."""
     total = 0
 
     def add(module: Any, _inputs: Any, output: Any) -> None:

@@ -26,9 +26,8 @@ class PictureErrors:
     """The image errors over all pictures that were added."""
 
     def __init__(self) -> None:
-        # Number of pixels, first of the whole frames, then of the boxes.
-        self._pixels = np.zeros(2)
-        self._squares, self._similar, self._flip = np.zeros(2), np.zeros(2), np.zeros(2)
+        # Number of pixels, and the sums of their errors by `error_maps`: of the whole frames, and of the boxes.
+        self._sums = {"": np.zeros(4), "box_": np.zeros(4)}
 
     def add(self, picture: U8, reference: U8, boxes: Sequence[Box]) -> None:
         """Add the errors of `picture` against `reference`, both (h,w,3) uint8 sRGB.
@@ -36,10 +35,9 @@ class PictureErrors:
         `boxes`: rectangles of the visible avatars; empty if no avatar is in view.
         """
         maps = error_maps(picture, reference)
-        for part, mask in enumerate((np.ones(picture.shape[:2], bool), inside(boxes, picture))):
-            self._pixels[part] += mask.sum()
-            for total, values in zip((self._squares, self._similar, self._flip), maps, strict=True):
-                total[part] += values[mask].sum()
+        masks = np.ones(picture.shape[:2], bool), inside(boxes, picture)
+        for sums, mask in zip(self._sums.values(), masks, strict=True):
+            sums += (mask.sum(), *(values[mask].sum() for values in maps))
 
     def figures(self, plan: str) -> dict[str, float | None]:
         """Return the errors over all pictures added until now, under keys that contain the name `plan`.
@@ -48,12 +46,10 @@ class PictureErrors:
         `box_` for the boxes. Box figures are None if no picture had a box, and all figures are None without pictures.
         """
         found: dict[str, float | None] = {}
-        for part, prefix in enumerate(("", "box_")):
-            count = self._pixels[part]
-            means = [total[part] / count if count else None for total in (self._squares, self._similar, self._flip)]
-            found[f"{prefix}psnr_{plan}_db"] = None if means[0] is None else psnr_db(means[0])
-            found[f"{prefix}ssim_{plan}"] = None if means[1] is None else float(means[1])
-            found[f"{prefix}flip_{plan}"] = None if means[2] is None else float(means[2])
+        for prefix, (count, square, similar, flip) in self._sums.items():
+            found[f"{prefix}psnr_{plan}_db"] = psnr_db(square / count) if count else None
+            found[f"{prefix}ssim_{plan}"] = float(similar / count) if count else None
+            found[f"{prefix}flip_{plan}"] = float(flip / count) if count else None
         return found
 
 

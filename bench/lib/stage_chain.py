@@ -52,7 +52,8 @@ class StageChain:
 
         `pipeline`: pipeline with these stages. `units`: contexts of its units, from `units_of`.
         """
-        self.packets = [_packet(SlotLayout(edge.header, edge.payload_bytes)) for edge in pipeline.edges]
+        layouts = [SlotLayout(edge.header, edge.payload_bytes) for edge in pipeline.edges]
+        self.packets = [view_packet(memoryview(bytearray(layout.slot_bytes)), layout) for layout in layouts]
         named = dict(zip(pipeline.edge_names, self.packets, strict=True))
         begin, end = pipeline.bypass or (None, None)
         self._end = [stage.name for stage in pipeline.stages].index(end) if end is not None else 0
@@ -166,7 +167,3 @@ class AvatarFrames:
         height, width, channels = self._shape
         picture: U8 = packet.payload[: height * width * channels].reshape(self._shape).copy()
         return picture
-
-
-def _packet(layout: SlotLayout) -> Packet:
-    return view_packet(memoryview(bytearray(layout.slot_bytes)), layout)

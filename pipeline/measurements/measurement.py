@@ -1,11 +1,12 @@
 """Measurements of other tools in one form, and the checks of every number in them.
 
-    found = Found("QNN profile", "times of each run ...")
+    found = Measurements("QNN profile", "times of each run ...")
     found.sample("line 16: RPC (execute) time", "RPC (execute) time", "run", 7784, "us")
     found.measurements, found.refused
 
-Rule: a reader of a format hands each number to `Found`, which converts it to ms and refuses a number that no tool can
-have measured. A refusal names the row and a reason; other rows stay. Nothing is guessed and nothing is repaired.
+Rule: a reader of a format hands each number to `Measurements`, which converts it to ms and refuses a number that no
+tool can have measured. A refusal names the row and a reason; other rows stay. Nothing is guessed and nothing is
+repaired.
 """
 
 from __future__ import annotations
@@ -14,7 +15,9 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, TypeGuard
 
 import numpy as np
@@ -82,9 +85,8 @@ class Measurement:
 
     def document(self) -> dict[str, Any]:
         """Return the measurement as JSON values, by the names of the fields."""
-        names = ("name", "kind", "unit", "what", "count", "mean_ms", "sd_ms", "min_ms", "p50_ms", "p95_ms", "max_ms")
-        rest = ("share", "hardware", "service", "hint", "more")
-        return {name: getattr(self, name) for name in (*names, *rest)} | {"samples_ms": list(self.samples_ms)}
+        others = {name: value for name, value in vars(self).items() if name != "samples_ms"}
+        return {**others, "samples_ms": list(self.samples_ms)}
 
 
 def is_finite(value: object) -> TypeGuard[int | float]:
@@ -92,9 +94,18 @@ def is_finite(value: object) -> TypeGuard[int | float]:
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
-class Found:
-    """Collects the measurements that a reader finds in one file.
+def number_in(text: str) -> object:
+    """Return the number that a text states; for any other text the text itself."""
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
+
+class Measurements:
+    """The measurements of one file, which a reader collects.
+
+    `path`: path of the file.
     `tool`: name of the file's format.
     `says`: description of the times in this format, as part of a sentence.
     `refused`: refused rows, at most MOST_REFUSED.
@@ -103,7 +114,7 @@ class Found:
     """
 
     def __init__(self, tool: str, says: str) -> None:
-        self.tool, self.says = tool, says
+        self.path, self.tool, self.says = Path(), tool, says
         self.refused: list[Refused] = []
         self.refused_count = 0
         self.skipped: Counter[str] = Counter()
@@ -194,18 +205,17 @@ class Found:
             raise BadInputError("the file", f"over {MOST_NAMES} names", "fewer")
         self._made.append(replace(measurement, name=measurement.name[:LONGEST_NAME] or UNNAMED))
 
-    def take_back(self, names: set[str], row: str, reason: str) -> None:
-        """Remove the measurements `names`, which `add` has added, and refuse `row` for `reason`."""
-        self._made = [each for each in self._made if each.name not in names]
-        self.refuse(row, reason)
+    def take_back(self, name: str, reason: str) -> None:
+        """Remove the measurement `name`, which `add` has added, and refuse it for `reason`."""
+        self._made = [each for each in self._made if each.name != name]
+        self.refuse(name, reason)
 
-    @property
-    def measurements(self) -> list[Measurement]:
-        """All measurements in the order of the file, but those with samples come first."""
-        sampled = [
-            _of_samples(name, kind, values, self._facts[name, kind]) for (name, kind), values in self._samples.items()
-        ]
-        return [*sampled, *_told_apart(self._made)]
+    @cached_property
+    def measurements(self) -> tuple[Measurement, ...]:
+        """All measurements in the order of the file, but those with samples come first; read after the whole file."""
+        samples = self._samples.items()
+        sampled = [_of_samples(name, kind, values, self._facts[name, kind]) for (name, kind), values in samples]
+        return (*sampled, *_told_apart(self._made))
 
 
 def _of_samples(name: str, kind: Kind, samples: list[float], facts: dict[str, Any]) -> Measurement:
@@ -241,48 +251,27 @@ def _told_apart(made: list[Measurement]) -> list[Measurement]:
     return result
 
 
-class Figures(NamedTuple):
-    """Figures of measured times in ms, as a tool states them; None for a figure that the tool does not state.
-
-    `sd`: standard deviation.
-    `low`, `high`: least and largest time.
-    `p50`, `p95`: percentiles.
-    """
-
-    mean: float | None = None
-    sd: float | None = None
-    low: float | None = None
-    p50: float | None = None
-    p95: float | None = None
-    high: float | None = None
-
-
 #: Relative rounding of a figure that a tool prints with six digits.
 ROUNDING: Final = 2e-5
 
 
-def contradiction(figures: Figures) -> str:
-    """Return a sentence about two figures that contradict each other; "" if no two figures do.
+def contradiction(stated: Measurement) -> str:
+    """Return a sentence about two figures of a measurement that contradict each other; "" if no two figures do.
 
     Mean and percentiles must lie between the least and the largest time, and a higher percentile must not be smaller.
     """
-    named = [
-        ("the least", figures.low),
-        ("the median", figures.p50),
-        ("p95", figures.p95),
-        ("the largest", figures.high),
-    ]
+    mean, sd, low, high = stated.mean_ms, stated.sd_ms, stated.min_ms, stated.max_ms
+    named = [("the least", low), ("the median", stated.p50_ms), ("p95", stated.p95_ms), ("the largest", high)]
     ordered = [(name, value) for name, value in named if value is not None]
     for (name, value), (next_name, next_value) in pairwise(ordered):
         if value > next_value * (1 + ROUNDING):
             return f"{name} ({value:g} ms) is above {next_name} ({next_value:g} ms)"
-    low, high, mean = figures.low, figures.high, figures.mean
     if mean is not None and low is not None and mean < low * (1 - ROUNDING):
         return f"the mean ({mean:g} ms) is below the least ({low:g} ms)"
     if mean is not None and high is not None and mean > high * (1 + ROUNDING):
         return f"the mean ({mean:g} ms) is above the largest ({high:g} ms)"
-    if None not in (figures.sd, low, high) and figures.sd > (high - low) * (1 + ROUNDING) + 1e-3:  # type: ignore[operator]
-        return f"the standard deviation ({figures.sd:g} ms) is larger than all of the range"
+    if None not in (sd, low, high) and sd > (high - low) * (1 + ROUNDING) + 1e-3:  # type: ignore[operator]
+        return f"the standard deviation ({sd:g} ms) is larger than all of the range"
     return ""
 
 

@@ -12,14 +12,13 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
 from trilane.errors import BadInputError, did_you_mean
 from trilane.files import HEAD_BYTES, read_bytes, read_text, require_file, whole_number
 from trilane.pipeline.measurements import runtime_files, trace_slices, vendor_files
-from trilane.pipeline.measurements.measurement import CYCLES, PER_MS, QUEUEING, Found, Measurement, Refused
+from trilane.pipeline.measurements.measurement import CYCLES, PER_MS, QUEUEING, Measurement, Measurements, number_in
 
 MOST_TEXT_BYTES: Final = 64 << 20
 MOST_TRACE_BYTES: Final = 256 << 20
@@ -31,43 +30,20 @@ KNOWN: Final = (
 OWN_COLUMNS: Final = ("name", "kind", "unit", "sample", "ms")
 
 
-@dataclass(frozen=True)
-class Measurements:
-    """The measurements of a file.
-
-    `path`: path of the file.
-    `tool`: name of the file's format.
-    `says`: description of the times in this format, as part of a sentence.
-    `refused`: refused rows, at most MOST_REFUSED.
-    `refused_count`: number of all refused rows.
-    `skipped`: number of rows that do not contain a time of a run, by reason.
-    """
-
-    path: Path
-    tool: str
-    says: str
-    measurements: tuple[Measurement, ...]
-    refused: tuple[Refused, ...]
-    refused_count: int
-    skipped: Mapping[str, int]
-
-
 def read_measurements(path: Path) -> Measurements:
     """Return the measurements in the file `path`.
 
     Raises BadInputError for a file of no known tool, and for a file without a usable measurement.
     """
     found = _found(path)
-    measured = tuple(found.measurements)
-    if not measured:
+    found.path = path
+    if not found.measurements:
         first = f": {found.refused[0].row}: {found.refused[0].reason}" if found.refused else ""
         raise BadInputError(path, f"no usable time in the {found.tool}{first}", "times of runs or layers")
-    return Measurements(
-        path, found.tool, found.says, measured, tuple(found.refused), found.refused_count, dict(found.skipped)
-    )
+    return found
 
 
-def _found(path: Path) -> Found:
+def _found(path: Path) -> Measurements:
     size = require_file(path, KNOWN)
     try:
         with path.open("rb") as file:
@@ -80,28 +56,22 @@ def _found(path: Path) -> Found:
     except OSError as error:
         raise BadInputError.of_os_error(path, error, KNOWN) from None
     except BadInputError as error:
-        raise _about(path, error) from None
+        if str(path) in error.where:
+            raise
+        # the reader of a format does not know the path
+        raise BadInputError(path, f"{error.found} in {error.where}", error.expected, error.remedy) from None
 
 
-def _about(path: Path, error: BadInputError) -> BadInputError:
-    """Return the error with the path of the file, which the reader of a format does not know."""
-    if str(path) in error.where:
-        return error
-    return BadInputError(path, f"{error.found} in {error.where}", error.expected, error.remedy)
-
-
-def _of_text(path: Path, text: str) -> Found:
+def _of_text(path: Path, text: str) -> Measurements:
     lines = text.lstrip().splitlines()[:20]
-    if text.lstrip()[:1] in ("{", "["):
-        document = _of_json(path, text)
-        if document is not None:
-            return document
+    if text.lstrip()[:1] in ("{", "[") and (document := _of_json(path, text)) is not None:
+        return document
     if vendor_files.is_qnn(lines):
         return vendor_files.read_qnn(text)
     if vendor_files.TITLE in text:
         return vendor_files.read_loadgen(text)
     if runtime_files.is_benchmark(text):
-        return runtime_files.read_benchmark(text)
+        return runtime_files.BenchmarkLog(text).found
     if lines and tuple(lines[0].split(",")) == OWN_COLUMNS:
         return _read_own(text)
     if trace_slices.PERFETTO_TEXT.match(text):
@@ -113,7 +83,7 @@ def _of_text(path: Path, text: str) -> Found:
     raise BadInputError(path, f"text that begins with {(lines or [''])[0][:60]!r}", KNOWN)
 
 
-def _of_json(path: Path, text: str) -> Found | None:
+def _of_json(path: Path, text: str) -> Measurements | None:
     """Return the measurements of a JSON document; None if `text` is a log of benchmark_model that begins like JSON.
 
     Raises BadInputError for any other text that is not JSON, and for JSON of no known tool.
@@ -139,7 +109,7 @@ def _of_json(path: Path, text: str) -> Found | None:
     return found
 
 
-def _of_table(document: Mapping[str, Any]) -> Found | None:
+def _of_table(document: Mapping[str, Any]) -> Measurements | None:
     data = document.get("data")
     data = data if isinstance(data, dict) else document
     tables = document and all(isinstance(each, dict) for each in document.values())
@@ -158,7 +128,7 @@ def _of_table(document: Mapping[str, Any]) -> Found | None:
     return None
 
 
-def _of_list(document: object) -> Found | None:
+def _of_list(document: object) -> Measurements | None:
     if not isinstance(document, list):
         return None
     if runtime_files.is_tensorrt(document):
@@ -173,7 +143,7 @@ def _of_list(document: object) -> Found | None:
     return None
 
 
-def _of_events(events: Sequence[Any]) -> Found:
+def _of_events(events: Sequence[Any]) -> Measurements:
     """Return the measurements in trace events of ONNX Runtime (categories Session and Node) or of another tool."""
     categories = {
         each.get("cat") for each in events[:1000] if isinstance(each, dict) and isinstance(each.get("cat"), str)
@@ -201,9 +171,9 @@ def _events_by_line(text: str) -> tuple[list[Any], list[str]]:
     return events, broken
 
 
-def _read_own(text: str) -> Found:
+def _read_own(text: str) -> Measurements:
     """Return the measurements in the text of a CSV that `trilane times --csv` wrote."""
-    found = Found("CSV of trilane times", "samples, as another tool measured them")
+    found = Measurements("CSV of trilane times", "samples, as another tool measured them")
     lines = text.splitlines()
     reader, last = csv.DictReader(lines), len(lines)
     try:
@@ -218,10 +188,7 @@ def _read_own(text: str) -> Found:
             if unit not in PER_MS or kind not in ("run", "layer", "wall"):
                 found.refuse(place, f"the unit {unit!r} or the kind {kind!r} is unknown")
                 continue
-            try:
-                value: object = float(str(row["ms"]))
-            except ValueError:
-                value = row["ms"]
+            value = row["ms"] and number_in(row["ms"])
             found.sample(place, str(row["name"]), kind, value, "ms")  # type: ignore[arg-type]
     except csv.Error as error:
         found.refuse(f"line {reader.line_num}", f"no CSV: {error}")
@@ -259,11 +226,7 @@ def chosen(read: Measurements, name: str, where: str) -> Measurement:
 
 
 def _not_one(read: Measurements, runs: Sequence[Measurement], where: str) -> BadInputError:
-    """Return the error for a file that has no run, or several; it lists the measurements that a name can choose.
-
-    `runs`: runs of the file.
-    `where`: place that the error names.
-    """
+    """Return the error for a file without exactly one of `runs`; it lists the measurements that a name can choose."""
     usable = runs or [each for each in read.measurements if each.service and each.unit != CYCLES]
     listed = [f"{each.name!r}" if runs else f"{each.name!r} ({each.what})" for each in usable or read.measurements]
     shown = ", ".join(listed[:8]) + (" …" if len(listed) > 8 else "")

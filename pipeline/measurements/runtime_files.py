@@ -13,18 +13,19 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import PurePosixPath
 from typing import Any, Final
 
 from trilane.pipeline.measurements.measurement import (
     PER_MS,
     ROUNDING,
-    Figures,
-    Found,
     Kind,
     Measurement,
+    Measurements,
     contradiction,
     falling,
+    number_in,
 )
 
 #: Contents of the session events that are runs, by the event's name.
@@ -36,9 +37,9 @@ RUNS: Final = {
 NODE_ENDING: Final = "_kernel_time"
 
 
-def read_ort(events: Sequence[Any]) -> Found:
+def read_ort(events: Sequence[Any]) -> Measurements:
     """Return the measurements in the events of ONNX Runtime's profile."""
-    found = Found("ONNX Runtime profile", "times of each call of the session, and of each node")
+    found = Measurements("ONNX Runtime profile", "times of each call of the session, and of each node")
     for index, event in enumerate(events):
         row = f"event {index}"
         if not isinstance(event, dict):
@@ -78,20 +79,17 @@ def is_benchmark(text: str) -> bool:
     return re.search(r"\bcount=\d+ (first|curr)=|Inference timings in us:|Inference \(avg\):", text) is not None
 
 
-def read_benchmark(text: str) -> Found:
-    """Return the measurements in a log of `benchmark_model`, which may contain several benchmarks."""
-    return _Benchmark(text).found
+class BenchmarkLog:
+    """Reads a log of `benchmark_model`, which may contain several benchmarks, line by line.
 
-
-class _Benchmark:
-    """Reads the log of `benchmark_model` line by line.
+    `found`: measurements in the log.
 
     The last line of figures before a summary is about the measured runs; an earlier one is about the warm-up.
     """
 
     def __init__(self, text: str) -> None:
         says = "count, mean, spread and percentiles of the runs, warm-up apart; of operators the mean"
-        self.found = Found("TFLite benchmark_model log", says)
+        self.found = Measurements("TFLite benchmark_model log", says)
         self._graph, self._starting, self._in_order, self._columns = "benchmark", False, False, list[str]()
         self._announced = 0
         self._lines: list[str] = []  # of this benchmark
@@ -146,14 +144,10 @@ class _Benchmark:
         self._figures = (place, pairs)
 
     def _flush(self, place: str, summary: str = "") -> None:
-        """Add the last line of figures, after a check against the summary, which repeats the mean.
-
-        `place`: place of the summary in the file.
-        `summary`: text of the summary; empty without a summary.
-        """
+        """Add the last line of figures, after a check against `summary`, which repeats the mean; empty without one."""
         figures, self._figures, self._is_warm = self._figures, None, False
         stated = re.search(r"Inference \(avg\): ([^\s,]+)", summary)
-        average = _number(stated[1]) if stated else None
+        average = number_in(stated[1]) if stated else None
         if figures is None:
             if summary:
                 self._only_summary(place, average)
@@ -162,7 +156,7 @@ class _Benchmark:
         if not summary and self._announced == 1:
             self.found.refuse(f"{row}: {self._graph}", "a warm-up: the log ends before the runs do")
             return
-        mean, name = _number(pairs.get("avg", pairs.get("curr", ""))), f"{row}: {self._graph}"
+        mean, name = number_in(pairs.get("avg", pairs.get("curr", ""))), f"{row}: {self._graph}"
         if stated:
             number = self.found.number(f"{place}: {self._graph}", average, "Inference (avg)")
             if number is None:
@@ -173,15 +167,10 @@ class _Benchmark:
         self._take(row, pairs, self._graph)
 
     def _take(self, place: str, pairs: Mapping[str, str], name: str) -> None:
-        """Add the measurement in a line of figures in us. A line about a single run has a time in place of a mean.
-
-        `place`: place of the line in the file.
-        `pairs`: figures as texts, by the tool's key, such as `avg`.
-        `name`: name of the measurement.
-        """
-        times = {key: _number(value) for key, value in pairs.items() if key != "count"}
+        """Add the measurement in a line of figures in us. A line about a single run has a time in place of a mean."""
+        times = {key: number_in(value) for key, value in pairs.items() if key != "count"}
         times.setdefault("avg", times.get("curr", ""))
-        self._add(place, name, _number(pairs["count"]), times, "us")
+        self._add(place, name, number_in(pairs["count"]), times, "us")
 
     def _only_summary(self, place: str, average: object) -> None:
         row = f"{place}: {self._graph}"
@@ -197,7 +186,7 @@ class _Benchmark:
             return
         place, _, unit, count = self._litert["avg"]
         times = {
-            key: _in_unit(_number(value), of or unit or "us", unit or "us")
+            key: _in_unit(number_in(value), of or unit or "us", unit or "us")
             for key, (_, value, of, _) in self._litert.items()
         }
         self._litert = {}
@@ -209,14 +198,11 @@ class _Benchmark:
     def _of_block(self, place: str, average: object, unit: str) -> None:
         """Add the line of figures before a block of lines, which repeats these figures with two digits.
 
-        If the block's mean contradicts the line, refuse the line.
-
-        `place`: place of the block in the file.
-        `average`: mean that the block states, in `unit`.
+        If the block's mean `average`, in `unit`, contradicts the line, refuse the line.
         """
         assert self._figures is not None
         row, pairs = self._figures
-        mean, factor = _number(pairs.get("avg", "")), PER_MS["us"] / PER_MS[unit]
+        mean, factor = number_in(pairs.get("avg", "")), PER_MS["us"] / PER_MS[unit]
         if isinstance(mean, float) and isinstance(average, float) and abs(average * factor - mean) > 0.006 * factor:
             self._figures, self._is_warm = None, False
             said = f"avg={mean:g} us, but {place} says Inference (avg): {average:g} {unit}"
@@ -227,7 +213,6 @@ class _Benchmark:
     def _add(self, place: str, name: str, count: object, times: Mapping[str, object], unit: str) -> None:
         """Add a measurement. Refuse it if a figure is no number, or if figures contradict each other.
 
-        `place`: place of the figures in the file.
         `count`: number of runs; None if the tool does not state it.
         `times`: figures in `unit`, by the tool's key, such as `avg`.
         """
@@ -241,25 +226,15 @@ class _Benchmark:
             if time is None:
                 return
             ms[key] = time
-        figures = Figures(*(ms.get(key) for key in ("avg", "std", "min", "median", "p95", "max")))
-        wrong = contradiction(figures) or next(
-            (
-                text
-                for key in ("first", "curr", "p5")
-                if key in ms and (text := contradiction(figures._replace(mean=ms[key])))
-            ),
-            "",
-        )
-        if wrong:
+        runs = int(count) if isinstance(count, float) else None
+        mean, sd, low, p50, p95, high = (ms.get(key) for key in ("avg", "std", "min", "median", "p95", "max"))
+        what, hardware = "runs after the warm-up, figures alone", _ran_by(self._lines)
+        made = Measurement(name, "run", unit, what, (), runs, mean, sd, low, p50, p95, high, hardware=hardware)
+        like_means = [replace(made, mean_ms=ms[key]) for key in ("first", "curr", "p5") if key in ms]
+        if wrong := next(filter(None, map(contradiction, [made, *like_means])), ""):
             self.found.refuse(row, wrong)
             return
-        runs = int(count) if isinstance(count, float) else None
-        self.found.add(
-            Measurement(
-                name, "run", unit, "runs after the warm-up, figures alone", (), runs, figures.mean, figures.sd,
-                figures.low, figures.p50, figures.p95, figures.high, hardware=_ran_by(self._lines),
-            )
-        )  # fmt: skip
+        self.found.add(made)
 
     def _operator(self, place: str, line: str) -> None:
         """Add a row of the table of operators in run order. The first row of the table names the columns."""
@@ -269,9 +244,9 @@ class _Benchmark:
         elif self._columns and self._in_order and len(cells) == len(self._columns):
             named = dict(zip(self._columns, cells, strict=True))
             name = f"{named['node type']} {named.get('name', '')}".strip()
-            time = self.found.ms(f"{place}: {name}", _number(named.get("avg ms", "")), "ms", "layer", "avg ms")
+            time = self.found.ms(f"{place}: {name}", number_in(named.get("avg ms", "")), "ms", "layer", "avg ms")
             if time is not None:
-                calls = _number(named.get("times called", ""))
+                calls = number_in(named.get("times called", ""))
                 more = {"times_called": calls} if isinstance(calls, float) else {}
                 self.found.add(
                     Measurement(name, "layer", "ms", "an operator, the mean of a call", mean_ms=time, more=more)
@@ -291,13 +266,6 @@ def _ran_by(lines: Sequence[str]) -> str:
     return "XNNPACK" if named and all("xnnpack" in line.lower() for line in named) else ""
 
 
-def _number(text: str) -> object:
-    try:
-        return float(text)
-    except ValueError:
-        return text
-
-
 def _in_unit(value: object, of: str, unit: str) -> object:
     """Convert a number from the unit of time `of` to `unit`; return a value that is no number unchanged."""
     return value / PER_MS[of] * PER_MS[unit] if isinstance(value, float) and of != unit else value
@@ -309,9 +277,11 @@ def is_tensorrt(document: Sequence[Any]) -> bool:
     return any("averageMs" in each or "timeMs" in each for each in tables)
 
 
-def read_tensorrt(document: Sequence[Any]) -> Found:
+def read_tensorrt(document: Sequence[Any]) -> Measurements:
     """Return the mean time of each layer that TensorRT exports, and the sum of these times as a run."""
-    found = Found("TensorRT profile", "the mean of each layer; their sum is the run without what lies between them")
+    found = Measurements(
+        "TensorRT profile", "the mean of each layer; their sum is the run without what lies between them"
+    )
     count, whole = None, 0.0
     for index, layer in enumerate(document):
         row = f"row {index}"
@@ -333,13 +303,8 @@ def read_tensorrt(document: Sequence[Any]) -> Found:
     return found
 
 
-def _of_tensorrt(found: Found, row: str, layer: Mapping[str, Any], count: int | None) -> float | None:
-    """Add one layer to `found`, and return its mean in ms; None if it is refused.
-
-    `row`: place and name of the layer, for messages.
-    `layer`: the layer's table.
-    `count`: number of runs; None if it is not known.
-    """
+def _of_tensorrt(found: Measurements, row: str, layer: Mapping[str, Any], count: int | None) -> float | None:
+    """Add one layer to `found`, and return its mean in ms; None if it is refused."""
     mean = found.ms(row, layer.get("averageMs"), "ms", "layer", "averageMs")
     if mean is None:
         return None
@@ -359,13 +324,13 @@ def _of_tensorrt(found: Found, row: str, layer: Mapping[str, Any], count: int | 
     return mean
 
 
-def read_layer_means(document: Sequence[Any]) -> Found:
+def read_layer_means(document: Sequence[Any]) -> Measurements:
     """Return the measurements in a list of layers with `average_time_ms`, as scripts make from TensorRT's profiles."""
-    found = Found("table of layers' means", "the mean of each layer")
+    found = Measurements("table of layers' means", "the mean of each layer")
     for index, layer in enumerate(document):
-        name = str(layer.get("name", index)) if isinstance(layer, dict) else str(index)
-        value = layer.get("average_time_ms") if isinstance(layer, dict) else None
-        time = found.ms(f"row {index}: {name}", value, "ms", "layer", "average_time_ms")
+        facts = layer if isinstance(layer, dict) else {}
+        name = str(facts.get("name", index))
+        time = found.ms(f"row {index}: {name}", facts.get("average_time_ms"), "ms", "layer", "average_time_ms")
         if time is not None:
             found.add(Measurement(name, "layer", "ms", "a layer, the mean", mean_ms=time))
     return found
@@ -374,13 +339,13 @@ def read_layer_means(document: Sequence[Any]) -> Found:
 CUT: Final = re.compile(r"^(.*)_at_(-?\d+)$")
 
 
-def read_cut_means(document: Mapping[str, Any]) -> Found:
+def read_cut_means(document: Mapping[str, Any]) -> Measurements:
     """Return the measurements in a table of mean times of networks that are cut after layer N (`NAME_at_N`).
 
     The part of a network behind a later cut cannot take longer than the part behind an earlier cut. A time that
     contradicts this is refused.
     """
-    found = Found("table of times by cut", "the mean for each place at which a network is cut")
+    found = Measurements("table of times by cut", "the mean for each place at which a network is cut")
     rests: dict[str, list[tuple[int, float]]] = defaultdict(list)
     for name, facts in document.items():
         key = next((key for key in ("total_time", "mean_time") if key in facts), "")
@@ -391,20 +356,13 @@ def read_cut_means(document: Mapping[str, Any]) -> Found:
         time = found.ms(name, facts.get(key), "ms", "run", key or "the time")
         if time is None:
             continue
-        found.add(
-            Measurement(
-                name,
-                "run",
-                "ms",
-                "a run with this cut" if key == "mean_time" else "the rest behind the cut",
-                mean_ms=time,
-            )
-        )
+        what = "a run with this cut" if key == "mean_time" else "the rest behind the cut"
+        found.add(Measurement(name, "run", "ms", what, mean_ms=time))
         if cut and key == "total_time":
             rests[cut[1]].append((int(cut[2]), time))
     for stem, points in rests.items():
         for place, reason in rising_rests(points):
-            found.take_back({f"{stem}_at_{place}"}, f"{stem}_at_{place}", reason)
+            found.take_back(f"{stem}_at_{place}", reason)
     return found
 
 
@@ -425,10 +383,10 @@ def rising_rests(points: Sequence[tuple[int, float]]) -> Iterator[tuple[int, str
         yield place, f"rest times rise again: {before:g} ms behind cut {cut}, {after:g} ms behind the later cut {later}"
 
 
-def read_executorch(document: Mapping[str, Any]) -> Found:
+def read_executorch(document: Mapping[str, Any]) -> Measurements:
     """Return the measurements of react-native-executorch: calls of a network, and wall times of the app around them."""
     says = "runs of each network as its runtime sees them, and wall times of the app around them"
-    found = Found("react-native-executorch benchmarks", says)
+    found = Measurements("react-native-executorch benchmarks", says)
     for index, case in enumerate(document["cases"]):
         row = f"cases[{index}]"
         if not isinstance(case, dict):
@@ -448,7 +406,7 @@ def read_executorch(document: Mapping[str, Any]) -> Found:
     return found
 
 
-def _add_stats(found: Found, row: str, name: str, kind: Kind, stats: object) -> None:
+def _add_stats(found: Measurements, row: str, name: str, kind: Kind, stats: object) -> None:
     if not isinstance(stats, dict):
         found.skip("a case without figures")
         return
@@ -458,20 +416,17 @@ def _add_stats(found: Found, row: str, name: str, kind: Kind, stats: object) -> 
             ms[key] = found.ms(row, stats[key], "ms", "layer" if key == "stdev" else kind, key)
             if ms[key] is None:
                 return
-    figures = Figures(ms.get("mean"), ms.get("stdev"), ms.get("min"), ms.get("median"), None, ms.get("max"))
-    wrong = contradiction(figures)
-    if wrong or figures.mean is None:
+    count = stats.get("count")
+    what = "calls of the network in its runtime" if kind == "run" else "wall time, with all around the network"
+    made = Measurement(
+        name, kind, "ms", what, (), count, ms.get("mean"), ms.get("stdev"), ms.get("min"), ms.get("median"), None,
+        ms.get("max"), service=kind == "run", more={"p90_ms": p90} if (p90 := ms.get("p90")) is not None else {},
+    )  # fmt: skip
+    wrong = contradiction(made)
+    if wrong or made.mean_ms is None:
         found.refuse(row, wrong or "no mean")
         return
-    count = stats.get("count")
     if count is not None and (not isinstance(count, int) or isinstance(count, bool) or count < 1):
         found.refuse(row, f"count is {count!r}, not a whole number of runs")
         return
-    what = "calls of the network in its runtime" if kind == "run" else "wall time, with all around the network"
-    more = {"p90_ms": ms["p90"]} if ms.get("p90") is not None else {}
-    found.add(
-        Measurement(
-            name, kind, "ms", what, (), count, figures.mean, figures.sd, figures.low, figures.p50, None, figures.high,
-            service=kind == "run", more=more,  # type: ignore[arg-type]
-        )
-    )  # fmt: skip
+    found.add(made)

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from trilane.errors import BadInputError
-from trilane.pipeline.measurements.measurement import Found, is_finite
+from trilane.pipeline.measurements.measurement import Measurements, is_finite
 
 if TYPE_CHECKING:
     from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import TracePacket
@@ -63,9 +63,9 @@ def is_perfetto(head: bytes) -> bool:
     return any(ord(letter) < 9 or 13 < ord(letter) < 32 for letter in text)
 
 
-def read_perfetto(data: bytes) -> Found:
+def read_perfetto(data: bytes) -> Measurements:
     """Return the slices of a Perfetto trace, whose bytes are `data`. Raises BadInputError for other bytes."""
-    found = Found("Perfetto trace", "wall times of named slices")
+    found = Measurements("Perfetto trace", "wall times of named slices")
     _Slices(found).read(data)
     return found
 
@@ -136,7 +136,7 @@ class _Slices:
     Packets of several writers come in any order. Therefore all begins and ends are collected by track, and then paired.
     """
 
-    def __init__(self, found: Found) -> None:
+    def __init__(self, found: Measurements) -> None:
         self._found = found
         self._sequences: dict[int, _Sequence] = defaultdict(_Sequence)
         self._clocks: dict[int, list[int]] = {}  # of the whole trace, as in `_Sequence`
@@ -263,13 +263,13 @@ def _varint(data: bytes, at: int) -> tuple[int, int]:
     return -1, at
 
 
-def read_chrome(events: Sequence[Any]) -> Found:
+def read_chrome(events: Sequence[Any]) -> Measurements:
     """Return the slices of a trace in Chrome's format: complete events, and pairs of begin and end. Times are in us.
 
     If an asynchronous slice has the name of an ordinary slice, it is called `name (async)`, so that the times of the
     two do not mix.
     """
-    found = Found("Chrome trace (JSON)", "wall times of named slices")
+    found = Measurements("Chrome trace (JSON)", "wall times of named slices")
     slices = _ChromeSlices(found)
     for index, event in enumerate(events):
         if isinstance(event, dict):
@@ -281,7 +281,7 @@ def read_chrome(events: Sequence[Any]) -> Found:
 
 
 class _ChromeSlices:
-    def __init__(self, found: Found) -> None:
+    def __init__(self, found: Measurements) -> None:
         self._found = found
         self._open: dict[tuple[str, ...], list[tuple[str, float]]] = defaultdict(list)
         self._names: set[str] = set()  # of slices of threads

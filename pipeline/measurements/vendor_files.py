@@ -34,13 +34,13 @@ from typing import Any, Final
 from trilane.pipeline.measurements.measurement import (
     CYCLES,
     PER_MS,
-    Figures,
-    Found,
     Kind,
     Measurement,
+    Measurements,
     contradiction,
     falling,
     is_finite,
+    number_in,
 )
 
 QNN_COLUMNS: Final = ("Msg Timestamp", "Message", "Time", "Unit of Measurement", "Timing Source", "Event Level")
@@ -66,16 +66,13 @@ RATE_SLACK: Final = 0.02  # largest relative difference between a rate and the r
 
 def is_qnn(lines: Sequence[str]) -> bool:
     """Return whether one of the first 20 lines of a file is the header of the QNN CSV."""
-    return any(_names(line.lstrip("\ufeff").split(","))[:3] == list(QNN_COLUMNS[:3]) for line in lines[:20])
+    begins = [line.lstrip("\ufeff").split(",")[:3] for line in lines[:20]]
+    return any([cell.strip() for cell in cells] == list(QNN_COLUMNS[:3]) for cells in begins)
 
 
-def _names(cells: Sequence[str]) -> list[str]:
-    return [cell.strip() for cell in cells]
-
-
-def read_qnn(text: str) -> Found:
+def read_qnn(text: str) -> Measurements:
     """Return the measurements in a CSV of the QNN execution provider, which has one run or many."""
-    found = Found("QNN profile (CSV)", "times of each run; of its nodes only cycles, which are shares")
+    found = Measurements("QNN profile (CSV)", "times of each run; of its nodes only cycles, which are shares")
     cycles: dict[str, list[float]] = defaultdict(list)
     run = _Run(found)
     for place, cells, identifier, graph in _qnn_rows(text, found):
@@ -88,19 +85,23 @@ def read_qnn(text: str) -> Found:
         elif not _fits_name(unit, identifier, cells["Event Level"]):
             found.refuse(row, f"the unit is {unit}, but the name says {identifier!r}")
         else:
-            value = _number_of(cells["Time"])
+            value = number_in(cells["Time"])
             if QNN_UNITS[unit] == CYCLES:
-                _take_cycles(found, row, cells["Event Level"], identifier, value, cycles)
+                if (number := found.number(row, value, "the count of cycles")) is not None:
+                    cycles[identifier if cells["Event Level"] == "SUB-EVENT" else ""].append(number)
             elif "execute" not in identifier.lower():
                 found.skip("no time of a run, such as preparing the graph or acquiring memory")
             else:
                 run.take(row, identifier, value, QNN_UNITS[unit], graph)
     run.finish()
-    _add_cycles(found, cycles)
+    nodes = {name: sum(values) / len(values) for name, values in cycles.items() if name}
+    _add_shares(found, nodes, {name: len(cycles[name]) for name in nodes})
+    if of_runs := cycles.get(""):
+        found.skipped["cycles of a run, whose clock is not known"] += len(of_runs)
     return found
 
 
-def _qnn_rows(text: str, found: Found) -> Iterator[tuple[str, dict[str, str], str, str]]:
+def _qnn_rows(text: str, found: Measurements) -> Iterator[tuple[str, dict[str, str], str, str]]:
     """Yield (place, cells by column, name of the event, graph) of each row; refuse damaged rows.
 
     The graph is "" for a row that names none. In files that were joined a header may come again. Each line is parsed by
@@ -115,7 +116,7 @@ def _qnn_rows(text: str, found: Found) -> Iterator[tuple[str, dict[str, str], st
             found.refuse(place, f"no CSV: {error}")
             continue
         if cells and cells[0].strip() == QNN_COLUMNS[0]:
-            header = _names(cells)
+            header = [cell.strip() for cell in cells]
             missing = [name for name in (*QNN_COLUMNS[2:4], IDENTIFIER) if name not in header]
             if missing:
                 found.refuse(place, f"a header without the column {missing[0]!r}")
@@ -137,9 +138,7 @@ def _event(named: dict[str, str], identifier: str) -> str:
     """Return the name of a row's event.
 
     This is the identifier, with two exceptions: a row of `qnn-net-run` has the graph's name as identifier, and an event
-    without a name has NULL.
-
-    `named`: cells by column; the texts of other columns are cleaned in place.
+    without a name has NULL. The texts of other columns are cleaned in place in `named`.
     """
     for column in ("Event Level", "Message", "Timing Source"):
         named[column] = named.get(column, "").strip().upper()
@@ -152,21 +151,10 @@ def _event(named: dict[str, str], identifier: str) -> str:
 
 
 def _fits_name(unit: str, identifier: str, level: str) -> bool:
-    """Return whether a row's unit agrees with its event's name. The name of a node need not contain `(cycles)`.
-
-    `unit`: key of QNN_UNITS.
-    `level`: event level; SUB-EVENT: a node.
-    """
+    """Return whether a row's unit agrees with its event's name. The name of a node need not contain `(cycles)`."""
     if QNN_UNITS[unit] == CYCLES and level == "SUB-EVENT":
         return identifier not in WHAT
     return ("(cycles)" in identifier.lower()) == (QNN_UNITS[unit] == CYCLES)
-
-
-def _number_of(text: str) -> object:
-    try:
-        return float(text)
-    except ValueError:
-        return text
 
 
 class _Run:
@@ -176,7 +164,7 @@ class _Run:
     ends the execution. A row of `qnn-net-run` names the graph of an execution.
     """
 
-    def __init__(self, found: Found) -> None:
+    def __init__(self, found: Measurements) -> None:
         self._found = found
         self._rows: dict[str, tuple[str, float, str]] = {}
         self._graph = ""
@@ -220,24 +208,7 @@ class _Run:
             self._found.sample(row, said, "run", value, unit, WHAT[name])
 
 
-def _take_cycles(found: Found, row: str, level: str, name: str, value: object, cycles: dict[str, list[float]]) -> None:
-    number = found.number(row, value, "the count of cycles")
-    if number is not None:
-        cycles[name if level == "SUB-EVENT" else ""].append(number)
-
-
-def _add_cycles(found: Found, cycles: Mapping[str, Sequence[float]]) -> None:
-    """Add each node to `found`, with its share of all nodes' cycles.
-
-    `cycles`: counts of cycles by the node's name; under "" the counts of whole runs.
-    """
-    nodes = {name: sum(values) / len(values) for name, values in cycles.items() if name}
-    _add_shares(found, nodes, {name: len(cycles[name]) for name in nodes})
-    if of_runs := cycles.get(""):
-        found.skipped["cycles of a run, whose clock is not known"] += len(of_runs)
-
-
-def _add_shares(found: Found, nodes: Mapping[str, float], counts: Mapping[str, int | None]) -> None:
+def _add_shares(found: Measurements, nodes: Mapping[str, float], counts: Mapping[str, int | None]) -> None:
     whole = sum(nodes.values())
     for name, mean in nodes.items():
         share = mean / whole if whole else None
@@ -249,9 +220,11 @@ def _add_shares(found: Found, nodes: Mapping[str, float], counts: Mapping[str, i
         )  # fmt: skip
 
 
-def read_qhas(document: Mapping[str, Any]) -> Found:
+def read_qhas(document: Mapping[str, Any]) -> Measurements:
     """Return the measurements in the summary of a QHAS analysis."""
-    found = Found("QHAS summary", "the mean time of a run with its traffic; of operators only cycles, which are shares")
+    found = Measurements(
+        "QHAS summary", "the mean time of a run with its traffic; of operators only cycles, which are shares"
+    )
     data = document.get("data", document)
     rows = _rows(data.get("htp_overall_summary"))
     if not rows:
@@ -297,9 +270,9 @@ def _rows(table: object) -> list[dict[str, Any]]:
     return [row for row in rows if isinstance(row, dict)] if isinstance(rows, list) else []
 
 
-def read_ai_hub(document: Mapping[str, Any]) -> Found:
+def read_ai_hub(document: Mapping[str, Any]) -> Measurements:
     """Return the measurements in the result of AI Hub's `download_profile()`, whose times are in us."""
-    found = Found("AI Hub profile", "times of each run on the device, and the mean of each layer")
+    found = Measurements("AI Hub profile", "times of each run on the device, and the mean of each layer")
     summary = document.get("execution_summary")
     summary = summary if isinstance(summary, dict) else {}
     times = summary.get("all_inference_times")
@@ -309,8 +282,7 @@ def read_ai_hub(document: Mapping[str, Any]) -> Found:
     stated = summary.get("estimated_inference_time")
     if stated is not None:
         row = "execution_summary.estimated_inference_time"
-        time = found.ms(row, stated, "us", "run")
-        if time is not None:
+        if (time := found.ms(row, stated, "us", "run")) is not None:
             what = "run, as AI Hub estimates it"
             found.add(Measurement("estimated_inference_time", "run", "us", what, mean_ms=time))
     elif not times:
@@ -322,7 +294,7 @@ def read_ai_hub(document: Mapping[str, Any]) -> Found:
     return found
 
 
-def _add_layers(found: Found, detail: object) -> None:
+def _add_layers(found: Measurements, detail: object) -> None:
     times: list[tuple[str, str, float]] = []
     for index, layer in enumerate(detail if isinstance(detail, list) else []):
         row = f"execution_detail[{index}]"
@@ -355,9 +327,9 @@ WHOLE_MS: Final = "measured_duration_ms"  # key of the duration of all queries, 
 ACCURACY: Final = ("AccuracyOnly", "Accuracy")
 
 
-def read_loadgen(text: str) -> Found:
+def read_loadgen(text: str) -> Measurements:
     """Return the measurements in LoadGen's summary, mlperf_log_summary.txt."""
-    found = Found("LoadGen summary", "latencies of queries, as percentiles")
+    found = Measurements("LoadGen summary", "latencies of queries, as percentiles")
     facts: dict[str, tuple[str, str]] = {}
     count = None
     for number, line in enumerate(text.splitlines(), 1):
@@ -388,14 +360,14 @@ def _says(scenario: str) -> str:
     return f"latencies of queries that wait for each other ({scenario}): wall times with queueing"
 
 
-def _add_latencies(found: Found, scenario: str, facts: Mapping[str, tuple[str, str]], count: int | None) -> None:
+def _add_latencies(found: Measurements, scenario: str, facts: Mapping[str, tuple[str, str]], count: int | None) -> None:
     kind: Kind = "run" if scenario == SINGLE else "wall"
     ms: dict[str, float] = {}
     for key, (place, value) in facts.items():
         named = LATENCY.fullmatch(key)
         if named is None:
             continue
-        time = found.ms(f"{place}: {key}", _number(value), "ns", kind, key)
+        time = found.ms(f"{place}: {key}", number_in(value), "ns", kind, key)
         if time is not None:
             ms[named[1].removesuffix(" percentile")] = time
     place = facts.get("Mean latency (ns)", ("Mean latency (ns)", ""))[0]
@@ -411,25 +383,22 @@ def _add_latencies(found: Found, scenario: str, facts: Mapping[str, tuple[str, s
                 row, f"the percentile {lower:g} ({time:g} ms) is above the percentile {upper:g} ({other:g} ms)"
             )
             return
-    figures = Figures(ms["Mean"], None, ms.get("Min"), ms.get("50.00"), ms.get("95.00"), ms.get("Max"))
-    wrong = contradiction(figures) or _of_rate(scenario, facts, ms["Mean"])
-    if wrong:
-        found.refuse(row, wrong)
-        return
     name = facts.get("SUT name", ("", "query"))[1] or "query"
     more = {f"p{key:g}_ms": value for key, value in percentiles}
     result = facts.get("Result is", ("", ""))[1]
     hints = [f"LoadGen calls the result {result}"] if result and result != "VALID" else []
-    rate = _number(facts.get("Samples per second", ("", ""))[1])
+    rate = number_in(facts.get("Samples per second", ("", ""))[1])
     if scenario == OFFLINE and is_finite(rate):
         hints.append(f"{rate:g} samples a second")
         more["samples_per_second"] = rate
-    found.add(
-        Measurement(
-            name, kind, "ns", _what(scenario), (), count, figures.mean, None, figures.low, figures.p50, figures.p95,
-            figures.high, service=scenario == SINGLE, hint="; ".join(hints), more=more,
-        )
+    made = Measurement(
+        name, kind, "ns", _what(scenario), (), count, ms["Mean"], None, ms.get("Min"), ms.get("50.00"),
+        ms.get("95.00"), ms.get("Max"), service=scenario == SINGLE, hint="; ".join(hints), more=more,
     )  # fmt: skip
+    if wrong := contradiction(made) or _of_rate(scenario, facts, ms["Mean"]):
+        found.refuse(row, wrong)
+        return
+    found.add(made)
 
 
 def _what(scenario: str) -> str:
@@ -439,23 +408,13 @@ def _what(scenario: str) -> str:
 
 
 def _of_rate(scenario: str, facts: Mapping[str, tuple[str, str]], mean_ms: float) -> str:
-    """Return a sentence if the rate of a SingleStream run contradicts its mean latency; otherwise "".
-
-    `facts`: (place, value) of each line of the summary, by the line's key.
-    """
-    rate = _number(facts.get("QPS w/o loadgen overhead", ("", ""))[1])
+    """Return a sentence if the rate of a SingleStream run contradicts its mean latency; otherwise ""."""
+    rate = number_in(facts.get("QPS w/o loadgen overhead", ("", ""))[1])
     if scenario != SINGLE or not isinstance(rate, float) or rate <= 0:
         return ""
     if abs(rate - 1e3 / mean_ms) > APP_RATE_SLACK * rate + RATE_ROUNDING:
         return f"a mean of {mean_ms:g} ms beside {rate:g} queries a second: a unit is wrong"
     return ""
-
-
-def _number(text: str) -> object:
-    try:
-        return float(text)
-    except ValueError:
-        return text
 
 
 def is_mlperf_app(document: object) -> bool:
@@ -472,9 +431,9 @@ def _results(documents: Sequence[Any]) -> Iterator[tuple[str, Any]]:
             yield f"results[{index}]" if len(documents) == 1 else f"[{number}].results[{index}]", result
 
 
-def read_mlperf_app(document: Mapping[str, Any] | Sequence[Any]) -> Found:
+def read_mlperf_app(document: Mapping[str, Any] | Sequence[Any]) -> Measurements:
     """Return the measurements in the result file of MLPerf's mobile app, whose latencies are in seconds."""
-    found = Found("MLPerf app results", "")
+    found = Measurements("MLPerf app results", "")
     divided = stated = False
     for row, result in _results(document if isinstance(document, list) else [document]):
         if not isinstance(result, dict):
@@ -507,13 +466,10 @@ def _loadgen(run: Mapping[str, Any]) -> dict[str, Any]:
     return table if isinstance(table, dict) else {}
 
 
-def _of_older_app(found: Found, row: str, run: Mapping[str, Any]) -> dict[str, Any]:
+def _of_older_app(found: Measurements, row: str, run: Mapping[str, Any]) -> dict[str, Any]:
     """Return a table like `_loadgen` of newer versions; its mean is the duration of all queries over their number.
 
     The mean is in seconds; None if the duration is refused.
-
-    `row`: place and name of the benchmark, for messages.
-    `run`: table `performance_run` of the benchmark.
     """
     info = run.get("loadgen_info")
     info = info if isinstance(info, dict) else {}
@@ -531,7 +487,7 @@ def _of_older_app(found: Found, row: str, run: Mapping[str, Any]) -> dict[str, A
 
 
 def _add_result(
-    found: Found, row: str, name: str, scenario: str, result: Mapping[str, Any], loadgen: Mapping[str, Any]
+    found: Measurements, row: str, name: str, scenario: str, result: Mapping[str, Any], loadgen: Mapping[str, Any]
 ) -> None:
     kind: Kind = "run" if scenario == SINGLE else "wall"
     if loadgen.get("what") and loadgen["latency_mean"] is None:
@@ -571,12 +527,10 @@ def _add_result(
 
 
 def _fits(rate: float, mean_ms: float, p90_ms: float | None) -> bool:
-    """Return whether a rate is about the reciprocal of the 90th percentile.
+    """Return whether a rate in queries a second is about the reciprocal of the 90th percentile.
 
     Without a percentile, return whether the rate differs less from the reciprocal of the mean than a wrong unit would
     make it.
-
-    `rate`: queries a second.
     """
     if p90_ms is not None:
         return (

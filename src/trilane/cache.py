@@ -58,14 +58,15 @@ def cached_arrays(name: str, sources: Iterable[NDArray[Any] | str], make: Callab
     entry = cache_entry(ARRAYS, f"{_digest(name, sources)}.npz")
     if entry is None:
         return make()
-    stored = _read(entry)
-    if stored is not None:
+    if (stored := _read(entry)) is not None:
         return stored
     made = make()
     with contextlib.suppress(OSError, BadInputError):
         with write_atomically(entry) as draft, draft.open("wb") as file:
             np.savez(file, allow_pickle=False, **made)
-        _forget_oldest(entry.parent)
+        entries = sorted(entry.parent.glob("*.npz"), key=lambda path: path.stat().st_mtime)
+        for oldest in entries[:-MAX_ENTRIES]:
+            oldest.unlink(missing_ok=True)
     return made
 
 
@@ -87,9 +88,3 @@ def _digest(name: str, sources: Iterable[NDArray[Any] | str]) -> str:
             digest.update(f"{source.dtype.str}{source.shape}".encode())
             digest.update(np.ascontiguousarray(source).data)
     return digest.hexdigest()
-
-
-def _forget_oldest(folder: Path) -> None:
-    entries = sorted(folder.glob("*.npz"), key=lambda path: path.stat().st_mtime)
-    for entry in entries[:-MAX_ENTRIES]:
-        entry.unlink(missing_ok=True)

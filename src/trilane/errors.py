@@ -29,12 +29,9 @@ def did_you_mean(word: str, known: Iterable[str], prefix: str = "") -> str:
     `prefix`: text that the remedy puts before the suggested word, such as a folder.
     """
     words = list(known)
-    near = get_close_matches(word, words, n=1) or _only_one([each for each in words if word and each.startswith(word)])
+    longer = [each for each in words if word and each.startswith(word)]
+    near = get_close_matches(word, words, n=1) or (longer if len(longer) == 1 else [])
     return f"did you mean {prefix + near[0]!r}?" if near else ""
-
-
-def _only_one(words: list[str]) -> list[str]:
-    return words if len(words) == 1 else []
 
 
 PACKAGE = Path(__file__).resolve().parent

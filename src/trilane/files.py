@@ -291,10 +291,7 @@ def npy_pickle(path: Path, most: int, expected: str) -> bytes | None:
 
 
 def _holds_objects(file: IO[bytes]) -> bool:
-    """Read the `.npy` header that comes next in `file`, and return whether its array holds Python objects.
-
-    Raises one of DAMAGED for a broken header.
-    """
+    """Read the `.npy` header that comes next in `file`, and return whether its array holds Python objects."""
     version = np.lib.format.read_magic(file)
     return version in _HEADERS and _header(file, version)[2].hasobject
 
@@ -341,10 +338,7 @@ def read_header(where: Path | str, file: IO[bytes]) -> tuple[tuple[int, ...], bo
 
 
 def _header(file: IO[bytes], version: tuple[int, int]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Return (shape, whether the order is Fortran's, dtype) from a header whose `version` was read already.
-
-    Raises one of DAMAGED for a broken header.
-    """
+    """Return (shape, whether the order is Fortran's, dtype) of a header; raises one of DAMAGED for a broken one."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # about headers that Python 2 wrote
@@ -363,8 +357,6 @@ def _read_array(file: IO[bytes]) -> NDArray[Any]:
 
 def _checked_bytes(where: Path | str, file: IO[bytes], expected: str) -> int:
     """Read the `.npy` header that comes next in `file`, and return the number of data bytes that it announces.
-
-    `expected`: what the file should hold, in words, for the error about a negative side.
 
     Raises BadInputError for a negative side or an array that is too large, and as `read_header` does.
     """

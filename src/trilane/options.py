@@ -179,13 +179,10 @@ class Options(BaseModel):
 
     def as_json(self) -> dict[str, Any]:
         """Return the value of every option as a JSON value, by field name, as the report contains them."""
-        return {name: _as_json(value) for name, value in self}
-
-
-def _as_json(value: object) -> object:
-    if isinstance(value, tuple):
-        return list(value)
-    return str(value) if isinstance(value, PurePath) else value
+        return {
+            name: list(value) if isinstance(value, tuple) else str(value) if isinstance(value, PurePath) else value
+            for name, value in self
+        }
 
 
 def expected(field: FieldInfo) -> str:

@@ -64,9 +64,7 @@ def squeeze_channels(channels: int) -> int:
 def _repeated(spec: Sequence[tuple[int, int, int, int, int]], before: int) -> tuple[MobileBlock, ...]:
     """Return the blocks that `spec` describes by rows (kernel, expansion factor, channels, repeats, stride).
 
-    The first block of a row has the row's stride; its repeats have stride 1.
-
-    `before`: channels that enter the first block.
+    The first block, which `before` channels enter, has the row's stride; its repeats have stride 1.
     """
     rows = []
     for kernel, expansion, channels, repeats, stride in spec:

@@ -34,7 +34,7 @@ def write_atomically(path: Path, remedy: str = "") -> Iterator[Path]:
     draft = path.parent / f"{PREFIX}{secrets.token_hex(8)}{path.suffix}"
     try:
         with _os_errors_about(path, remedy, (path, draft)):
-            if _is_stream(path):
+            if path.exists() and not path.is_file() and not path.is_dir():  # a device, a pipe or a socket
                 yield path
             else:
                 yield draft
@@ -106,11 +106,6 @@ def _move_files(source: Path, target: Path) -> None:
     target.mkdir(exist_ok=True)
     for file in files:
         file.replace(target / file.name)
-
-
-def _is_stream(path: Path) -> bool:
-    """Return whether `path` is a device, a pipe or a socket, which a file must not replace."""
-    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 def _flush(file: Path) -> None:

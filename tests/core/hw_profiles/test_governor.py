@@ -39,7 +39,7 @@ def worked(governor: Governor, seconds: int, share: float = 1.0) -> list[tuple[i
 def test_a_performance_profile_is_its_corners_duty(phone: Profile) -> None:
     requested = {event.unit: event.permille for event in Governor(phone, "power_saver").begin(0)}
     corners = phone.performance_profiles["power_saver"]
-    assert requested == {unit: round(1000 * phone.units[unit].clock(corners.corner(unit))) for unit in UNITS}
+    assert requested == {unit: round(1000 * phone.units[unit].clock(getattr(corners, unit))) for unit in UNITS}
     assert Governor(phone, "burst").begin(0) == []
 
 

@@ -415,7 +415,7 @@ def test_heat_follows_the_power_from_poll_to_poll(monkeypatch: pytest.MonkeyPatc
     first = profile.performance_profiles["burst"]
     assert len(found) == len(seen) == 4, "round(7.8 s / 2 s)"
     for number, moment in enumerate(found):
-        corners: Any = [first.corner(unit) for unit in UNITS]
+        corners: Any = [getattr(first, unit) for unit in UNITS]
         if number >= 2:
             corners[2] = CORNERS[CORNERS.index(corners[2]) + 1]
         power = {u: profile.units[u].power_w(c, busy[u]) for u, c in zip(UNITS, corners, strict=True)}
@@ -429,7 +429,7 @@ def test_heat_follows_the_power_from_poll_to_poll(monkeypatch: pytest.MonkeyPatc
         assert astuple(moment)[:5] == pytest.approx(wanted)
         assert moment.throttled == (number >= 2) and moment.corners == tuple(corners)
         assert seen[number][1] == pytest.approx(device) and seen[number][3] == pytest.approx(power)
-        assert seen[number][2] == {unit: CORNERS.index(first.corner(unit)) for unit in UNITS}
+        assert seen[number][2] == {unit: CORNERS.index(getattr(first, unit)) for unit in UNITS}
     assert len(settled) == 2, "each state of the units is settled once"
 
 

@@ -107,7 +107,7 @@ def world(monkeypatch: pytest.MonkeyPatch) -> World:
         ("run_loop", world.run_loop),
         ("start_units", lambda *_: {"left": 1.5, "right": 2.5}),
         ("close_units", lambda *_: None),
-        ("beside_units", lambda cores, pids: lambda now: 0.25 if (cores, pids == now) == ([0, 1, 3], True) else None),
+        ("beside_units", lambda cores, pids: lambda now: 0.25 if (cores, pids == now) == ((0, 1, 3), True) else None),
         ("processor_of", lambda cores: lambda: ProcessorState(throttles=len(cores))),
     ):
         monkeypatch.setattr(run, name, part)
@@ -161,7 +161,7 @@ def test_a_run_with_a_journal_keeps_nothing_and_writes_the_same(world: World, tm
     file = JournalFile(tmp_path / "j", {"made": "today", "clock": "host"}, lambda: {"temperature_c.sensor": 41.5})
     result = go(journal=file)
     assert (result.jobs, result.recording.steps, result.recording.accounts) == ((), [], [])
-    assert world.others[-1] is DdSketch and result.report.percentiles == kept.report.percentiles == "exact"
+    assert world.others[-2] is DdSketch and result.report.percentiles == kept.report.percentiles == "exact"
     begun, *records, ended = read_journal(tmp_path / "j")
     assert isinstance(begun, Begun)
     assert (begun.graph, begun.settings, begun.facts["made"]) == (PIPELINE.graph(), kept.recording.settings, "today")

@@ -178,7 +178,7 @@ def test_a_stop_ends_each_pipeline_with_its_frames_in_flight() -> None:
 @pytest.mark.parametrize("name", TURNS)
 def test_each_rule_of_turns_takes_one_of_those_that_wait(name: str) -> None:
     waiting = [Waiting(2, 30, 1), Waiting(0, NEVER, 2), Waiting(1, 20, 3)]
-    assert TURNS[name](waiting) == waiting[1 if name == "round-robin" else 2]
+    assert min(waiting, key=TURNS[name]) == waiting[1 if name == "round-robin" else 2]
 
 
 def test_unknown_turns_are_refused() -> None:

@@ -35,6 +35,7 @@ from trilane.scheduler.events import (
 )
 from trilane.scheduler.ledger import Ledger
 from trilane.scheduler.policy import Candidate, earliest_deadline, furthest_stage, oldest_frame
+from trilane.scheduler.state import READY, STOPPING
 from trilane.scheduler.virtual import VirtualDriver, simulate
 
 MS = 1_000_000
@@ -316,9 +317,9 @@ def test_a_unit_that_is_being_killed_has_room_for_no_job_and_is_asked_nothing() 
     core = Core(TWO, Settings(9, asked=True, hang_ns=100))
     core.step(0, (UnitReady("gpu"), UnitReady("cpu")))
     gpu = core.units["gpu"]
-    assert (gpu.is_ready, gpu.awaits_nothing, gpu.queue_capacity) == (True, True, 2)
+    assert (gpu.life, gpu.awaits_nothing, gpu.queue_capacity) == (READY, True, 2)
     core.step(1, (Pinged("gpu"),))
-    assert (gpu.is_ready, gpu.awaits_nothing) == (True, False)
+    assert (gpu.life, gpu.awaits_nothing) == (READY, False)
     assert core.step(101, (FrameRequest(0),)).actions == (Kill("gpu"),)
-    assert (gpu.is_ready, gpu.awaits_nothing, gpu.queue_capacity) == (False, False, 0)
+    assert (gpu.life, gpu.awaits_nothing, gpu.queue_capacity) == (STOPPING, False, 0)
     assert core.step(102, (FrameRequest(1),)).actions == ()

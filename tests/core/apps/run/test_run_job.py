@@ -295,12 +295,8 @@ def test_a_run_at_a_chips_pace_is_compared(runs: Callable[..., Runs], tmp_path: 
 def test_a_cap_is_kept_by_a_governor_of_this_machine(runs: Callable[..., Runs], tmp_path: Path) -> None:
     caps = {"how": "duty cycles", "profile": "host", "performance_profile": "balanced"}
     capped = a_result()
-    capped = replace(
-        capped,
-        report=RunMetrics.model_validate(
-            {**capped.report.as_json(), "caps": caps, "temperature_c": {"kind": "modelled"}}
-        ),
-    )
+    changed = {**capped.report.as_json(), "caps": caps, "temperature_c": {"kind": "modelled"}}
+    capped = replace(capped, report=RunMetrics.model_validate(changed))
     double = runs(capped, a_result(policy="sequential"))
     report = go(double, tmp_path / "run", performance_profile=PerformanceProfile.BALANCED.value).report
     governors = [call["governor"] for call in double.calls]
