@@ -104,18 +104,6 @@ def test_of_frames_at_a_slow_rate_a_slower_stage_moves_latency_path_and_misses(s
     assert found.figures["machine_efficiency"] == pytest.approx(late_us / period_us / 3, rel=NEAR)
 
 
-@SLOWER
-@pytest.mark.parametrize("stage", STAGE_US)
-def test_of_one_frame_at_a_time_every_stage_costs_what_it_takes(stage: str, slower: float) -> None:
-    """The baseline that a run is compared with: frame time and latency are the sum of the stages."""
-    times, settings = slowed(stage, slower), Settings(FRAMES, "sequential")
-    run, total_us = simulate(graph(), settings, service(times), keep=True), sum(times.values())
-    assert (frame_us(run), 1e3 * run.report["latency_ms"]["mean"]) == pytest.approx((total_us, total_us))
-    found = found_of(run, settings)
-    assert shares(found) == pytest.approx({("work", name): us / total_us for name, us in times.items()}, abs=1e-6)
-    assert found.figures["bound"]["stage"]["name"] == max(times, key=times.__getitem__)
-
-
 # A unit held by a cap, and frames held by a rate.
 
 
