@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import importlib
 import inspect
-import json
 import sys
 
 import pytest
 
 from trilane.apps.cli import main as cli
 from trilane.apps.cli.bench import BENCHES, MEANINGS, bench_command, meaning
-
-#: A bench that is over in seconds.
-SHORT = ("scheduler", "--minutes", "0.02", "--rounds", "1", "--seeds", "1")
 
 
 def run_here(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> int:
@@ -37,16 +33,6 @@ def test_options_are_the_parameters_of_measure_and_each_has_a_line(name: str) ->
 def test_no_line_is_without_its_option() -> None:
     spoken = {option for name in BENCHES for own in parameters(name) for option in (own, f"{name} {own}")}
     assert set(MEANINGS) <= spoken
-
-
-def test_json_is_one_document_with_the_machine(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run_here(monkeypatch, *SHORT, "--json") == 0
-    document = json.loads(capsys.readouterr().out)
-    assert document["bench"] == "scheduler"
-    assert document["config"]["minutes"] == 0.02
-    assert document["machine"]["cpu"]["cores"] >= 1
 
 
 @pytest.mark.parametrize("arguments", [("nothing",), ("scheduler", "--seeds", "0"), ("scheduler", "--seeds", "many")])

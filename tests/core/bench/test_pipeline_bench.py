@@ -148,6 +148,7 @@ def test_every_avatar_size_and_number_of_cores_is_measured(
         ({"rounds": 0}, "expected at least 20 and 1"),
         ({"policy": ("best",)}, "--policy"),
         ({"edge": ("quadruple",)}, "--edge"),
+        ({"size": ("63x64",)}, "size: found side 63"),
     ],
 )
 def test_what_cannot_be_measured_is_refused(asked: dict[str, Any], words: str) -> None:
