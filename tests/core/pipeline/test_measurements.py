@@ -184,16 +184,6 @@ EXPECTED: dict[str, dict[tuple[str, str], tuple[int | None, float]]] = {
 }
 
 
-@pytest.fixture
-def read(tmp_path: Path) -> Callable[[str], Measurements]:
-    def reader(text: str) -> Measurements:
-        path = tmp_path / "file"
-        path.write_text(text, encoding="utf-8", newline="")
-        return read_measurements(path)
-
-    return reader
-
-
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize("written", [str, lambda text: "\ufeff" + text.replace("\n", "\r\n")], ids=["plain", "windows"])
 def test_what_is_read_is_what_the_source_states(
