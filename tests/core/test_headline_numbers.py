@@ -74,20 +74,13 @@ def frame_us(run: Simulation) -> float:
 # A stage made slower where it does not hold the rate: the path and the latency have all of it, the frame time nothing.
 
 
-SLOWER = pytest.mark.parametrize("slower", [0.0, 0.2, 0.5, 1.0])
-
-
-def slowed(stage: str, slower: float) -> dict[str, int]:
-    return STAGE_US | {stage: round(STAGE_US[stage] * (1 + slower))}
-
-
-@SLOWER
+@pytest.mark.parametrize("slower", [0.0, 0.2, 0.5, 1.0])
 @pytest.mark.parametrize("stage", STAGE_US)
 def test_of_frames_at_a_slow_rate_a_slower_stage_moves_latency_path_and_misses(stage: str, slower: float) -> None:
     """A frame each 400 us, which takes 120 us alone: its latency is the sum of its stages, and what is left of the time
     waits for the rate. The deadline lies 3 us behind that sum: a fifth of pose is 3 us, of any other stage 4 or more.
     """
-    times, period_us, due_us = slowed(stage, slower), 400, ALONE_US + 3
+    times, period_us, due_us = STAGE_US | {stage: round(STAGE_US[stage] * (1 + slower))}, 400, ALONE_US + 3
     settings = Settings(FRAMES, period_ns=period_us * US, deadline_ns=due_us * US)
     run, late_us = simulate(graph(), settings, service(times), keep=True), sum(times.values())
     assert 1e3 * run.report["latency_ms"]["mean"] == pytest.approx(late_us)
