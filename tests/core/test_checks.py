@@ -88,7 +88,7 @@ def test_tests_that_a_run_never_came_to_are_counted(tmp_path: Path, workers: tup
     found = check_tests([*workers, "-q", f"--rootdir={tmp_path}", str(test)], tmp_path / "told.json")
     names, left = found.failures[:-1], found.failures[-1]
     # the worker that died is its test's failure
-    assert [*map(_function, names)] == ["test_0", "test_1"][: 2 if workers else 1]
+    assert [name.rpartition("::")[2] for name in names] == ["test_0", "test_1"][: 2 if workers else 1]
     assert left == f"{2 if workers else 3} tests not run"
 
 
@@ -135,10 +135,6 @@ def test_ctrl_c_ends_quietly_with_what_was_known(tmp_path: Path, monkeypatch: py
     assert tuple(map(int, told.groups())) in {(0, 3), (1, 2)}
     assert "Traceback" not in err
     assert not skipped.exists()
-
-
-def _function(name: str) -> str:
-    return name.rpartition("::")[2]
 
 
 def test_a_run_of_pytest_that_tells_nothing_has_failed(folder: Path) -> None:

@@ -75,20 +75,13 @@ def frame_us(run: Simulation) -> float:
 # A stage made slower where it does not hold the rate: the path and the latency have all of it, the frame time nothing.
 
 
-SLOWER = pytest.mark.parametrize("slower", [0.0, 0.2, 0.5, 1.0])
-
-
-def slowed(stage: str, slower: float) -> dict[str, int]:
-    return STAGE_US | {stage: round(STAGE_US[stage] * (1 + slower))}
-
-
-@SLOWER
+@pytest.mark.parametrize("slower", [0.0, 0.2, 0.5, 1.0])
 @pytest.mark.parametrize("stage", STAGE_US)
 def test_of_frames_at_a_slow_rate_a_slower_stage_moves_latency_path_and_misses(stage: str, slower: float) -> None:
     """A frame each 400 us, which takes 120 us alone: its latency is the sum of its stages, and what is left of the time
     waits for the rate. The deadline lies 3 us behind that sum: a fifth of pose is 3 us, of any other stage 4 or more.
     """
-    times, period_us, due_us = slowed(stage, slower), 400, ALONE_US + 3
+    times, period_us, due_us = STAGE_US | {stage: round(STAGE_US[stage] * (1 + slower))}, 400, ALONE_US + 3
     settings = Settings(FRAMES, period_ns=period_us * US, deadline_ns=due_us * US)
     run, late_us = simulate(graph(), settings, service(times), keep=True), sum(times.values())
     assert 1e3 * run.report["latency_ms"]["mean"] == pytest.approx(late_us)
@@ -103,18 +96,6 @@ def test_of_frames_at_a_slow_rate_a_slower_stage_moves_latency_path_and_misses(s
     of_units = [sum(us for name, us in times.items() if UNIT_OF[name] == unit) for unit in PLACES]
     assert found.figures["efficiency"] == pytest.approx(max(of_units) / period_us, rel=NEAR)
     assert found.figures["machine_efficiency"] == pytest.approx(late_us / period_us / 3, rel=NEAR)
-
-
-@SLOWER
-@pytest.mark.parametrize("stage", STAGE_US)
-def test_of_one_frame_at_a_time_every_stage_costs_what_it_takes(stage: str, slower: float) -> None:
-    """The baseline that a run is compared with: frame time and latency are the sum of the stages."""
-    times, settings = slowed(stage, slower), Settings(FRAMES, "sequential")
-    run, total_us = simulate(graph(), settings, service(times), keep=True), sum(times.values())
-    assert (frame_us(run), 1e3 * run.report["latency_ms"]["mean"]) == pytest.approx((total_us, total_us))
-    found = found_of(run, settings)
-    assert shares(found) == pytest.approx({("work", name): us / total_us for name, us in times.items()}, abs=1e-6)
-    assert found.figures["bound"]["stage"]["name"] == max(times, key=times.__getitem__)
 
 
 # A unit held by a cap, and frames held by a rate.

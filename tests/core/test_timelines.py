@@ -150,25 +150,3 @@ def test_frames_that_skip_by_hand() -> None:
     assert [done["composite", frame] for frame in range(4)] == [(10, 12), (16, 18), (18, 20), (20, 22)]
     assert done["pose", 4][0] == 21 and not {("raster", 2), ("infer", 3)} & {*done}
     assert run.report["frames"]["skipped"] == FRAMES // 2
-
-
-@pytest.mark.parametrize("edge", EDGES)
-def test_the_newest_frame_waits_for_nobody(edge: str) -> None:
-    """Under `latest` every frame is released at its time, and none but the newest waits for a stage."""
-    run = example("latest", edge)
-    for job in run.jobs:
-        if job.stage == "pose":
-            assert job.begin_ns >= job.frame * PERIOD_MS * NS_PER_MS
-    for stage, _, _ in STAGES[1:]:
-        frames = [job.frame for job in run.jobs if job.stage == stage]
-        assert frames == sorted(frames)
-    presented = sum(job.stage == "present" for job in run.jobs)
-    assert presented + sum(run.report["frames"]["dropped"].values()) == FRAMES
-
-
-def test_no_frame_is_presented_late_under_deadline() -> None:
-    """Three periods of 5 ms after its release; a frame alone needs 13."""
-    run = example("deadline", "double")
-    ends = {job.frame: job.end_ns for job in run.jobs if job.stage == "present"}
-    assert all(end <= (frame * PERIOD_MS + 15) * NS_PER_MS for frame, end in ends.items())
-    assert run.report["deadline_misses"] == 0

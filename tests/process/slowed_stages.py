@@ -54,26 +54,20 @@ JobClock.begin, JobClock.end, BoundStage.run = begun, slowed, named
 """
 
 
-def hook_in(folder: Path) -> None:
-    """Make a folder with the module that slows a stage."""
-    folder.mkdir(parents=True)
-    (folder / "sitecustomize.py").write_text(HOOK, encoding="utf-8")
-
-
-def run(hook: Path, command: list[str], stage: str, share: float = SHARE, keep: Path | None = None) -> dict[str, Any]:
-    """The report of one run in which `stage` takes `share` more; "": none does. `keep`: where the run stays."""
-    out = keep or hook / "run"
+def run(hook: Path, command: list[str], stage: str) -> dict[str, Any]:
+    """The report of one run in which `stage` takes `SHARE` more; "": none does."""
+    out = hook / "run"
     path = os.pathsep.join(filter(None, (str(hook), os.environ.get("PYTHONPATH"))))
-    environment = {**os.environ, "PYTHONPATH": path, "SLOWED_STAGE": stage, "SLOWED_SHARE": str(share)}
+    environment = {**os.environ, "PYTHONPATH": path, "SLOWED_STAGE": stage, "SLOWED_SHARE": str(SHARE)}
     subprocess.run([*command, "--out", str(out)], env=environment, check=True, capture_output=True)
     report: dict[str, Any] = json.loads((out / "report.json").read_text(encoding="utf-8"))
-    if keep is None:
-        shutil.rmtree(out)
+    shutil.rmtree(out)
     return report
 
 
 def main(folder: Path, rounds: int, command: list[str]) -> None:
-    hook_in(folder)
+    folder.mkdir(parents=True)
+    (folder / "sitecustomize.py").write_text(HOOK, encoding="utf-8")
     stages = [*run(folder, command, "")["stages"]]
     cost: dict[str, list[float]] = {stage: [] for stage in stages}
     grown: dict[str, list[float]] = {stage: [] for stage in stages}

@@ -7,7 +7,6 @@ import pytest
 from support.cpu_load import FACTORY
 from support.second_accounts import largest_difference, second_accounts
 from trilane.hw_profiles.host import usable_cores
-from trilane.pipeline import realtime_clock
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run import run_pipeline
@@ -58,10 +57,3 @@ def test_a_job_that_sleeps_works_only_if_it_has_a_device(device: bool) -> None:
             assert unit.busy <= computed + ROUNDING
             assert unit.idle.overhead >= slept
         assert unit.busy + sum(unit.idle.as_json().values()) == pytest.approx(1)
-
-
-def test_a_kernel_that_does_not_count_run_delay_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(realtime_clock, "counts_run_delay", lambda: False)
-    result = run()
-    assert [unit.idle.preempted for unit in result.report.units.values()] == [None, None]
-    assert any("CONFIG_SCHED_INFO" in message for message in result.messages)

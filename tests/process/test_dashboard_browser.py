@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import signal
-import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -19,6 +16,7 @@ pytest.importorskip("uvicorn", reason="the extra dashboard is not installed")
 pytest.importorskip("websockets", reason="the extra dashboard is not installed")
 playwright = pytest.importorskip("playwright.sync_api", reason="the extra browser is not installed")
 
+from support.dashboard_client import serving  # noqa: E402
 from support.dashboard_double import DoubleView, Served  # noqa: E402
 from trilane import machine  # noqa: E402
 from trilane.apps.dashboard.view import PICTURE_KIND, ChangesSaid, ControlSaid, Seek  # noqa: E402
@@ -425,43 +423,6 @@ def test_perfetto_is_handed_the_trace_on_a_click_alone(opened: Callable[..., Wat
         assert seen.foreign == []
 
 
-class Started:
-    """Context manager: `trilane run --dashboard` in a process of its own; `url` is the page's address."""
-
-    def __init__(self, folder: Path) -> None:
-        command = [sys.executable, "-m", "trilane", "run", "--dashboard", *SMALL, *PACE, "--out", str(folder)]
-        self._process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
-        self.said: list[str] = []
-        self.url = ""
-
-    def _listen(self) -> None:
-        assert self._process.stderr is not None
-        self.said.extend(self._process.stderr)
-
-    def __enter__(self) -> Started:
-        assert self._process.stderr is not None
-        for line in self._process.stderr:
-            self.said.append(line)
-            if "http://" in line:
-                self.url = line[line.index("http://") :].strip()
-                break
-        assert self.url, "".join(self.said)
-        self._listener = threading.Thread(target=self._listen)
-        self._listener.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._process.send_signal(signal.SIGINT)
-        try:
-            self._process.wait(60)
-        finally:
-            self._process.kill()
-            self._process.wait()
-            self._listener.join()
-            if self._process.stderr is not None:
-                self._process.stderr.close()
-
-
 def cell(seen: Watched, unit: str, column: int) -> str:
     """Of the table of the units."""
     return str(seen.page.locator(f"#units tr[data-unit={unit}]").locator("th, td").nth(column).inner_text())
@@ -478,8 +439,9 @@ def in_flight(seen: Watched) -> int:
 
 @pytest.mark.timeout(300)
 def test_a_run_is_watched_and_steered(opened: Callable[..., Watched], tmp_path: Path) -> None:
-    with Started(tmp_path / "run") as started:
-        seen = opened(started.url)
+    command = [sys.executable, "-m", "trilane", "run", "--dashboard", *SMALL, *PACE, "--out", "run"]
+    with serving(command, tmp_path) as served:
+        seen = opened(served.url)
         seen.wait_for("() => document.getElementById('picture').dataset.frame > 0")
         corner = seen.page.evaluate(CORNER)
         for canvas in ("picture", "timeline"):

@@ -92,16 +92,12 @@ def busy_process() -> Iterator[None]:
     code = f"import os\nos.sched_setaffinity(0, [{CORES[0]}])\nwhile True: pass"
     process = subprocess.Popen([sys.executable, "-c", code])
     try:
-        while not _is_pinned(process.pid):
+        while psutil.Process(process.pid).cpu_affinity() != [CORES[0]]:
             time.sleep(0.01)
         yield
     finally:
         process.kill()
         process.wait()
-
-
-def _is_pinned(pid: int) -> bool:
-    return psutil.Process(pid).cpu_affinity() == [CORES[0]]
 
 
 @pytest.mark.usefixtures("busy_process")

@@ -36,17 +36,6 @@ def test_a_variant_that_fails_says_why(tmp_path):
         pass
 
 
-def test_a_file_is_measured(file, monkeypatch):
-    monkeypatch.setattr(roofline, "measure", lambda _threads: {"int8_gmac_s": 100.0, "int8_instruction_gmac_s": 400.0})
-    result = infer.measure(str(file), runtime=("ort",), threads=1, seconds=0.2, period=0.1)
-    (row,) = result["rows"]
-    assert row["runtime"] == "ort" and len(row["periods"]) == 2
-    assert row["min_ms"] <= row["p50_ms"] <= row["p99_ms"] <= row["max_ms"]
-    assert 0 < row["share_of_roofline"] < 10
-    assert row["share_of_instruction_peak"] == pytest.approx(row["share_of_roofline"] / 4)
-    assert row["int8_over_fp32"] is None
-
-
 def test_whole_batches_are_run(file, monkeypatch):
     """That a batch's time is divided by its frames is held with times that are told: test_inference_bench.py."""
     monkeypatch.setattr(roofline, "measure", lambda _threads: {"int8_gmac_s": 100.0, "int8_instruction_gmac_s": 400.0})
@@ -56,9 +45,6 @@ def test_whole_batches_are_run(file, monkeypatch):
     assert all(0 < row["min_ms"] <= row["p50_ms"] <= row["max_ms"] for row in (one, eight))
 
 
-@pytest.mark.parametrize(
-    ("asked", "message"), [({"runtime": ("tpu",)}, "tpu"), ({"period": 0.0}, "--period"), ({"period": 9.0}, "--period")]
-)
-def test_wrong_options_are_named(asked, message):
-    with pytest.raises(BadInputError, match=message):
-        infer.measure(**asked)
+def test_an_unknown_runtime_is_named():
+    with pytest.raises(BadInputError, match="tpu"):
+        infer.measure(runtime=("tpu",))

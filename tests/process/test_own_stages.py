@@ -110,11 +110,3 @@ def test_without_the_guard_no_unit_starts_units(module: Path) -> None:
     assert done.returncode == 1
     assert "run_pipeline was called while a unit imported its stages" in done.stderr
     assert 'expected a call under `if __name__ == "__main__":`' in done.stderr
-
-
-def test_a_stage_that_fails_ends_the_file_with_its_error(module: Path) -> None:
-    broken = module.read_text().replace("packet = self.inputs[slot_in]", "raise ValueError(f'frame {frame} is dark')")
-    module.write_text(broken, encoding="utf-8")
-    done = started([str(module)], module.parent)
-    assert done.returncode == 1
-    assert "frame 0 is dark" in done.stderr

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from support.doubles import pipeline_of_doubles
-from support.trace_reading import Slice, read_trace
+from support.trace_reading import read_trace
 from trilane.apps.run.report import read_report
 from trilane.apps.run.run_job import Hooks, Prepared, RunOutcome, run_to_folder
 from trilane.errors import TrilaneError
@@ -103,7 +103,9 @@ def test_the_trace_of_a_run_adds_up_to_its_report(tmp_path: Path) -> None:
     through: dict[int, list[str]] = defaultdict(list)
     for unit, row in outcome.report.units.items():
         slices = trace.of(f"trilane, host clock/{unit}")
-        busy_ns = sum(one.end_ns - one.begin_ns - lost_ns(one) for one in slices if one.flows)
+        jobs = [one for one in slices if one.flows]
+        lost_ns = sum(one.notes.get(key, 0) for one in jobs for key in ("preempted_ns", "asleep_ns"))
+        busy_ns = sum(one.end_ns - one.begin_ns for one in jobs) - lost_ns
         span_ns = slices[-1].end_ns - slices[0].begin_ns
         assert span_ns / 1e9 == pytest.approx(outcome.report.duration_s, rel=1e-6)
         assert busy_ns / span_ns == pytest.approx(row.busy, abs=0.005)
@@ -118,12 +120,6 @@ def test_the_trace_of_a_run_adds_up_to_its_report(tmp_path: Path) -> None:
     assert run.notes["config"]["policy"] == "pipelined"
     assert run.notes["machine"]["hardware_counters"] == machine_facts()["hardware_counters"]
     assert run.notes["times"] == "ns of CLOCK_MONOTONIC"
-
-
-def lost_ns(one: Slice) -> int:
-    """Of a job: the time in which its unit had no core or slept, which is not busy."""
-    lost: int = one.notes.get("preempted_ns", 0) + one.notes.get("asleep_ns", 0)
-    return lost
 
 
 def test_no_baseline_beside_a_sequential_run(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from support.doubles import pipeline_of_doubles as doubles
 from trilane.bench import scenario
 from trilane.bench.scenario import Load
-from trilane.errors import BadInputError, TrilaneError
+from trilane.errors import TrilaneError
 from trilane.pipeline.controls import FrameRequestQueue
 
 pytestmark = pytest.mark.usefixtures("nothing_left")
@@ -82,19 +82,3 @@ def test_an_interrupt_ends_a_scenario(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(scenario.PATTERNS, "offline", ask_and_interrupt)
     with pytest.raises(KeyboardInterrupt):
         scenario.run_scenario(doubles(), {}, Load("offline", seconds=60), "trilane", "pipelined")
-
-
-@pytest.mark.parametrize(
-    "asked",
-    [
-        {"scenario": ("x",)},
-        {"judge": ("x",)},
-        {"seconds": 0.0},
-        {"rate": float("nan")},
-        {"samples": 0},
-        {"limit_ms": -1.0},
-    ],
-)
-def test_a_scenario_that_cannot_be_played_is_refused(asked: dict[str, object]) -> None:
-    with pytest.raises(BadInputError, match="expected"):
-        scenario.measure(**asked)  # type: ignore[arg-type]

@@ -4,31 +4,13 @@ from __future__ import annotations
 
 import os
 import re
-import sys
 from pathlib import Path
 
 import pytest
 
-from trilane.bench import handoff, pipeline, scheduler
+from trilane.bench import handoff, pipeline
 from trilane.bench.lib import handoff_variants
-from trilane.errors import BadInputError
-from trilane.scheduler.ledger import JobRecord
 from trilane.units import NO_FIGURES
-
-
-def job(ready: int, dispatch: int, begin: int, end: int) -> JobRecord:
-    return JobRecord("infer", "dsp", 0, ready, dispatch, begin, end)
-
-
-def test_idle_time_between_jobs_has_one_cause_for_every_nanosecond() -> None:
-    jobs = [
-        job(0, 0, 0, 10),
-        job(5, 6, 12, 20),  # held: 2 until it began
-        job(30, 33, 37, 60),  # 10 without input, 3 until the scheduler told, 4 until it began
-        job(50, 65, 65, 100),  # 5 with input, not told
-    ]
-    shares = pipeline.idle_between_jobs(jobs)
-    assert shares == pytest.approx({"idle": 0.24, "starved": 0.10, "undispatched": 0.08, "overhead": 0.06})
 
 
 def test_the_pipeline_is_set_against_its_stages_alone(drawable_bundle: Path) -> None:
@@ -47,15 +29,6 @@ def test_the_pipeline_is_set_against_its_stages_alone(drawable_bundle: Path) -> 
     (accuracy,) = result["accuracy"].values()
     assert accuracy["source"] == NO_FIGURES
     assert "never validated" in accuracy["why"]
-
-
-@pytest.mark.parametrize(
-    "asked",
-    [{"frames": 3}, {"rounds": 0}, {"cores": (99,)}, {"size": ("63x64",)}, {"policy": ("x",)}, {"edge": ("x",)}],
-)
-def test_a_pipeline_that_cannot_be_measured_is_refused(asked: dict[str, object]) -> None:
-    with pytest.raises(BadInputError):
-        pipeline.measure(**asked)  # type: ignore[arg-type]
 
 
 def peers_files() -> set[Path]:
@@ -78,22 +51,3 @@ def test_every_way_hands_over_the_same_bytes() -> None:
         assert row["read_p50_us"] > row["p50_us"]
     assert result["met"] == {"slot": None, handoff.PIPELINE: None}
     assert peers_files() == before
-
-
-def test_virtual_time_agrees_with_simpy_and_repeats_itself() -> None:
-    pytest.importorskip("simpy")
-    result = scheduler.measure(minutes=0.1, rounds=1, seeds=3)
-    ways = ["trilane", "trilane, no report", "trilane, recorded", "simpy", "simpy lean"]
-    assert [row["way"] for row in result["rows"]] == ways
-    assert set(result["over_trilane"]) == {*ways[1:]}
-    assert {row["way"]: row["processed"] for row in result["rows"]}["simpy lean"] == 360 * 6  # a timeout for each event
-    assert result["agree"] == 360
-    assert result["same_traces"] == result["different_traces"] == 3
-
-
-def test_without_simpy_the_bench_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "simpy", None)
-    result = scheduler.measure(minutes=0.05, rounds=1, seeds=1)
-    assert {row["way"].partition(",")[0] for row in result["rows"]} == {"trilane"}
-    assert result["over_simpy"] is result["over_simpy_lean"] is None
-    assert "pip install" in result["absent"]["simpy"]

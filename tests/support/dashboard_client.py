@@ -98,7 +98,7 @@ class Served:
         self.parent = parent
         matched = re.fullmatch(r"http://127\.0\.0\.1:([0-9]+)/\?token=(.+)", url)
         assert matched is not None, url
-        self.port, self.token = int(matched[1]), matched[2]
+        self.url, self.port, self.token = url, int(matched[1]), matched[2]
 
     def connect(self, token: str | None = None, origin: str | None = None, **more: Any) -> Any:
         """A WebSocket, as of the page unless told otherwise."""

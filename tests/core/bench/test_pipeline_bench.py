@@ -148,6 +148,7 @@ def test_every_avatar_size_and_number_of_cores_is_measured(
         ({"rounds": 0}, "expected at least 20 and 1"),
         ({"policy": ("best",)}, "--policy"),
         ({"edge": ("quadruple",)}, "--edge"),
+        ({"size": ("63x64",)}, "size: found side 63"),
     ],
 )
 def test_what_cannot_be_measured_is_refused(asked: dict[str, Any], words: str) -> None:
@@ -307,17 +308,6 @@ def test_only_the_time_in_which_both_ran_counts() -> None:
     assert pipeline.overlapping_ms([run_of(10).jobs, run_of(20, begin_ms=40).jobs]) == [10, 20]
     with pytest.raises(TrilaneError, match="met for 1 frames"):
         pipeline.overlapping_ms([run_of(10).jobs, run_of(10, begin_ms=100).jobs])
-
-
-def test_the_command_asks_for_both_avatars(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pipeline, "measure_beside", lambda *asked: [asked])
-    result = pipeline.measure(
-        **{"size": ("256",), "frames": 30, "rounds": 2, "cores": (1,), "edge": ("single",), "video": False},
-        **{"beside": "default", "beside_size": "64"},  # type: ignore[arg-type]
-    )
-    asked = [Asked("default", size, 30, "auto", usable_cores()[:1], False, "single") for size in ("256", "64")]
-    assert result["rows"] == [(asked, 2)]
-    assert result["config"] == {"frames": 30, "rounds": 2, "runtime": "auto", "video": False, "cores": 1}
 
 
 JOBS = (JobRecord("pose", "cpu", 0, 1, 2, 3, 4), JobRecord("infer", "dsp", 0, 4, 5, 6, 7))

@@ -1,95 +1,57 @@
-"""`trilane profiles` beside doubles of what reads and fits: each table, each document and each refusal."""
+"""`trilane profiles`: each table, each document and each refusal; fits are doubles."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from trilane.apps.cli import profiles as cli
 from trilane.hw_profiles import fit as fit_module
-from trilane.hw_profiles import fit_engines, profile_files
 from trilane.hw_profiles.fit import ProfileFit, Residual
-from trilane.hw_profiles.fit_engines import PublishedTime
+from trilane.hw_profiles.fit_engines import check_published
+from trilane.hw_profiles.profile_files import load_profile, profile_names
 from trilane.hw_profiles.reference_networks import ConfigurationRow, NetworkSpec
 
 Command = Callable[..., tuple[str, str]]
 
 
-def a_number(value: float | None, spread: float | None, kind: str = "fitted") -> dict[str, Any]:
-    return {"value": value, "spread": spread, "kind": kind, "source": f"where {value} is from"}
+def cells(text: str) -> list[list[str]]:
+    return [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines()]
 
 
-class Profile(SimpleNamespace):
-    def model_dump(self, **form: str) -> dict[str, Any]:
-        data = {
-            "title": self.title,
-            "units": {"gpu": {"peak": a_number(1234567.0, 0.126), "names": ["a"]}},
-            "base": a_number(0.5, None, "assumed"),
-            "unknown": a_number(None, None, "unknown"),
-        }
-        return data | ({"form": form["mode"]} if form else {})
+def test_profiles_are_listed_shown_and_checked(command: Command) -> None:
+    """But for templates, which are no chips: they are valid, and no latency was published of them."""
 
+    def document(*words: str) -> Any:
+        return json.loads(command("profiles", *words, "--json")[0])
 
-@pytest.fixture
-def known(monkeypatch: pytest.MonkeyPatch) -> None:
-    def units(name: str) -> Any:
-        return {unit: SimpleNamespace(title=f"{unit} of {name}") for unit in ("dsp", "gpu")}
-
-    def load_profile(name: str) -> Profile:
-        return Profile(name=name, title=f"The {name}", template=name == "form", units=units(name))
-
-    def check_published(name: str, profile: Profile) -> list[PublishedTime]:
-        assert profile.title == f"The {name}"
-        if name != "one":
-            return []
-        return [
-            PublishedTime("one", "unet", "tflite", False, 54.1, 55.678),
-            PublishedTime("one", "resnet18", "qnn_dlc", True, 0.5, 0.4),
-        ]
-
-    monkeypatch.setattr(profile_files, "load_profile", load_profile)
-    monkeypatch.setattr(profile_files, "profile_names", lambda: ["one", "form", "two"])
-    monkeypatch.setattr(fit_engines, "check_published", check_published)
-
-
-@pytest.mark.usefixtures("known")
-@pytest.mark.parametrize(
-    ("words", "name"),
-    [(("list",), "profiles-list"), (("show", "one"), "profiles-show-one"), (("check",), "profiles-check-one")],
-)
-def test_profiles_are_listed_shown_and_checked(
-    words: tuple[str, ...], name: str, command: Command, check_printed: Callable[..., None]
-) -> None:
-    check_printed(name, command("profiles", *words)[0])
-    keys = ("profile", "network", "runtime", "independent", "published_ms", "predicted_ms", "error")
-    published = (
-        ("one", "unet", "tflite", False, 54.1, 55.678, 55.678 / 54.1 - 1),
-        ("one", "resnet18", "qnn_dlc", True, 0.5, 0.4, 0.4 / 0.5 - 1),
-    )
-    documents = {
-        "list": {
-            "profiles": [
-                {"name": name, "title": f"The {name}", "units": {unit: f"{unit} of {name}" for unit in ("dsp", "gpu")}}
-                for name in ("one", "two")
-            ]
-        },
-        "show": Profile(title="The one").model_dump(mode="json"),
-        "check": {
-            "valid": ["one", "form", "two"],
-            "published": [dict(zip(keys, row, strict=True)) for row in published],
-        },
+    chips = [chip for chip in map(load_profile, profile_names()) if not chip.template]
+    assert document("list")["profiles"] == [
+        {"name": chip.name, "title": chip.title, "units": {name: unit.title for name, unit in chip.units.items()}}
+        for chip in chips
+    ]
+    row = ["qcs6490", "Dragonwing QCS6490", "Adreno 643, 812 MHz", "Hexagon (V68)"]
+    assert row in cells(command("profiles", "list")[0])
+    template = load_profile("phone-template")
+    assert document("show", "phone-template") == template.model_dump(mode="json")
+    shown = cells(command("profiles", "show", "phone-template")[0])
+    assert ["memory.bandwidth_gb_s", "unknown", "", "unknown", "set by the chip"] in shown
+    assert ["memory.application_use_fraction", "0.15", "60", "assumed"] in [each[:4] for each in shown]
+    latencies = check_published("snapdragon-8-gen-1", load_profile("snapdragon-8-gen-1"))
+    assert document("check", "phone-template", "snapdragon-8-gen-1") == {
+        "valid": ["phone-template", "snapdragon-8-gen-1"],
+        "published": [{**latency._asdict(), "error": latency.error} for latency in latencies],
     }
-    assert json.loads(command("profiles", *words, "--json")[0]) == documents[words[0]]
-
-
-@pytest.mark.usefixtures("known")
-def test_some_profiles_are_checked(command: Command) -> None:
-    assert command("profiles", "check", "two", "form") == ("2 valid: two, form\n", "")
+    assert command("profiles", "check", "phone-template") == ("1 valid: phone-template\n", "")
+    first = latencies[0]
+    assert [
+        *("snapdragon-8-gen-1", "unet", "tflite", "54.07", f"{first.predicted_ms:.2f}", f"{100 * first.error:+.0f} %"),
+        "among the rows of the fit",
+    ] in cells(command("profiles", "check", "snapdragon-8-gen-1")[0])
 
 
 def a_fit() -> ProfileFit:

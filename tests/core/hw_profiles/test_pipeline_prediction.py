@@ -159,24 +159,6 @@ def test_a_full_queue_turns_away_as_many_as_theory_says(predict: Predict) -> Non
     assert abs(fmean(shares) - loss) < 3 * stdev(shares) / sqrt(len(shares))
 
 
-def test_branches_choose_the_same_frames(predict: Predict) -> None:
-    """A of 10 and B of 11 ms behind a source every 6 ms: a frame that one has begun is not stale for the other."""
-    text = """
-    [run]
-    fps = 166.66666666666666
-    policy = "latest"
-    [stages]
-    source = { unit = "s", time_ms = 0 }
-    a = { unit = "a", in = "source", time_ms = 10 }
-    b = { unit = "b", in = "source", time_ms = 11 }
-    join = { unit = "j", in = { a = "a", b = "b" }, time_ms = 0 }
-    """
-    answer = predict(text)
-    assert answer["frame_time_ms"]["mean"] == pytest.approx(11, abs=0.03)
-    assert answer["needs_ms"]["mean"] == 11
-    assert sum(answer["frames"]["dropped"].values()) + answer["frames"]["presented"] == 1000
-
-
 def test_samples_are_drawn_as_they_are(predict: Predict) -> None:
     row = predict(chain("{ samples = [1, 1, 4] }", head="[run]\nframes = 3000"))["stages"]["s0"]
     assert row["alone_ms"] == 2
@@ -584,11 +566,6 @@ def test_a_prediction_is_trusted_no_more_than_the_run_whose_times_it_takes(
     assert verdict["trusted"] is (others == 0.01)
     own = documents(text.replace("m:f", 'm:f", time_ms = 5, unit = "a" }#'), "--measured", str(run))["pipelines"][0]
     assert dict(own["verdict"]["lines"])["TRUST"] == "computed; the times have no interval"
-
-
-def test_what_a_frame_needs_has_no_part_of_the_start(predict: Predict) -> None:
-    stages = 't = { unit = "u", time_ms = 12 }\nd = { unit = "u", in = "t", time_ms = 45, every = 3 }'
-    assert predict(f"[stages]\n{stages}")["needs_ms"]["mean"] == 27
 
 
 @pytest.mark.parametrize(

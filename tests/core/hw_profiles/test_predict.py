@@ -78,14 +78,6 @@ def test_no_frame_in_time_has_no_latency_rather_than_the_least_one() -> None:
     assert now.frame_ms == pytest.approx(network_ms)
 
 
-def test_two_buffers_make_the_network_the_limit() -> None:
-    profile = load_profile("snapdragon-888")
-    corners = corners_of(profile, SUSTAINED)
-    now = steady(profile, Plan(NETWORK, "dsp", Variant("pipelined", "double")), corners)
-    assert now.frame_ms == pytest.approx(now.stages_ms["infer"], rel=0.01)
-    assert now.busy["dsp"] > 0.97
-
-
 def test_the_display_caps_what_is_fast() -> None:
     profile = load_profile("snapdragon-888")
     now = steady(

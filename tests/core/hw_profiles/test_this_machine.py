@@ -32,7 +32,6 @@ from trilane.stages.blocks import network as block
 from trilane.stages.dsp import ort
 from trilane.units import BURST
 
-ANY: Any = None
 CORES = (0, 1, 2)
 TOOK_NS = {1: [4_000_000, 5_000_000, 9_000_000], 2: [3_000_000, 3_000_000, 3_000_000]}
 

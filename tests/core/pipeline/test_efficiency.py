@@ -211,21 +211,6 @@ def test_the_bounds_share_has_an_interval_that_holds_it_and_short_runs_have_none
     assert ran(STAGE_NS, 51)[1].figures["bound"]["stage"]["share_low"] is not None
 
 
-def test_stages_whose_shares_may_be_equal_are_rivals_and_a_surely_smaller_one_is_none() -> None:
-    """raster and composite take 5 and 7 us, and after ten frames the other way round, so 6 us each in the mean."""
-    turns = {"raster": (5000, 7000), "composite": (7000, 5000)}
-
-    def service(stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
-        return turns.get(stage, (STAGE_NS[stage],) * 2)[frame // 10 % 2]
-
-    run = simulate(GRAPH, SETTINGS, service, keep=True)
-    found = found_of(run)
-    stage = found.figures["bound"]["stage"]
-    assert {stage["name"], *stage["rivals"]} == {"raster", "composite"}
-    assert ran(STAGE_NS)[1].figures["bound"]["stage"]["rivals"] == []
-    assert ran(STAGE_NS, 50)[1].figures["bound"]["stage"]["rivals"] is None
-
-
 def test_time_that_another_stage_had_a_core_is_that_stages_and_the_rest_is_nobodys() -> None:
     """infer shares core 0 with pose: of its 10 ns on the path pose had the core for 4 and nobody of the run for 2."""
     graph = chain([("pose", "cpu"), ("infer", "dsp")], "double", "infer")
@@ -243,19 +228,6 @@ def test_time_that_another_stage_had_a_core_is_that_stages_and_the_rest_is_nobod
     }
     assert found.taken["infer"].of.keys() == {"pose"}
     assert found.figures["core_efficiency"] == pytest.approx(0.8, abs=0.02)
-
-
-def test_what_other_programs_take_is_no_units_and_no_work() -> None:
-    """Of every job of the GPU unit three quarters were without a core: it is 0.25 efficient, and others bound it."""
-    run = simulate(GRAPH, SETTINGS, lambda stage, *_: STAGE_NS[stage], keep=True)
-    jobs = [
-        one._replace(preempted_ns=one.cpu_ns * 3 // 4, cpu_ns=one.cpu_ns // 4) if one.unit == "gpu" else one
-        for one in run.jobs
-    ]
-    found = found_of(run, {"gpu": ON_1, "cpu": ON_0}, jobs)
-    assert found.figures["bottleneck"] == "other programs"
-    assert found.figures["bound"]["unit"]["share"] == pytest.approx(0.75, abs=0.01)
-    assert found.figures["bound"]["stage"]["name"] == "composite"
 
 
 @pytest.mark.parametrize("slower", [0.0, 0.2, 0.5, 1.0])

@@ -35,7 +35,8 @@ def drawn(seed: int) -> tuple[Graph, Settings, dict[str, int], list[tuple[int, s
         inputs = tuple(Input(name, latest=rng.random() < 0.25 * (each > 0)) for each, name in enumerate(read))
         every = rng.choice((2, 3)) if rng.random() < 0.2 else 1
         stages.append(StageSpec(f"s{place}", f"u{rng.randint(0, 3)}", inputs, every))
-    bare = Graph(tuple(stages), ("double",) * len(_streams(stages)), "s0")
+    read = {each.stage for stage in stages for each in stage.inputs or ()}
+    bare = Graph(tuple(stages), ("double",) * len(read), "s0")
     newest = {each.stage for stage in stages for each in stage.inputs or () if each.latest}
     rules = []
     for name, readers in bare.streams.items():
@@ -49,10 +50,6 @@ def drawn(seed: int) -> tuple[Graph, Settings, dict[str, int], list[tuple[int, s
     settings = Settings(40, policy, period_ns=period_ns, deadline_ns=deadline_ns, in_flight=in_flight)
     deaths = [(rng.randint(1, 600), f"{rng.choice(graph.units)}") for _ in range(rng.choice((0, 0, 1, 3)))]
     return graph, settings, {stage.name: rng.randint(1, 20) for stage in stages}, sorted(deaths)
-
-
-def _streams(stages: list[StageSpec]) -> set[str]:
-    return {each.stage for stage in stages for each in stage.inputs or ()}
 
 
 def run(seed: int) -> tuple[Recording, Sequence[JobRecord], dict[str, Any]]:

@@ -184,16 +184,6 @@ EXPECTED: dict[str, dict[tuple[str, str], tuple[int | None, float]]] = {
 }
 
 
-@pytest.fixture
-def read(tmp_path: Path) -> Callable[[str], Measurements]:
-    def reader(text: str) -> Measurements:
-        path = tmp_path / "file"
-        path.write_text(text, encoding="utf-8", newline="")
-        return read_measurements(path)
-
-    return reader
-
-
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize("written", [str, lambda text: "\ufeff" + text.replace("\n", "\r\n")], ids=["plain", "windows"])
 def test_what_is_read_is_what_the_source_states(
@@ -270,12 +260,12 @@ def test_rest_times_that_rise_again(read: Callable[[str], Measurements]) -> None
     )
 
 
-#: format -> (what is replaced, by what, the refused row, a word of the reason): ten for each.
-BROKEN: dict[str, list[tuple[str, str, str, str]]] = {
+Change = tuple[str, str, str, str]
+#: format -> what is replaced, by what, the refused row, a word of the reason.
+BROKEN: dict[str, list[Change]] = {
     "qnn": [
         ("88338,US", "-88338,US", "line 5: RPC (execute) time", "negative"),
         ("88338,US", "nan,US", "line 5: RPC (execute) time", "finite"),
-        ("88338,US", "x,US", "line 5: RPC (execute) time", "a number was expected"),
         ("88338,US", ",US", "line 5: RPC (execute) time", "a number was expected"),
         ("88338,US", "88338,CYCLES", "line 5: RPC (execute) time", "unit is CYCLES"),
         ("88338,US", "88338,HOURS", "line 5: RPC (execute) time", "unknown unit"),
@@ -291,24 +281,14 @@ BROKEN: dict[str, list[tuple[str, str, str, str]]] = {
     ],
     "qhas": [
         ('"time_us": 1343', '"time_us": 1.343', "htp_overall_summary.data[0]: time_us", "a unit is wrong"),
-        ('"time_us": 1343', '"time_us": -1343', "htp_overall_summary.data[0]: time_us", "negative"),
-        ('"time_us": 1343', '"time_us": NaN', "htp_overall_summary.data[0]: time_us", "finite"),
-        ('"time_us": 1343', '"time_us": "1343"', "htp_overall_summary.data[0]: time_us", "a number was expected"),
-        ('"time_us": 1343', '"time_us": null', "htp_overall_summary.data[0]: time_us", "nothing"),
         ('"time_us": 1343,', "", "htp_overall_summary.data[0]: time_us", "nothing"),
         ('_us": 1132', '_us": 11320', "htp_overall_summary.data[0]: graph_execute_us", "longer than"),
-        ('_us": 1132', '_us": true', "htp_overall_summary.data[0]: graph_execute_us", "a number was expected"),
         ('"cycles": 671293', '"cycles": -5', "qnn_op_instances_nodes.data[0]: /resnet/embedder/embedder/", "negative"),
         ('"cycles": 277418', '"cycles": 1e999', "qnn_op_instances_nodes.data[1]: Transpose_token_328_2", "finite"),
     ],
     "ort": [
-        ('"dur" :109600', '"dur" :-109600', "event 4: model_run", "negative"),
-        ('"dur" :109600', '"dur" :NaN', "event 4: model_run", "finite"),
-        ('"dur" :109600', '"dur" :"109600"', "event 4: model_run", "a number was expected"),
         ('"dur" :109600,', "", "event 4: model_run", "nothing"),
         ('"dur" :109600', '"dur" :0', "event 4: model_run", "a run takes time"),
-        ('"dur" :109600', '"dur" :99999999999999', "event 4: model_run", "over an hour"),
-        ('"dur" :109600', '"dur" :[]', "event 4: model_run", "a number was expected"),
         ('"dur" :775', '"dur" :-775', "event 2: ReLU32_kernel_time", "negative"),
         ('"model_run","args" : {}},', '"model_ru', "line 6", "cut off"),
         ('"args" : {}}\n]\n', '"args" : {}},\n{"cat" : "No', "line 8", "cut off"),
@@ -326,12 +306,7 @@ BROKEN: dict[str, list[tuple[str, str, str, str]]] = {
         ("83.750", "-83.750", "line 12: TfLiteNnapiDelegate [model/tf.math.multiply_23/Mul]:270", "negative"),
     ],
     "loadgen": [
-        (
-            "Mean latency (ns)               : 5734487",
-            "Mean latency (ns) : -5",
-            "line 11: Mean latency (ns)",
-            "negative",
-        ),
+        (": 5734487", ": -5", "line 11: Mean latency (ns)", "negative"),
         (": 5734487", ": nan", "line 11: Mean latency (ns)", "finite"),
         (": 5734487", ": 5.734487", "line 11: Mean latency (ns)", "below the least"),
         (": 5734487", ": x", "line 11: Mean latency (ns)", "a number was expected"),
@@ -343,11 +318,7 @@ BROKEN: dict[str, list[tuple[str, str, str, str]]] = {
         (": SingleStream", ": Stream", "line 3", "none of"),
     ],
     "app": [
-        ("0.005734487", "-0.005734487", "results[0]: image_classification_v2", "negative"),
         ("0.005734487", "5.734487", "results[0]: image_classification_v2", "a unit is wrong"),
-        ("0.005734487", "NaN", "results[0]: image_classification_v2", "finite"),
-        ("0.005734487", '"0.0057"', "results[0]: image_classification_v2", "a number was expected"),
-        ("0.005734487", "null", "results[0]: image_classification_v2", "nothing"),
         ("0.005734487", "0", "results[0]: image_classification_v2", "a run takes time"),
         ("10461", "-1", "results[0]: image_classification_v2", "whole number"),
         ("10461", "1.5", "results[0]: image_classification_v2", "whole number"),
@@ -356,45 +327,25 @@ BROKEN: dict[str, list[tuple[str, str, str, str]]] = {
     ],
     "tensorrt": [
         ('"averageMs" : 0.0831405', '"averageMs" : 0.1831405', "row 1: conv1/7x7_s2", "timeMs / count is 0.083140"),
-        ('"averageMs" : 0.0831405', '"averageMs" : 83.1405', "row 1: conv1/7x7_s2", "timeMs / count"),
-        ('"averageMs" : 0.0831405', '"averageMs" : -0.0831405', "row 1: conv1/7x7_s2", "negative"),
-        ('"averageMs" : 0.0831405', '"averageMs" : NaN', "row 1: conv1/7x7_s2", "finite"),
-        ('"averageMs" : 0.0831405', '"averageMs" : "0.08"', "row 1: conv1/7x7_s2", "a number was expected"),
         ('"averageMs" : 0.0831405, ', "", "row 1: conv1/7x7_s2", "nothing"),
         ('"timeMs" : 303.378', '"timeMs" : -1', "row 2: pool1/3x3_s2", "negative"),
         ('"count" : 11596', '"count" : -1', "row 0", "negative"),
         ('"count" : 11596', '"count" : 1.5', "row 0", "whole number"),
-        ('"averageMs" : 0.00882802', '"averageMs" : 1e300', "row 3: prob", "over an hour"),
     ],
     "ai_hub": [
-        ("10003", "-10003", "execution_summary.all_inference_times[0]", "negative"),
-        ("10003", "NaN", "execution_summary.all_inference_times[0]", "finite"),
-        ("10003", "null", "execution_summary.all_inference_times[0]", "nothing"),
-        ("10003", '"10003"', "execution_summary.all_inference_times[0]", "a number was expected"),
         ("10003", "0", "execution_summary.all_inference_times[0]", "a run takes time"),
-        ("10003", "1e13", "execution_summary.all_inference_times[0]", "over an hour"),
         ("3652", "-3652", "execution_summary.estimated_inference_time", "negative"),
-        ("3652", "{}", "execution_summary.estimated_inference_time", "a number was expected"),
         ('"execution_time": 23', '"execution_time": -23', "execution_detail[0]: model/truediv", "negative"),
         ('{"compute_unit": "CPU"', '7, {"compute_unit": "CPU"', "execution_detail[0]", "no table"),
     ],
     "cuts": [
-        ("0.409", "-0.409", "googlenet_gpu_transition_at_124", "negative"),
-        ("0.409", "NaN", "googlenet_gpu_transition_at_124", "finite"),
-        ("0.409", "null", "googlenet_gpu_transition_at_124", "nothing"),
-        ("0.409", '"0.409"', "googlenet_gpu_transition_at_124", "a number was expected"),
-        ("0.409", "1e8", "googlenet_gpu_transition_at_124", "over an hour"),
         ("0.409", "1.0", "googlenet_gpu_transition_at_124", "rise again"),
         ("2.255", "5", "googlenet_gpu_transition_at_10", "2.434 ms behind cut 10, 5 ms behind the later cut 24"),
-        ("2.434", "true", "googlenet_gpu_transition_at_10", "a number was expected"),
-        ("1.923", "[]", "googlenet_gpu_transition_at_38", "a number was expected"),
         ('"total_time": 0.409', '"time": 1', "googlenet_gpu_transition_at_124", "nothing"),
     ],
     "executorch": [
-        ("18.563", "-18.563", FORWARD, "negative"),
         ("18.563", "185.63", FORWARD, "above the largest"),
         ("18.563", "1.8563", FORWARD, "below the least"),
-        ("18.563", "NaN", FORWARD, "finite"),
         ('"mean": 18.563, ', "", FORWARD, "no mean"),
         ('"stdev": 0.601', '"stdev": 60.1', FORWARD, "larger than all of the range"),
         ('"median": 18.523', '"median": 20.5', FORWARD, "above the largest"),
@@ -403,13 +354,30 @@ BROKEN: dict[str, list[tuple[str, str, str, str]]] = {
         ("62.505", "0", f"cases[0].pipeline: {EFFICIENTNET}", "a run takes time"),
     ],
 }
+#: format in JSON -> a time of it, and its row.
+A_TIME = {
+    "qhas": ("1343,", "htp_overall_summary.data[0]: time_us"),
+    "ort": ("109600,", "event 4: model_run"),
+    "app": ("0.005734487,", "results[0]: image_classification_v2"),
+    "tensorrt": ("0.0831405,", "row 1: conv1/7x7_s2"),
+    "ai_hub": ("10003,", "execution_summary.all_inference_times[0]"),
+    "cuts": ("0.409}", "googlenet_gpu_transition_at_124"),
+    "executorch": ("18.563,", FORWARD),
+}
+#: What stands in its place -> a word of the reason.
+NO_TIMES = {"-1": "negative", "NaN": "finite", '"1"': "a number", "true": "a number", "[]": "a number", "null": "no"}
 
 
-@pytest.mark.parametrize(
-    ("name", "change"), [(name, change) for name, changes in BROKEN.items() for change in changes], ids=str
-)
+def changes(name: str) -> list[Change]:
+    if name not in A_TIME:
+        return BROKEN[name]
+    time, row = A_TIME[name]
+    return BROKEN[name] + [(time, bad + time[-1], row, reason) for bad, reason in NO_TIMES.items()]
+
+
+@pytest.mark.parametrize(("name", "change"), [(name, change) for name in BROKEN for change in changes(name)], ids=str)
 def test_a_broken_row_is_named_and_the_others_stay(
-    name: str, change: tuple[str, str, str, str], read: Callable[[str], Measurements]
+    name: str, change: Change, read: Callable[[str], Measurements]
 ) -> None:
     old, new, row, reason = change
     assert FILES[name].count(old) == 1, "the change is of one place"

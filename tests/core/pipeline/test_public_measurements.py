@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pytest
 
 from trilane.errors import BadInputError
-from trilane.pipeline.measurements.measurement import Measurement
-from trilane.pipeline.measurements.read_file import Measurements, chosen, read_measurements
+from trilane.pipeline.measurements.read_file import Measurements, chosen
 
 HEADER = "Msg Timestamp,Message,Time,Unit of Measurement,Timing Source,Event Level,Event Identifier\n"
 
@@ -357,16 +355,6 @@ Mean latency (ns)               : 12331497965
 }
 
 
-@pytest.fixture
-def read(tmp_path: Path) -> Callable[[str], Measurements]:
-    def reader(text: str) -> Measurements:
-        path = tmp_path / "file"
-        path.write_text(text, encoding="utf-8")
-        return read_measurements(path)
-
-    return reader
-
-
 def timed(found: Measurements) -> dict[tuple[str, str], tuple[int | None, float]]:
     return {
         (each.name, each.kind): (each.count, each.mean_ms) for each in found.measurements if each.mean_ms is not None
@@ -501,49 +489,3 @@ def test_a_distribution_with_a_long_tail_is_no_wrong_unit(read: Callable[[str], 
     """The app's throughput is one over the 90th percentile, which may be twice the mean."""
     text = PUBLIC["mlperf app 4.0"].text.replace("0.00664158", "0.0035")
     assert timed(read(text)) == {("super_resolution", "run"): (9034, 3.5)}
-
-
-def one(found: Measurements) -> Measurement:
-    (only,) = found.measurements
-    return only
-
-
-def as_perfetto(text: str) -> bytes:
-    from google.protobuf import text_format
-    from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace
-
-    return bytes(text_format.Parse(text, Trace()).SerializeToString())
-
-
-#: google/perfetto, diff_tests/parser/track_event: a slice that begins on one thread and ends on another, 100 ns; and
-#: by the comments of track_event.proto an event of older Chrome (phase X, 88) of 3 us; phases B and E, 2 us.
-PERFETTO: dict[str, tuple[str, Any]] = {
-    "two threads": (
-        """packet { trusted_packet_sequence_id: 1 timestamp: 5100 incremental_state_cleared: true
-  track_event { track_uuid: 12 categories: "cat" name: "event1_on_async2" type: 1 } }
-packet { trusted_packet_sequence_id: 2 timestamp: 5200
-  track_event { track_uuid: 12 categories: "cat" name: "event1_on_async2" type: 2 } }""",
-        ("event1_on_async2", (1e-4,)),
-    ),
-    "a complete event": (
-        """packet { trusted_packet_sequence_id: 1 timestamp: 1000
-  track_event { name: "infer" legacy_event { phase: 88 duration_us: 3 } } }""",
-        ("infer", (0.003,)),
-    ),
-    "begin and end": (
-        """packet { trusted_packet_sequence_id: 1 timestamp: 1000
-  track_event { name: "infer" legacy_event { phase: 66 } } }
-packet { trusted_packet_sequence_id: 1 timestamp: 3000 track_event { legacy_event { phase: 69 } } }
-packet { trusted_packet_sequence_id: 1 timestamp: 3000 track_event { name: "mark" legacy_event { phase: 73 } } }""",
-        ("infer", (0.002,)),
-    ),
-}
-
-
-@pytest.mark.parametrize("name", PERFETTO)
-def test_events_of_perfetto_and_of_older_chrome(name: str, tmp_path: Path) -> None:
-    text, (slice_name, samples) = PERFETTO[name]
-    path = tmp_path / "trace"
-    path.write_bytes(as_perfetto(text))
-    found = one(read_measurements(path))
-    assert (found.name, found.samples_ms) == (slice_name, samples)

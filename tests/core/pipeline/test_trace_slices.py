@@ -6,7 +6,6 @@ import json
 import re
 import zlib
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -14,7 +13,7 @@ from google.protobuf import text_format
 from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TracePacket
 
 from trilane.errors import BadInputError
-from trilane.pipeline.measurements.read_file import Measurements, read_measurements
+from trilane.pipeline.measurements.read_file import Measurements
 
 #: google/perfetto, test/trace_processor/diff_tests, `test_slice_self_dur`: two slices, one in the other.
 ATRACE = """
@@ -44,27 +43,9 @@ def binary(text: str) -> bytes:
     return bytes(text_format.Parse(text, Trace()).SerializeToString())
 
 
-@pytest.fixture
-def read(tmp_path: Path) -> Callable[[bytes], Measurements]:
-    def reader(data: bytes) -> Measurements:
-        path = tmp_path / "file"
-        path.write_bytes(data)
-        return read_measurements(path)
-
-    return reader
-
-
 def samples(found: Measurements) -> dict[str, tuple[float, ...]]:
     assert {each.kind for each in found.measurements} == {"wall"}
     return {each.name: each.samples_ms for each in found.measurements}
-
-
-def test_marks_of_a_thread(read: Callable[[bytes], Measurements]) -> None:
-    assert samples(read(binary(ATRACE))) == {"ChildSlice": (3e-4,), "ParentSlice": (1e-3,)}
-
-
-def test_names_by_number_and_clocks_that_count_on(read: Callable[[bytes], Measurements]) -> None:
-    assert samples(read(binary(INTERNED))) == {"run": (0.004, 0.006)}
 
 
 #: A thread that moves from CPU 0 to 1 and back: runs from 1 to 11 and from 50 to 60 us. CPU 0's bundle comes first.
@@ -76,8 +57,42 @@ packet { ftrace_events { cpu: 1 event { timestamp: 11000 pid: 10 print { buf: "E
 """
 
 
-def test_marks_of_several_cpus_are_paired_in_the_order_of_time(read: Callable[[bytes], Measurements]) -> None:
-    assert samples(read(binary(MOVED))) == {"run": (0.01, 0.01)}
+#: google/perfetto, diff_tests/parser/track_event: a slice that begins on one thread and ends on another, 100 ns.
+TWO_THREADS = """
+packet { trusted_packet_sequence_id: 1 timestamp: 5100 incremental_state_cleared: true
+  track_event { track_uuid: 12 categories: "cat" name: "event1_on_async2" type: 1 } }
+packet { trusted_packet_sequence_id: 2 timestamp: 5200
+  track_event { track_uuid: 12 categories: "cat" name: "event1_on_async2" type: 2 } }
+"""
+#: By the comments of track_event.proto events of older Chrome: phase X (88) of 3 us, phases B and E of 2 us.
+COMPLETE = """
+packet { trusted_packet_sequence_id: 1 timestamp: 1000
+  track_event { name: "infer" legacy_event { phase: 88 duration_us: 3 } } }
+"""
+BEGIN_AND_END = """
+packet { trusted_packet_sequence_id: 1 timestamp: 1000
+  track_event { name: "infer" legacy_event { phase: 66 } } }
+packet { trusted_packet_sequence_id: 1 timestamp: 3000 track_event { legacy_event { phase: 69 } } }
+packet { trusted_packet_sequence_id: 1 timestamp: 3000 track_event { name: "mark" legacy_event { phase: 73 } } }
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (ATRACE, {"ChildSlice": (3e-4,), "ParentSlice": (1e-3,)}),
+        (INTERNED, {"run": (0.004, 0.006)}),
+        (MOVED, {"run": (0.01, 0.01)}),
+        (TWO_THREADS, {"event1_on_async2": (1e-4,)}),
+        (COMPLETE, {"infer": (0.003,)}),
+        (BEGIN_AND_END, {"infer": (0.002,)}),
+    ],
+    ids=["a thread", "names by number", "several cpus", "two threads", "a complete event", "begin and end"],
+)
+def test_slices_are_samples(
+    text: str, expected: dict[str, tuple[float, ...]], read: Callable[[bytes], Measurements]
+) -> None:
+    assert samples(read(binary(text))) == expected
 
 
 #: The last two events need what the lost packets said.

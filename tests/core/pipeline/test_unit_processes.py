@@ -221,7 +221,6 @@ def test_units_that_leave_by_themselves_are_waited_for_and_others_not_for_ever(s
     assert list(processes.pids) == ["right"]
     processes.wait_for_end(["right"], 0.01)
     assert list(processes.pids) == ["right"]
-    assert unit_processes.END_S == 2
 
 
 # the parent's end of the fork server, without one
@@ -372,7 +371,6 @@ def test_a_call_that_is_not_answered_in_time_is_none(starter_with: Starter, monk
     with pytest.raises(OSError, match="Bad file"):
         os.fstat(call._reads)
     starter.close()
-    assert (unit_starter.NOTICE_S, unit_starter.CLOSE_S) == (0.2, 5)
 
 
 # run_metrics.py

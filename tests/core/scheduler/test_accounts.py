@@ -237,12 +237,8 @@ def test_the_timeline_adds_up_to_the_ledger_in_random_runs(seed: int) -> None:
 # One of the two computations is wrong: the comparison shows it.
 
 
-def a_run() -> Simulation:
-    return run("double", faults=[(9 * MS, "v")], restart_ns=20 * MS, message_delay_ns=MS)
-
-
 def test_a_job_that_is_too_long_or_missing_shows() -> None:
-    done = a_run()
+    done = run("double", faults=[(9 * MS, "v")], restart_ns=20 * MS, message_delay_ns=MS)
     assert done.recording is not None
     first, *others = done.jobs
     share = 1e6 / (done.report["duration_s"] * 1e9)

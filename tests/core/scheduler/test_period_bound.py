@@ -18,12 +18,9 @@ NAMES = [f"s{place}" for place in range(len(FIVE))]
 
 def graph(edges: dict[str, str], *stages: StageSpec) -> Graph:
     """A graph whose streams have the rules `edges`, double where none is given."""
-    bare = Graph(stages, ("double",) * len(_streams(stages)), stages[-1].name)
+    read = {each.stage for stage in stages for each in stage.inputs or ()}
+    bare = Graph(stages, ("double",) * len(read), stages[-1].name)
     return Graph(stages, tuple(edges.get(name, "double") for name in bare.streams), stages[-1].name)
-
-
-def _streams(stages: tuple[StageSpec, ...]) -> set[str]:
-    return {each.stage for stage in stages for each in stage.inputs or ()}
 
 
 def reads(name: str, *sources: str, unit: str = "", every: int = 1) -> StageSpec:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import pytest
 
-from support.sliced_kernel import CORES, FRAMES, STEP_MS, WARM, Kernel
+from support.sliced_kernel import CORES, FRAMES, STEP_MS, WARM, placed_frame_ms
 from trilane.scheduler.placement import Ranked, Rules, Times, UnitWork, ranked, worth_trying
 
 FIRST = Rules("cpu")
@@ -34,7 +34,7 @@ def test_among_those_that_are_tried_is_one_as_good_as_any(cpu: float, gpu: float
     found = ranked(CORES, times, FIRST)
     rule = next(each for each in found if cores_of(each) == RULE)
     tried = [each.placement for each in worth_trying(found, rule)]
-    frames = [(Kernel(each.placement, ms).frame_ms(), each.placement in tried) for each in found]
+    frames = [(placed_frame_ms(each.placement, ms), each.placement in tried) for each in found]
     assert len(found) == 14
     assert min(frame for frame, is_tried in frames if is_tried) <= 1.03 * min(frame for frame, _ in frames)
 
@@ -46,5 +46,5 @@ def test_the_kernel_that_is_simulated_does_what_can_be_worked_out() -> None:
     found = {cores_of(each): each for each in ranked(CORES, of_one_thread(ms), FIRST)}
     for where, jobs, frame_ms in (("[(0,), (0,), (0,)]", 5, 26), (RULE, 4, 19)):
         under_way = frame_ms / (FRAMES - 1 - WARM)
-        simulated = Kernel(found[where].placement, ms, 0.0).frame_ms()
+        simulated = placed_frame_ms(found[where].placement, ms, 0.0)
         assert frame_ms - under_way <= simulated <= frame_ms + under_way + jobs * 2 * STEP_MS

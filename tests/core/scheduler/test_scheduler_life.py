@@ -108,13 +108,6 @@ def test_a_job_that_ends_while_its_unit_is_stopped_still_counts_and_one_of_a_dea
     assert core.ledger.lost_by_cause == {"died:gpu": 1}
 
 
-def test_a_unit_that_is_late_to_start_is_stopped_though_its_ready_was_under_way() -> None:
-    core = core_with_dsp(STARTING)
-    assert core.step(5 + START_NS).actions == (Kill("dsp"),)
-    core.step(5 + START_NS, (UnitReady("dsp"),))
-    assert (core.units["dsp"].life, core.units["dsp"].queue_capacity) == (STOPPING, 0)
-
-
 def test_a_ping_and_its_pong_do_not_move_the_deadline_of_a_running_job() -> None:
     core = Core(application_graph(), Settings(10, "sequential", hang_ns=HANG_NS))
     core.step(0, tuple(UnitReady(unit) for unit in core.units))

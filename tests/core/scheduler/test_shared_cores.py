@@ -8,7 +8,7 @@ from random import Random
 
 import pytest
 
-from support.sliced_kernel import STAGES, Kernel
+from support.sliced_kernel import STAGES, placed_frame_ms
 from trilane.scheduler.events import Graph, Settings, chain
 from trilane.scheduler.placement import Place, Placement
 from trilane.scheduler.virtual import BALANCE_NS, Need, SharedCores
@@ -88,7 +88,7 @@ def test_it_is_near_a_kernel_that_gives_slices_in_turn(seed: int) -> None:
     floats = FLOATS in places.values()
     stages = dict(zip(NAMES, (unit for unit, _ in STAGES), strict=True))
     parts = {name: (ms[unit] * part, 0.0) for name, (unit, part) in zip(NAMES, STAGES, strict=True)}
-    theirs = Kernel(places, ms, 0.0).frame_ms()
+    theirs = placed_frame_ms(places, ms, 0.0)
     mine = frame_ms(stages, places, parts)
     assert mine == pytest.approx(theirs, **({"rel": 0.1} if floats else {"abs": 0.5 + 1.0}))
     # the frames under way at both ends of what counts may differ by one
