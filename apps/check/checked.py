@@ -254,7 +254,8 @@ def draw_graph(checked: CheckedFile) -> str:
     """Return the drawing of a pipeline as the text of an SVG file."""
     file, cells = checked.file, _cells(checked.file)
     width, height = LEFT + COLUMN * (1 + max(column for column, _ in cells.values())), TOP
-    places, body = {}, []
+    places: dict[str, tuple[int, int]] = {}
+    body = []
     for unit in file.units:
         own = {name: cells[name] for name, stage in file.stages.items() if stage.unit == unit}
         lane = LANE * (1 + max(row for _, row in own.values()))

@@ -24,10 +24,12 @@ from trilane.apps.cli.console import (
 )
 from trilane.errors import BadInputError
 from trilane.stages.run_options import PROFILE_HELP, RunOptions
-from trilane.units import PerformanceProfile
+from trilane.units import NS_PER_MS, PerformanceProfile
 
 if TYPE_CHECKING:
     from rich.table import Table
+
+    from trilane.apps.explain.explained_run import ExplainedRun
 
 app = Commands()
 EPILOG = """\b
@@ -78,14 +80,17 @@ def explain(
         require_writable(jobs)
     folder = follow(run).folder
     with spinner("reading the journal"):
-        document = explain_run(folder, slowest) if frame is None else explain_frame(folder, frame)
+        explained = explain_run(folder, slowest) if frame is None else None
+        document = explain_frame(folder, frame) if frame is not None else {}
         count = write_jobs(folder, jobs) if jobs is not None else 0
     if jobs is not None:
         say(f"jobs: {jobs}, {count} rows")
     if json:
-        print_json(document)
-        return
-    (_show_run if frame is None else _show_frame)(without_controls(document))
+        print_json(explained.as_json() if explained else document)
+    elif explained:
+        _show_run(explained)
+    else:
+        _show_frame(without_controls(document))
 
 
 def _show_frame(document: Mapping[str, Any]) -> None:
@@ -110,49 +115,50 @@ def _causes(causes_ms: Mapping[str, float]) -> str:
     return ", ".join(f"{cause} {ms:.2f}" for cause, ms in causes_ms.items() if ms >= 0.005) or "-"
 
 
-def _show_run(document: Mapping[str, Any]) -> None:
+def _show_run(run: ExplainedRun) -> None:
     from trilane.apps.explain.explained_run import join_text
+    from trilane.apps.run.verdict_facts import verdict_of
 
     console = stdout_console()
-    if document["verdict"] and not document["remark"]:
-        print_verdict(document["verdict"]["lines"])
+    if run.report and not run.remark:
+        print_verdict(verdict_of(run.report, str(run.folder)).lines())
         console.print()
-    for line in _head(document):
-        print_line(line)
-    if not document["budget"]:
+    for line in _head(run):
+        print_line(without_controls(line))
+    if not run.budget:
         return
-    console.print(_budget(document))
-    for line in _shared(document["shared_cores"]):
-        print_line(line)
-    console.print(_waits(document["waits"]))
-    for row in document.get("joins", ()):
-        print_line(join_text(row))
-    console.print(_slowest(document))
-    for line in document["advice"]:
-        print_line(f"try: {line}")
-    print_line(f"times: {document['sources']['frames, waits_ms, service_ms, preempted_ms']}")
+    console.print(_budget(run))
+    for line in _shared(run):
+        print_line(without_controls(line))
+    console.print(_waits(run))
+    for stage, inputs in run.joins.items():
+        print_line(without_controls(join_text(stage, inputs)))
+    console.print(_slowest(run))
+    for line in run.advice:
+        print_line(without_controls(f"try: {line}"))
+    print_line(f"times: {run.source}")
 
 
-def _head(document: Mapping[str, Any]) -> Iterator[str]:
-    if document["remark"]:
-        yield document["remark"]
-    frame_ms = document["frame_ms"]
+def _head(run: ExplainedRun) -> Iterator[str]:
+    if run.remark:
+        yield run.remark
+    frame_ms, failure = run.frame_ms, run.report.failure if run.report else None
     mean = "fewer than two frames: no frame time" if frame_ms is None else f"{frame_ms:.2f} ms a frame"
-    scene = f"scene {document['scene']}, " if document["scene"] else ""
-    yield f"Run {document['run']}: {scene}policy {document['policy']}, {document['frames']} frames, {mean}"
-    for kind, counts in document["left"].items():
+    scene = f"scene {run.scene}, " if run.scene else ""
+    yield f"Run {run.folder}: {scene}policy {run.begun.settings.policy}, {run.frames} frames, {mean}"
+    for kind, counts in run.left.items():
         causes = ", ".join(f"{cause} {count}" for cause, count in counts.items())
-        yield f"frames {kind}: {sum(counts.values())} ({causes})"
-    if frame_ms and document["nobodys_ms"] >= LEAST_SHARE * frame_ms:
+        yield f"frames {kind}: {counts.total()} ({causes})"
+    if frame_ms and run.nobodys_ms >= LEAST_SHARE * frame_ms:
         yield (
-            f"other programs: {document['nobodys_ms']:.1f} of {frame_ms:.1f} ms a frame were nobody's of this run: a "
+            f"other programs: {run.nobodys_ms:.1f} of {frame_ms:.1f} ms a frame were nobody's of this run: a "
             "stage on the path had no core, and no job of this run had it"
         )
-    yield from _efficiency(document)
-    if document["failure"]:
-        yield f"the run failed: {document['failure']}"
-    yield from (f"in the run: {message}" for message in shown_messages(document["messages"], document["failure"]))
-    for name, facts in document["accuracy"].items():
+    yield from _efficiency(run)
+    if failure:
+        yield f"the run failed: {failure}"
+    yield from (f"in the run: {message}" for message in shown_messages(run.messages, failure))
+    for name, facts in run.accuracy.items():
         if "psnr_db_by_band" in facts:
             bands = ", ".join(f"{band} {value:.1f}" for band, value in facts["psnr_db_by_band"].items())
             yield f"avatar {name}: PSNR on held-out views, dB: {bands} ({facts['source']})"
@@ -160,27 +166,26 @@ def _head(document: Mapping[str, Any]) -> Iterator[str]:
             yield f"avatar {name}: {facts.get('source', 'no figures')} of accuracy"
 
 
-def _efficiency(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield lines on the bound and the efficiencies of the run. `document`: document of `trilane explain --json`."""
-    if bound := document.get("bound"):
+def _efficiency(run: ExplainedRun) -> Iterator[str]:
+    """Yield lines on the bound and the efficiencies of the run."""
+    if bound := run.figures["bound"]:
         from trilane.apps.explain.reasons import bound_text
 
         yield f"bound: {bound_text(bound)}"
-    if document["cores"]:
-        numbers, efficiency = ",".join(map(str, document["cores"]["numbers"])), document["machine_efficiency"]
-        cpu_ms, had_ms = document["cores"]["cpu_ms"], document["cores"]["had_ms"]
+    if cores := run.cores:
+        slowest, fullest, every = (run.figures[f"{of}efficiency"] for of in ("", "core_", "machine_"))
+        numbers, cpu_ms, had_ms = ",".join(map(str, cores.numbers)), cores.cpu_ms, cores.had_ms
         yield (
-            f"efficiency: {document['efficiency']:.0%} of the slowest unit, {document['core_efficiency']:.0%} of the "
-            f"fullest cores, {efficiency:.0%} of all (cores {numbers}: {cpu_ms:.2f} of {had_ms:.2f} ms a frame in jobs)"
+            f"efficiency: {slowest:.0%} of the slowest unit, {fullest:.0%} of the fullest cores, {every:.0%} of all "
+            f"(cores {numbers}: {cpu_ms:.2f} of {had_ms:.2f} ms a frame in jobs)"
         )
 
 
-def _budget(document: Mapping[str, Any]) -> Table:
+def _budget(run: ExplainedRun) -> Table:
     """Return a table of the frame time on the critical path.
 
     Each row has a stage, a cause, the milliseconds per frame and the share. The last row adds up the parts whose share
     is below LEAST_SHARE.
-    `document`: document of `trilane explain --json`.
     """
     from rich.table import Table
 
@@ -194,49 +199,49 @@ def _budget(document: Mapping[str, Any]) -> Table:
         caption=READ_PATH_SO,
         caption_justify="left",
     )
-    small = [row for row in document["budget"] if row["share"] < LEAST_SHARE]
-    for row in document["budget"]:
-        if row["share"] >= LEAST_SHARE:
-            table.add_row(f"{row['stage']} ({row['unit']})", row["why"], f"{row['ms']:.2f}", f"{row['share']:.1%}")
+    small = [row for row in run.budget if row.share < LEAST_SHARE]
+    for row in run.budget:
+        if row.share >= LEAST_SHARE:
+            stage = without_controls(f"{row.stage} ({row.unit})")
+            table.add_row(stage, row.why, f"{row.ms:.2f}", f"{row.share:.1%}")
     if small:
-        ms, share = (sum(row[key] for row in small) for key in ("ms", "share"))
+        ms, share = sum(row.ms for row in small), sum(row.share for row in small)
         table.add_row("", f"smaller parts, {len(small)}: --json has them", f"{ms:.2f}", f"{share:.1%}")
     return table
 
 
-def _shared(rows: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield a line for each stage whose jobs lacked a core for a noticeable time, with the stages that had the core.
-
-    `rows`: value of `shared_cores` in the document of `trilane explain --json`.
-    """
-    for row in rows:
-        if row["preempted_ms"] < LEAST_SHARE * row["service_ms"]:
+def _shared(run: ExplainedRun) -> Iterator[str]:
+    """Yield a line for each stage whose jobs lacked a core for a noticeable time, with the stages that had the core."""
+    for stage, taken in run.taken.items():
+        if taken.preempted_ns < LEAST_SHARE * taken.service_ns:
             continue
-        lead = f"{row['stage']}: {row['preempted_ms']:.2f} of {row['service_ms']:.2f} ms a job without a core"
-        found = [
-            f"{ms:.2f} ms of it {other} had it, on core"
-            f"{'s' if len(row['shared'][other]) > 1 else ''} {','.join(map(str, row['shared'][other]))}"
-            for other, ms in row["taken_ms"].items()
-        ]
-        found.append(f"{row['others_ms']:.2f} ms nobody of this run")
-        yield f"{lead}; {'; '.join(found)}"
+        job_ms, found = taken.jobs * NS_PER_MS, []
+        for other, ns in taken.of.items():
+            cores = run.shared(taken.unit, other)
+            on = f"core{'s' if len(cores) > 1 else ''} {','.join(map(str, cores))}"
+            found.append(f"{ns / job_ms:.2f} ms of it {other} had it, on {on}")
+        found.append(f"{taken.other_ns / job_ms:.2f} ms nobody of this run")
+        without, service = taken.preempted_ns / job_ms, taken.service_ns / job_ms
+        yield f"{stage}: {without:.2f} of {service:.2f} ms a job without a core; {'; '.join(found)}"
 
 
-def _waits(rows: list[dict[str, Any]]) -> Table:
+def _waits(run: ExplainedRun) -> Table:
     from rich.table import Table
 
     table = Table("stage (unit)", "jobs", "wait, ms", "why, ms", title="Why jobs waited", title_justify="left")
-    for row in rows:
-        waited = f"{row['wait_ms']:.2f}"
-        table.add_row(f"{row['stage']} ({row['unit']})", str(row["jobs"]), waited, _causes(row["causes_ms"]))
+    for stage, unit in run.unit_of.items():
+        wait_ms, causes_ms = run.waits(stage)
+        cells = without_controls([f"{stage} ({unit})", str(run.jobs[stage]), f"{wait_ms:.2f}", _causes(causes_ms)])
+        table.add_row(*cells)
     return table
 
 
-def _slowest(document: Mapping[str, Any]) -> Table:
+def _slowest(run: ExplainedRun) -> Table:
     from rich.table import Table
 
-    usual = document["usual"]["frame_ms"]
-    title = f"The slowest frames (the median takes {usual:.2f} ms)"
+    from trilane.apps.explain.reasons import notes, reasons
+
+    title = f"The slowest frames (the median takes {run.usual.frame_ns / NS_PER_MS:.2f} ms)"
     table = Table(
         "frame",
         "ms",
@@ -247,13 +252,14 @@ def _slowest(document: Mapping[str, Any]) -> Table:
         caption=SLOWEST_SO,
         caption_justify="left",
     )
-    for row in document["slowest"]:
-        reasons = [f"{reason['longer_ms']:.1f} ms: {reason['text']}" for reason in row["why"]]
+    for shown in run.slowest:
+        latency_ns = shown.now.latency_ns
+        why = [f"{reason.longer_ms:.1f} ms: {reason.text}" for reason in reasons(shown, run.usual)]
         table.add_row(
-            str(row["frame"]),
-            f"{row['frame_ms']:.1f}",
-            "-" if row["latency_ms"] is None else f"{row['latency_ms']:.1f}",
-            "\n".join([*row["notes"], *reasons]) or "hardly longer than the median",
+            str(shown.now.frame),
+            f"{shown.frame_ns / NS_PER_MS:.1f}",
+            "-" if latency_ns is None else f"{latency_ns / NS_PER_MS:.1f}",
+            "\n".join(without_controls([*notes(shown), *why])) or "hardly longer than the median",
         )
     return table
 
