@@ -5,7 +5,7 @@ Rule: this module only reads options and shows results.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Final
 
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from trilane.apps.explain.explained_run import ExplainedRun
+    from trilane.apps.explain.scene_plan import ImageSize, ModelledAvatar, Phase, PlanExplanation
 
 app = Commands()
 EPILOG = """\b
@@ -306,7 +307,7 @@ def plan(
     Nothing runs. `trilane explain` says where the time of a run went.
     """
     _refuse_other_things(Path(scene))
-    from trilane.apps.explain.scene_plan import draw_plan, explain
+    from trilane.apps.explain.scene_plan import PlanExplanation, draw_plan
     from trilane.stages.configure import configure
     from trilane.writing import require_writable
 
@@ -316,16 +317,16 @@ def plan(
         require_writable(out)
     with spinner("planning"):
         checked = configure(options.changed(scene=scene), Path.cwd())
-        explanation = explain(checked, profile, str(performance_profile))
+        explanation = PlanExplanation(checked, profile, str(performance_profile))
     for note in checked.notes:
         say(note)
     if out is not None:
-        draw_plan(explanation.plan, explanation.first_frames, out)
+        draw_plan(explanation.plan, [phase.frames[0] for phase in explanation.phases], out)
         say(f"picture: {out}\nin the picture: {RECTANGLES}")
     if json:
-        print_json(explanation.document)
+        print_json(explanation.as_json())
         return
-    _show_plan(without_controls(explanation.document))
+    _show_plan(explanation)
 
 
 def _refuse_other_things(path: Path) -> None:
@@ -338,109 +339,91 @@ def _refuse_other_things(path: Path) -> None:
         raise BadInputError(path, "a folder", "a scene", f"`trilane explain {path}` is for the folder of a run")
 
 
-def _show_plan(document: dict[str, Any]) -> None:
-    console, config = stdout_console(), document["config"]
-    height, width = config["output"]
-    print_line(
-        f"Scene {document['scene']}: {config['frames']} frames of {width}x{height}, plan {config['plan']}, tensor size "
-        f"{config['size']}, error budget {config['error_budget_px']:g} px",
+def _show_plan(plan: PlanExplanation) -> None:
+    from trilane.apps.explain.scene_plan import EXPRESSION
+
+    console, scene = stdout_console(), plan.checked.config.scene
+    height, width = plan.plan.output
+    shapes = ", ".join(f"{h}x{w}" for h, w in plan.checked.config.buckets)
+    drawn = (
+        f"skinned by the {plan.skinned_on} unit; detail: {plan.detail}; texture filter {scene.texture_filter}; "
+        f"expression: {EXPRESSION}"
     )
-    shapes = ", ".join(f"{h}x{w}" for h, w in document["shapes"])
-    print_line(f"tensor shapes that are made ready: {shapes}")
-    for line in dict.fromkeys(_drawn(row) for row in document["avatars"]):
-        print_line(line)
-    console.print(_phase_table(document["phases"]))
-    left = len(document["phases"]) - MOST_ROWS
+    for line in (
+        f"Scene {scene.name}: {scene.frames} frames of {width}x{height}, plan {scene.plan}, tensor size {scene.size}, "
+        f"error budget {scene.error_budget_px:g} px",
+        f"tensor shapes that are made ready: {shapes}",
+        *dict.fromkeys(f"avatar {avatar.bundle}: {drawn}" for avatar in scene.avatars),
+    ):
+        print_line(without_controls(line))
+    console.print(_phase_table(plan.phases))
+    left = len(plan.phases) - MOST_ROWS
     if left > 0:
         console.print(f"{left} more phases: --json has all of them")
-    for line in (*_left_out(document["phases"]), _image(document["image"])):
-        print_line(line)
-    print_line(READ_PLAN_SO)
-    firsts = {phase["why"]: phase["first_frame"] for phase in reversed(document["phases"])}
+    for line in (*_left_out(plan.phases), _image(plan.image), READ_PLAN_SO):
+        print_line(without_controls(line))
+    firsts = {phase.why: phase.frames[0].frame for phase in reversed(plan.phases)}
     for why, first in sorted(firsts.items(), key=lambda one: one[1]):
         print_line(f"frame {first} and others like it: {why}")
-    print_line(f"placement: {document['placement']['why']}")
-    for line in _totals(document["totals"], config):
-        print_line(line)
-
-
-def _drawn(row: dict[str, Any]) -> str:
-    """Return a line on how an avatar is drawn in all frames. `row`: an entry of `avatars` in the plan's document.
-
-    The line names the bundle. Therefore two avatars of one bundle with equal settings have the same line.
-    """
-    return (
-        f"avatar {row['bundle']}: skinned by the {row['skinned_on']} unit; detail: {row['detail']}; "
-        f"texture filter {row['texture_filter']}; expression: {row['expression']}"
+    print_line(without_controls(f"placement: {plan.placement['why']}"))
+    planned, fixed = plan.planned, plan.fixed
+    print_line(
+        f"beside a fixed tensor of 512x512: {planned.pixels / fixed.pixels:.1%} of the tensor's pixels, "
+        f"{planned.gmac:.1f} of {fixed.gmac:.1f} GMAC"
+    )
+    print_line(
+        f"work of all stages: {planned.work_ms:.0f} of {fixed.work_ms:.0f} ms, "
+        f"{1 - planned.work_ms / fixed.work_ms:.0%} saved "
+        f"(computed by the profile {without_controls(plan.profile)}; `trilane bench planner` measures)"
     )
 
 
-def _phase_table(phases: list[dict[str, Any]]) -> Table:
+def _phase_table(phases: Sequence[Phase]) -> Table:
     from rich.table import Table
 
     table = Table("frames", "tensor", "density", "avatar: modelled, bound / measured px", "saved: kpixel, GMAC, ms")
     for phase in phases[:MOST_ROWS]:
-        tensor, density = phase["tensor"], phase["density"]
+        tensor, density, saved = phase.frames[0].plan.shape, phase.density, phase.saved
         table.add_row(
-            f"{phase['first_frame']}-{phase['last_frame']}",
-            f"{tensor[0]}x{tensor[1]}" if tensor and phase["work"] == "full" else phase["work"],
+            f"{phase.frames[0].frame}-{phase.frames[-1].frame}",
+            f"{tensor[0]}x{tensor[1]}" if tensor and phase.work == "full" else phase.work,
             f"{density[0]:.2f}-{density[1]:.2f}" if density else "-",
-            _modelled(phase["avatars"]) or "-",
-            _saved(phase["saved"]),
+            _modelled(phase.avatars) or "-",
+            f"{saved['pixels'] / 1000:.0f}, {saved['gmac']:.1f}, {saved['work_ms']:.1f}",
         )
     return table
 
 
-def _saved(saved: dict[str, float]) -> str:
-    return f"{saved['pixels'] / 1000:.0f}, {saved['gmac']:.1f}, {saved['work_ms']:.1f}"
-
-
-def _left_out(phases: list[dict[str, Any]]) -> list[str]:
+def _left_out(phases: Sequence[Phase]) -> list[str]:
     """Return a line for each level of detail in use. The line names the parts of the body that the level leaves out."""
-    rows = [row for phase in phases for row in phase["avatars"]]
-    lines = {}
-    for row in rows:
-        out = ", ".join(row["left_out"]) or "nothing that this body has"
-        lines[row["modelled"], out] = f'"{row["modelled"]}" leaves out {out}'
-    return list(lines.values())
+    rows = [(row.modelled, ", ".join(row.left_out)) for phase in phases for row in phase.avatars]
+    return [f'"{level}" leaves out {out or "nothing that this body has"}' for level, out in dict.fromkeys(rows)]
 
 
-def _image(image: dict[str, Any]) -> str:
-    if image["work"] is None:
-        return f"image: {image['source']}"
-    loss = "an unknown loss" if image["psnr_loss_db"] is None else f"{image['psnr_loss_db']:.1f} dB lost"
-    return f"image: {image['work']:.0%} of the pixels that the network was trained for, {loss} ({image['source']})"
+def _image(image: ImageSize) -> str:
+    if image.work is None:
+        return f"image: {image.source}"
+    loss = "an unknown loss" if image.psnr_loss_db is None else f"{image.psnr_loss_db:.1f} dB lost"
+    return f"image: {image.work:.0%} of the pixels that the network was trained for, {loss} ({image.source})"
 
 
-def _modelled(rows: list[dict[str, Any]]) -> str:
+def _modelled(rows: Sequence[ModelledAvatar]) -> str:
     """Return a text with a line for each level of detail among the avatars of a phase.
 
     The line ends with the largest bound of the error, and the largest measured error, of these avatars, in pixels.
-    `rows`: avatars of the phase.
     """
     lines = []
     for modelled in dict.fromkeys(_model(row) for row in rows):
         own = [row for row in rows if _model(row) == modelled]
-        known = [row["measured_px"] for row in own if row["measured_px"] is not None]
+        known = [row.measured_px for row in own if row.measured_px is not None]
         measured = f"{max(known):.2f}" if known else "-"
-        names = ", ".join(row["name"] for row in own)
-        lines.append(f"{names}: {modelled}, {max(row['bound_px'] for row in own):.2f} / {measured}")
+        names = without_controls(", ".join(row.name for row in own))
+        lines.append(f"{names}: {modelled}, {max(row.bound_px for row in own):.2f} / {measured}")
     return "\n".join(lines)
 
 
-def _model(row: dict[str, Any]) -> str:
+def _model(row: ModelledAvatar) -> str:
     """Return an avatar's level of detail in words. For a coarser mesh, the level of the mesh comes first."""
-    mesh = row["mesh"]
+    mesh = row.mesh
     coarser = f"mesh level {mesh['level']} ({mesh['triangles']} of {mesh['of']} triangles), " if mesh["level"] else ""
-    return f"{coarser}{row['modelled']}"
-
-
-def _totals(totals: dict[str, Any], config: dict[str, Any]) -> list[str]:
-    """Return sentences that compare the work of the whole scene with the work of a fixed square tensor."""
-    share = 1 - totals["work_ms"] / totals["fixed_work_ms"]
-    return [
-        f"beside a fixed tensor of 512x512: {totals['pixels'] / totals['fixed_pixels']:.1%} of the tensor's pixels, "
-        f"{totals['gmac']:.1f} of {totals['fixed_gmac']:.1f} GMAC",
-        f"work of all stages: {totals['work_ms']:.0f} of {totals['fixed_work_ms']:.0f} ms, {share:.0%} saved "
-        f"(computed by the profile {config['profile']}; `trilane bench planner` measures)",
-    ]
+    return f"{coarser}{row.modelled}"
