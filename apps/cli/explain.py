@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -29,7 +29,7 @@ from trilane.units import NS_PER_MS, PerformanceProfile
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from trilane.apps.explain.explained_run import ExplainedRun
+    from trilane.apps.explain.explained_run import ExplainedFrame, ExplainedRun
     from trilane.apps.explain.scene_plan import ImageSize, ModelledAvatar, Phase, PlanExplanation
 
 app = Commands()
@@ -72,7 +72,7 @@ def explain(
     The output is the stage or wait that bounded the run, why jobs waited, and why the slowest frames were slow
     (docs/explain.md). `trilane plan` explains a scene before it runs.
     """
-    from trilane.apps.explain.explained_run import check_ending, explain_frame, explain_run, write_jobs
+    from trilane.apps.explain.explained_run import ExplainedRun, check_ending, explain_frame, explain_run, write_jobs
     from trilane.apps.watch.followed_run import follow
     from trilane.writing import require_writable
 
@@ -81,34 +81,33 @@ def explain(
         require_writable(jobs)
     folder = follow(run).folder
     with spinner("reading the journal"):
-        explained = explain_run(folder, slowest) if frame is None else None
-        document = explain_frame(folder, frame) if frame is not None else {}
+        explained = explain_run(folder, slowest) if frame is None else explain_frame(folder, frame)
         count = write_jobs(folder, jobs) if jobs is not None else 0
     if jobs is not None:
         say(f"jobs: {jobs}, {count} rows")
     if json:
-        print_json(explained.as_json() if explained else document)
-    elif explained:
+        print_json(explained.as_json())
+    elif isinstance(explained, ExplainedRun):
         _show_run(explained)
     else:
-        _show_frame(without_controls(document))
+        _show_frame(explained)
 
 
-def _show_frame(document: Mapping[str, Any]) -> None:
+def _show_frame(frame: ExplainedFrame) -> None:
     from rich.table import Table
 
-    after = "" if document["after_ms"] is None else f" {document['after_ms']:.1f} ms after its release"
-    cause = "" if document["cause"] is None else f", cause {document['cause']} (docs/policies-and-edges.md)"
-    latency = "" if document["latency_ms"] is None else f", latency {document['latency_ms']:.1f} ms"
+    after = "" if frame.after_ms is None else f" {frame.after_ms:.1f} ms after its release"
+    cause = "" if frame.cause is None else f", cause {frame.cause} (docs/policies-and-edges.md)"
+    latency = "" if frame.latency_ms is None else f", latency {frame.latency_ms:.1f} ms"
     console = stdout_console()
-    print_line(f"Frame {document['frame']}: {document['outcome']}{after}{cause}{latency}")
-    if not document["jobs"]:
+    print_line(without_controls(f"Frame {frame.frame}: {frame.outcome}{after}{cause}{latency}"))
+    if not frame.jobs:
         console.print("no job of it began")
         return
     table = Table("stage (unit)", "began, ms", "took, ms", "waited, ms", "why, ms")
-    for row in document["jobs"]:
-        times = [f"{row[key]:.2f}" for key in ("begin_ms", "took_ms", "wait_ms")]
-        table.add_row(f"{row['stage']} ({row['unit']})", *times, _causes(row["causes_ms"]))
+    for row in frame.jobs:
+        times = [f"{ms:.2f}" for ms in (row.begin_ms, row.took_ms, row.wait_ms)]
+        table.add_row(*without_controls([f"{row.stage} ({row.unit})", *times, _causes(row.causes_ms)]))
     console.print(table)
 
 

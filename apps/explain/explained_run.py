@@ -53,16 +53,6 @@ ROWS_AT_ONCE: Final = 8192
 ENDINGS = (".csv", ".parquet")
 
 
-def _explained_jobs(begun: Begun, records: Iterable[Record]) -> Iterator[ExplainedJob]:
-    """Yield every job of a journal with the causes of its wait, in the order of the jobs' ends.
-
-    `begun`: first record of the journal. `records`: records after the first.
-    """
-    timeline = Timeline(begun.graph, begun.settings, waits=True)
-    for record in records:
-        yield from (fact for fact in timeline.add(record) if isinstance(fact, ExplainedJob))
-
-
 def open_journal(folder: Path) -> tuple[Begun, Iterator[Record]]:
     """Return (first record, iterator over the other records) of the journal in the run folder `folder`.
 
@@ -245,19 +235,44 @@ def explain_run(folder: Path, slowest: int = 10) -> ExplainedRun:
     return ExplainedRun(folder, *open_journal(folder), report, slowest)
 
 
-def explain_frame(folder: Path, number: int) -> dict[str, Any]:
-    """Return what became of frame `number` of the run in `folder`, as plain data.
+class FrameJob(NamedTuple):
+    """A job of an explained frame. Its begin counts from the frame's release."""
 
-    Keys:
-    `schema`: version of the keys.
-    `run`: folder of the run.
-    `frame`: number of the frame.
+    stage: str
+    unit: str
+    begin_ms: float
+    took_ms: float
+    wait_ms: float
+    causes_ms: dict[str, float]
+
+
+class ExplainedFrame(NamedTuple):
+    """What became of a frame of a run.
+
+    `schema`: version of the keys in JSON. `run`: folder of the run. `frame`: number of the frame.
     `outcome`: `presented`, `dropped`, `lost` or `under way`.
     `cause`: key of the report that counts the dropped or lost frame; None for any other frame.
     `after_ms`: time from the frame's release until it was presented, dropped or lost; None for a frame under way.
     `latency_ms`: latency; None if not known.
-    `jobs`: a row for each job of the frame. Its `begin_ms` counts from the frame's release. For a frame under way, it
-    counts from when the frame's first job was ready.
+    `jobs`: jobs of the frame. For a frame under way, their begins count from when the first of them was ready.
+    """
+
+    schema: int
+    run: str
+    frame: int
+    outcome: str
+    cause: str | None
+    after_ms: float | None
+    latency_ms: float | None
+    jobs: list[FrameJob]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the document of `trilane explain RUN --frame N --json`."""
+        return self._asdict() | {"jobs": [job._asdict() for job in self.jobs]}
+
+
+def explain_frame(folder: Path, number: int) -> ExplainedFrame:
+    """Return what became of frame `number` of the run in `folder`.
 
     Raises BadInputError for a folder without a journal, for a broken journal, and for a frame that is not in the
     journal.
@@ -284,28 +299,23 @@ def explain_frame(folder: Path, number: int) -> dict[str, Any]:
     left = presented or gone
     release_ns = left.release_ns if left is not None else min(one.job.ready_ns for one in jobs)
     end_ns = presented.end_ns if presented is not None else gone.at_ns if gone is not None else None
-    return {
-        "schema": SCHEMA,
-        "run": str(folder),
-        "frame": number,
-        "outcome": "presented" if presented is not None else gone.kind if gone is not None else "under way",
-        "cause": None if gone is None else gone.cause,
-        "after_ms": None if end_ns is None else (end_ns - release_ns) / NS_PER_MS,
-        "latency_ms": None if presented is None or presented.latency_ns is None else presented.latency_ns / NS_PER_MS,
-        "jobs": [_job_row(one, release_ns) for one in jobs],
-    }
+    return ExplainedFrame(
+        SCHEMA,
+        str(folder),
+        number,
+        "presented" if presented is not None else gone.kind if gone is not None else "under way",
+        None if gone is None else gone.cause,
+        None if end_ns is None else (end_ns - release_ns) / NS_PER_MS,
+        None if presented is None or presented.latency_ns is None else presented.latency_ns / NS_PER_MS,
+        [_frame_job(one, release_ns) for one in jobs],
+    )
 
 
-def _job_row(one: ExplainedJob, release_ns: int) -> dict[str, Any]:
+def _frame_job(one: ExplainedJob, release_ns: int) -> FrameJob:
     job = one.job
-    return {
-        "stage": job.stage,
-        "unit": job.unit,
-        "begin_ms": (job.begin_ns - release_ns) / NS_PER_MS,
-        "took_ms": (job.end_ns - job.begin_ns) / NS_PER_MS,
-        "wait_ms": (job.begin_ns - job.ready_ns) / NS_PER_MS,
-        "causes_ms": _causes_ms(one.waits_ns, NS_PER_MS),
-    }
+    times_ns = (job.begin_ns - release_ns, job.end_ns - job.begin_ns, job.begin_ns - job.ready_ns)
+    begin_ms, took_ms, wait_ms = (ns / NS_PER_MS for ns in times_ns)
+    return FrameJob(job.stage, job.unit, begin_ms, took_ms, wait_ms, _causes_ms(one.waits_ns, NS_PER_MS))
 
 
 def _causes_ms(waits_ns: Mapping[str, int], per: float) -> dict[str, float]:
@@ -341,8 +351,11 @@ def job_rows(folder: Path, figures: Sequence[str]) -> Iterator[tuple[Any, ...]]:
     `figures`: names of metrics of the stages. Raises BadInputError as `open_journal` does.
     """
     values = [value for _, value in COLUMNS.values()]
-    for one in _explained_jobs(*open_journal(folder)):
-        yield (*(value(one) for value in values), *(one.figures.get(name) for name in figures))
+    begun, records = open_journal(folder)
+    timeline = Timeline(begun.graph, begun.settings, waits=True)
+    for one in (fact for record in records for fact in timeline.add(record)):
+        if isinstance(one, ExplainedJob):
+            yield (*(value(one) for value in values), *(one.figures.get(name) for name in figures))
 
 
 def check_ending(target: Path) -> None:
@@ -354,10 +367,9 @@ def check_ending(target: Path) -> None:
 def write_jobs(folder: Path, target: Path) -> int:
     """Write every job of the run in `folder` to `target`, a .csv or .parquet file, and return the number of jobs.
 
-    Raises BadInputError for another ending, a folder that is no run folder, and a file that cannot be written. Raises
+    Raises BadInputError for a folder that is no run folder, and for a file that cannot be written. Raises
     MissingPartError for .parquet if PyArrow is not installed.
     """
-    check_ending(target)
     figures = figure_names(folder)
     write = _write_parquet if target.suffix.lower() == ".parquet" else _write_csv
     with write_atomically(target) as draft:

@@ -154,11 +154,6 @@ class TraceWriter:
         self._sink.close()
 
 
-def write_trace(records: Iterable[Record], file: IO[bytes]) -> None:
-    """Write the trace of a run to `file` as Perfetto's packets. `records`: all records of the run's journal."""
-    write_tracks(PacketSink(file), {"trilane": records})
-
-
 def write_tracks(sink: Sink, runs: Mapping[str, Iterable[Record]]) -> None:
     """Write several runs to one trace, one after the other, and close `sink`.
 
@@ -190,13 +185,9 @@ def write_run(records: Iterable[Record], target: Path, *, chrome: bool = False) 
     `records`: all records of the run's journal. `chrome`: whether to write Chrome's JSON in place of Perfetto's
     packets.
     """
-    with write_atomically(target) as draft:
-        if chrome:
-            with draft.open("w", encoding="utf-8") as text:
-                write_tracks(ChromeSink(text), {"trilane": records})
-        else:
-            with draft.open("wb") as file:
-                write_trace(records, file)
+    mode, encoding = ("w", "utf-8") if chrome else ("wb", None)
+    with write_atomically(target) as draft, draft.open(mode, encoding=encoding) as file:
+        write_tracks((ChromeSink if chrome else PacketSink)(file), {"trilane": records})
 
 
 def write_predicted(runs: Mapping[str, Simulation], facts: Mapping[str, Any], target: Path) -> None:

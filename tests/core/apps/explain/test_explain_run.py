@@ -82,15 +82,15 @@ def test_the_slowest_frames_and_why(folder: Path) -> None:
 
 def test_one_frame_by_its_jobs_or_by_why_it_left(folder: Path) -> None:
     found = explain_frame(folder, 20)
-    assert (found["outcome"], found["cause"]) == ("presented", None)
-    took = {row["stage"]: row["took_ms"] for row in found["jobs"]}
+    assert (found.outcome, found.cause) == ("presented", None)
+    took = {row.stage: row.took_ms for row in found.jobs}
     assert took == {**STAGE_MS, "composite": 20.0}
-    last = found["jobs"][-1]
-    assert found["after_ms"] == pytest.approx(last["begin_ms"] + last["took_ms"])
-    assert all(row["wait_ms"] == pytest.approx(sum(row["causes_ms"].values())) for row in found["jobs"])
-    outcomes = [explain_frame(folder, number)["outcome"] for number in range(40)]
+    last = found.jobs[-1]
+    assert found.after_ms == pytest.approx(last.begin_ms + last.took_ms)
+    assert all(row.wait_ms == pytest.approx(sum(row.causes_ms.values())) for row in found.jobs)
+    outcomes = [explain_frame(folder, number).outcome for number in range(40)]
     assert (outcomes.count("presented"), outcomes.count("lost")) == (39, 1)
-    assert explain_frame(folder, outcomes.index("lost"))["cause"] == "died:gpu"
+    assert explain_frame(folder, outcomes.index("lost")).cause == "died:gpu"
     with pytest.raises(BadInputError, match="40, expected a frame that began, of 0 to 39"):
         explain_frame(folder, 40)
 
@@ -99,9 +99,9 @@ def test_a_frame_that_a_newer_one_replaced(tmp_path: Path) -> None:
     run = simulated({}, Settings(40, policy="latest", period_ns=2 * MS, in_flight=2))
     found = explain_run(write_run(tmp_path / "run", run, run.jobs, cores=CORES)).as_json()
     each = [explain_frame(tmp_path / "run", number) for number in range(40)]
-    counts = {cause: sum(one["cause"] == cause for one in each) for cause in found["left"]["dropped"]}
+    counts = {cause: sum(one.cause == cause for one in each) for cause in found["left"]["dropped"]}
     assert counts == found["left"]["dropped"]
-    assert sum(one["outcome"] == "presented" for one in each) == found["frames"] == run.report["frames"]["presented"]
+    assert sum(one.outcome == "presented" for one in each) == found["frames"] == run.report["frames"]["presented"]
 
 
 def test_the_budget_sums_to_the_frame_time_and_names_shared_cores(folder: Path) -> None:

@@ -22,7 +22,6 @@ from trilane.apps.explain.trace import (
     Lanes,
     Tiles,
     TraceWriter,
-    write_trace,
     write_tracks,
 )
 from trilane.apps.explain.trace_sinks import PLAIN_BYTES, ChromeSink, PacketSink
@@ -96,7 +95,7 @@ def records_of(done: Simulation) -> Iterator[Record]:
 
 def trace_of(records: Iterator[Record]) -> ReadTrace:
     file = io.BytesIO()
-    write_trace(records, file)
+    write_tracks(PacketSink(file), {"trilane": records})
     return read_trace(file.getvalue())
 
 
