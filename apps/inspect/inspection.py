@@ -90,14 +90,19 @@ class Inspection:
     def usable(self) -> bool:
         return not self.problem
 
+    @property
+    def missing(self) -> list[str]:
+        """The body joints that the file does not have; empty for a file without joints."""
+        mapped = self.detected.joints
+        return [name for name in BODY_JOINTS if name not in mapped] if mapped else []
+
     def document(self, file: Path, sheet: Path | None) -> dict[str, Any]:
         """Return the document that `trilane inspect --json` prints.
 
         `file`: inspected file. `sheet`: contact sheet that was written; None if no sheet was written.
         """
-        found = {key: value for key, value in asdict(self.detected).items() if key not in ("joints", "unmapped")}
-        mapped = dict(self.detected.joints)
-        missing = [name for name in BODY_JOINTS if name not in mapped] if mapped else []
+        detected = asdict(self.detected)
+        joints = {"mapped": detected.pop("joints"), "unmapped": list(detected.pop("unmapped")), "missing": self.missing}
         return {
             "file": str(file),
             "kind": self.kind,
@@ -105,9 +110,9 @@ class Inspection:
             "usable": self.usable,
             "problem": self.problem,
             "advice": self.advice,
-            "detected": found,
+            "detected": detected,
             "length": asdict(self.length) if self.length else {"samples": None, "seconds": None, "rate_hz": None},
-            "joints": {"mapped": mapped, "unmapped": list(self.detected.unmapped), "missing": missing},
+            "joints": joints,
             "facts": dict(self.facts),
             "notes": list(self.notes),
             "sheet": str(sheet) if sheet else None,

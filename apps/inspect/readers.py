@@ -424,23 +424,23 @@ def inspect_video(path: Path) -> Inspection:
     try:
         with av.open(str(path), metadata_errors="replace") as container:
             stream = container.streams.video[0]
-            facts = _video_facts(stream)
+            pixels, codec = stream.format, stream.codec_context.name
+            rate = float(stream.average_rate) if stream.average_rate else None
+            bits = max((part.bits for part in pixels.components), default=8) if pixels else 8
+            width, height, turn = stream.width, stream.height, _rotation(stream)
             seconds, stated = _seconds(container, stream), stream.frames
     except (av.FFmpegError, ValueError, OSError) as error:
         raise BadInputError(path, f"no readable video ({error})", "a video that FFmpeg can decode") from error
-    rate, turn = facts["rate_hz"], facts["turned_deg"]
     frames = stated or _counted(path)
     turned = f", turned by {turn} degrees" if turn else ""
     return Inspection(
         "video",
-        f"a video ({facts['codec']}) of {facts['width']}x{facts['height']} pixels{turned}",
+        f"a video ({codec}) of {width}x{height} pixels{turned}",
         "",
         used("--background", path),
-        Detected(
-            f"{facts['codec']} video", "streams that FFmpeg finds", rate="; ".join((*footage.rate, *footage.what[1:]))
-        ),
+        Detected(f"{codec} video", "streams that FFmpeg finds", rate="; ".join((*footage.rate, *footage.what[1:]))),
         Length(frames, seconds, rate if stated or not seconds else frames / seconds),
-        facts,
+        {"codec": codec, "width": width, "height": height, "rate_hz": rate, "bits": bits, "turned_deg": turn},
         draw=partial(_film, path, seconds),
     )
 
@@ -450,18 +450,6 @@ def _counted(path: Path) -> int:
     with av.open(str(path), metadata_errors="replace") as container:
         packets = container.demux(container.streams.video[0])
         return sum(packet.size > 0 for packet in itertools.islice(packets, MOST_PACKETS))
-
-
-def _video_facts(stream: Any) -> dict[str, Any]:
-    pixels = stream.format
-    return {
-        "codec": stream.codec_context.name,
-        "width": stream.width,
-        "height": stream.height,
-        "rate_hz": float(stream.average_rate) if stream.average_rate else None,
-        "bits": max((part.bits for part in pixels.components), default=8) if pixels else 8,
-        "turned_deg": _rotation(stream),
-    }
 
 
 def _rotation(stream: Any) -> int:
