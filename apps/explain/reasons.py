@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from heapq import heappush, heappushpop
+from heapq import heappop, heappush
 from statistics import median
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
@@ -148,12 +148,9 @@ class SlowFrames:
         while self._waiting:
             self._look(self._waiting.popleft())
         slowest = [shown for _, _, shown in sorted(self._slowest, reverse=True)]
-        return slowest, self._usual()
-
-    def _usual(self) -> Usual:
         frames = self._frames.values
         kinds = {part for _, parts_ns in frames for part in parts_ns}
-        return Usual(
+        return slowest, Usual(
             _median([frame_ns for frame_ns, _ in frames]),
             {part: _median([parts_ns.get(part, 0) for _, parts_ns in frames]) for part in kinds},
             {stage: _median(sample.values) for stage, sample in self._services.items()},
@@ -174,18 +171,13 @@ class SlowFrames:
                 sums[part] = sums.get(part, 0) + ns
                 if ns > longest.get(part, (0, piece.job))[0]:
                     longest[part] = (ns, piece.job)
-        self._frames.add((end_ns - begin_ns, sums))
-        if len(self._slowest) == self._most and self._slowest[0][0] >= end_ns - begin_ns:
-            return
-        jobs = {part: job for part, (_, job) in longest.items()}
-        self._keep(ShownFrame(now, before, end_ns - begin_ns, sums, jobs))
-
-    def _keep(self, shown: ShownFrame) -> None:
-        entry = (shown.frame_ns, -shown.now.frame, shown)
-        if len(self._slowest) < self._most:
-            heappush(self._slowest, entry)
-        else:
-            heappushpop(self._slowest, entry)
+        frame_ns = end_ns - begin_ns
+        self._frames.add((frame_ns, sums))
+        if len(self._slowest) < self._most or self._slowest[0][0] < frame_ns:
+            jobs = {part: job for part, (_, job) in longest.items()}
+            heappush(self._slowest, (frame_ns, -now.frame, ShownFrame(now, before, frame_ns, sums, jobs)))
+            if len(self._slowest) > self._most:
+                heappop(self._slowest)
 
 
 def _median(values: Sequence[int]) -> float:
