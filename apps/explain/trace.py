@@ -134,24 +134,9 @@ class RunTracks:
             self._sink.count(self._samples[name], sampled.now_ns, value)
 
 
-class TraceWriter:
-    """Writes the trace of a run as Perfetto's packets.
-
-    `file`: file for bytes; the caller closes it after `close`. `begun`: first record of the run's journal.
-    """
-
-    def __init__(self, file: IO[bytes], begun: Begun) -> None:
-        self._sink = PacketSink(file)
-        self._tracks = RunTracks(self._sink, begun)
-
-    def add(self, record: Record) -> None:
-        """Take the next record of the journal; the first call takes the record after `begun`."""
-        self._tracks.add(record)
-
-    def close(self) -> None:
-        """Write the rest of the trace. The file stays open."""
-        self._tracks.close()
-        self._sink.close()
+def write_trace(records: Iterable[Record], file: IO[bytes]) -> None:
+    """Write the trace of a run to `file` as Perfetto's packets. `records`: all records of the run's journal."""
+    write_tracks(PacketSink(file), {"trilane": records})
 
 
 def write_tracks(sink: Sink, runs: Mapping[str, Iterable[Record]]) -> None:
@@ -185,9 +170,13 @@ def write_run(records: Iterable[Record], target: Path, *, chrome: bool = False) 
     `records`: all records of the run's journal. `chrome`: whether to write Chrome's JSON in place of Perfetto's
     packets.
     """
-    mode, encoding = ("w", "utf-8") if chrome else ("wb", None)
-    with write_atomically(target) as draft, draft.open(mode, encoding=encoding) as file:
-        write_tracks((ChromeSink if chrome else PacketSink)(file), {"trilane": records})
+    with write_atomically(target) as draft:
+        if chrome:
+            with draft.open("w", encoding="utf-8") as text:
+                write_tracks(ChromeSink(text), {"trilane": records})
+        else:
+            with draft.open("wb") as file:
+                write_trace(records, file)
 
 
 def write_predicted(runs: Mapping[str, Simulation], facts: Mapping[str, Any], target: Path) -> None:

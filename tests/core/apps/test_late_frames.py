@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 
 from support.trace_reading import read_trace
-from trilane.apps.explain.trace import write_tracks
-from trilane.apps.explain.trace_sinks import PacketSink
+from trilane.apps.explain.trace import write_trace
 from trilane.apps.watch.live_figures import LiveFigures
 from trilane.hw_profiles.application import application_graph
 from trilane.pipeline.journal import SCHEMA, Begun, Record, journal_of, target_period_ns
@@ -52,7 +51,7 @@ def test_ledger_live_figures_and_trace_count_the_same_frames(case: str) -> None:
     verdict = figures.now().verdict
     assert verdict is not None
     assert f" {misses} of " in verdict["lines"][0][1]
-    write_tracks(PacketSink(file := io.BytesIO()), {"run": records})
+    write_trace(records, file := io.BytesIO())
     actual = read_trace(file.getvalue()).of("Actual frames")
     assert sum(one.name.startswith("late") for one in actual) == misses
 
