@@ -70,20 +70,21 @@ class ScenePlan:
     """Plans the frames of a checked configuration, one after the other.
 
     `config`: checked configuration. `assets`: arrays of the run. `output`: (height, width) of the picture.
-    `bodies`: body of each avatar.
+    `bodies`: body of each avatar. `kept`: for each avatar, the vertices that each level of its mesh keeps.
     """
 
     def __init__(self, config: RunConfig, assets: Assets) -> None:
-        self.config, self._assets = config, assets
+        self.config = config
         self.output = (config.scene.output.height, config.scene.output.width)
         self._stage = PoseStage(config, assets)
         self._packet = _packet(config)
         self._stage.bind([], [self._packet])
         self._drawn = posed_vertices(self._packet.payload, config.posed_vertices)
-        bodies = [shaped_body(assets, number) for number in range(len(distinct(config)))]
-        self.bodies = [bodies[distinct(config).index(folder)] for folder in config.avatar_dirs]
-        kept = [_kept(assets, number) for number in range(len(bodies))]
-        self._kept = [kept[distinct(config).index(folder)] for folder in config.avatar_dirs]
+        folders = distinct(config)
+        bodies = [shaped_body(assets, number) for number in range(len(folders))]
+        kept = [_kept(assets, number) for number in range(len(folders))]
+        numbers = [folders.index(folder) for folder in config.avatar_dirs]
+        self.bodies, self.kept = [bodies[number] for number in numbers], [kept[number] for number in numbers]
         self._skinners = {id(body): CpuSkinner(body) for body in bodies}
         self._staged = staged_of(assets)
 
@@ -112,7 +113,7 @@ class ScenePlan:
         """
         if not self._drawn:
             return 0.0
-        kept = self._kept[avatar][int(self._packet.header["avatars"][avatar]["mesh"])]
+        kept = self.kept[avatar][int(self._packet.header["avatars"][avatar]["mesh"])]
         exact = self.places(frame, avatar)[kept]
         drawn = self._places(self._drawn[avatar][: len(exact)].astype(np.float64), frame)
         moved = np.linalg.norm(exact - drawn, axis=1)
@@ -392,10 +393,10 @@ class PlanExplanation:
                     "skinned_on": self.skinned_on,
                     "expression": EXPRESSION,
                     "detail": self.detail,
-                    "mesh_levels": len(mesh_levels_of(self.checked.assets, distinct(config).index(folder))),
+                    "mesh_levels": len(self.plan.kept[number]) - 1,  # without the whole mesh
                     "texture_filter": scene.texture_filter,
                 }
-                for number, (avatar, folder) in enumerate(zip(scene.avatars, config.avatar_dirs, strict=True))
+                for number, avatar in enumerate(scene.avatars)
             ],
             "phases": [phase.as_json() for phase in self.phases],
             "image": self.image._asdict(),
