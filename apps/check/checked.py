@@ -81,7 +81,7 @@ class CheckedFile:
     def period_ms(self) -> float | None:
         return None if self.bound is None else float(self.bound.period_ns) / NS_PER_MS
 
-    def document(self) -> dict[str, Any]:
+    def as_json(self) -> dict[str, Any]:
         """Return what `trilane check --json` prints."""
         file, run = self.file, self.file.run
         routes = []

@@ -68,7 +68,7 @@ def check(file: FileArgument, svg: SvgOption = None, profile: ProfileOption = No
     if svg is not None:
         write_bytes(svg, draw_graph(checked).encode())
     if json:
-        print_json(checked.document())
+        print_json(checked.as_json())
         return
     if text:
         print(text, end="")
