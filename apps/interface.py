@@ -156,7 +156,7 @@ class Run:
         `slowest`: number N of slowest frames to name.
         Raises BadInputError for a missing or broken journal.
         """
-        return explain_run(self.folder, slowest)
+        return explain_run(self.folder, slowest).as_json()
 
 
 class RunFailedError(TrilaneError):

@@ -13,10 +13,12 @@ takes the newest frame. A dotted line is the bypass. The stages that determine t
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from html import escape
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from trilane.apps.check.port_types import PortTypes, port_types, read_networks
 from trilane.errors import BadInputError
@@ -28,7 +30,7 @@ from trilane.hw_profiles.shared_chip import alone_ms
 from trilane.hw_profiles.tenants import SKIPS
 from trilane.pipeline.description import file_text, tables_of, unsaid
 from trilane.pipeline.file_graph import edge_rules, graph_of
-from trilane.pipeline.file_keys import PythonStage, StageKeys
+from trilane.pipeline.file_keys import PortInput, PortType, PythonStage, StageKeys
 from trilane.pipeline.pipeline_file import (
     FORM,
     IF_EMPTY,
@@ -36,8 +38,8 @@ from trilane.pipeline.pipeline_file import (
     TABLES,
     PipelineFile,
     checked_tables,
-    read_pipeline,
 )
+from trilane.scheduler.period_bound import PeriodBound
 from trilane.scheduler.policy import POLICIES
 from trilane.transport.slots import edge_rule
 from trilane.units import HOST, NS_PER_MS, SUSTAINED
@@ -47,116 +49,126 @@ MOST_STREAM_BYTES: Final = 2 << 30
 DIGITS: Final = 6  # behind the point of a time in ms, because the scheduler counts nanoseconds
 
 
-def check_file(path: Path) -> dict[str, Any]:
-    """Check a pipeline file, its networks and its ports, and return what `trilane check --json` prints.
+@dataclass(frozen=True)
+class CheckedFile:
+    """A pipeline file without a fault, or the pipeline of a scene.
 
-    Raises BadInputError for the first fault in these files.
+    `name`: file or scene, as it was named. `types`: types of the ports.
+    `prices`: time of each stage, by name; a stage without a known time is absent.
+    `bound`: lower bound on the period; None if the time of a stage is not known.
+    `rules`, `memory`: rule and bytes of each stream's slots, by the stage that writes the stream; the bytes are None if
+    a type is not known.
+    `past`: stages that a frame on the bypass skips. `imports`: factories in Python that a run imports.
+    `notes`: sentences about a scene; None for a pipeline file.
     """
-    return _document_of(read_pipeline(path))
+
+    name: str
+    file: PipelineFile
+    types: PortTypes
+    prices: Mapping[str, StagePrice]
+    bound: PeriodBound | None
+    rules: Mapping[str, str]
+    memory: Mapping[str, int | None]
+    past: Sequence[str]
+    imports: Sequence[str]
+    notes: Sequence[str] | None = None
+
+    def time_ms(self, stage: str) -> float | None:
+        """Return the mean time of a job of `stage`, by its name; None if it is not known."""
+        return self.prices[stage].time.mean_ms if stage in self.prices else None
+
+    @property
+    def period_ms(self) -> float | None:
+        return None if self.bound is None else float(self.bound.period_ns) / NS_PER_MS
+
+    def as_json(self) -> dict[str, Any]:
+        """Return what `trilane check --json` prints."""
+        file, run = self.file, self.file.run
+        routes = []
+        if file.bypass is not None:
+            begin, way = file.bypass
+            share = None if way.taken is None else float(way.taken)
+            routes = [{"from": begin, "to": way.to, "past": list(self.past), "share": share}]
+        return {
+            "schema": 1,
+            "file": self.name,
+            "run": run.model_dump(mode="json", exclude_defaults=True) | {"policy": run.policy},
+            "latency_to": file.latency_to,
+            "units": {name: {"hardware": file.hardware(name)} for name in file.units},
+            "stages": [
+                {
+                    "name": name,
+                    "unit": stage.unit,
+                    "kind": stage.kind,
+                    "what": what(stage),
+                    "in": [{"port": each.port, "from": source(each), **_sync(each)} for each in stage.inputs],
+                    "every": stage.every,
+                    "time_ms": self.time_ms(name),
+                    "time_from": self.prices[name].source if name in self.prices else "",
+                }
+                for name, stage in file.stages.items()
+            ],
+            "streams": [
+                {
+                    "from": name,
+                    "to": file.readers[name],
+                    "slots": edge_rule(rule).slots,
+                    "rule": rule,
+                    "ports": {port: str(kind) for port, kind in self.types.get(name, {}).items()},
+                    "memory_bytes": self.memory[name],
+                }
+                for name, rule in self.rules.items()
+            ],
+            "routes": routes,
+            "period_ms": self.period_ms,
+            "cycle": list(self.bound.stages) if self.bound else [],
+            "limit": self.bound.limit if self.bound else "",
+            "memory_bytes": sum(filter(None, self.memory.values())),
+            "memory_unknown": [name for name, size in self.memory.items() if size is None],
+            "imports": self.imports,
+            **({} if self.notes is None else {"notes": self.notes}),
+        }
 
 
-def _document_of(file: PipelineFile) -> dict[str, Any]:
-    """Return the result of `check_file` for the pipeline file `file`, which was read before.
-
-    Raises BadInputError for the first fault in its networks and ports.
-    """
+def check_file(file: PipelineFile) -> CheckedFile:
+    """Check the networks and ports of a pipeline file. Raises BadInputError for the first fault in them."""
     types = port_types(file, read_networks(file))
     prices = {name: price for name in file.stages if (price := given_price(file, name)) is not None}
-    known = prices if len(prices) == len(file.stages) else None
     rules = edge_rules(file)
-    period: dict[str, Any] = {"period_ms": None, "cycle": [], "limit": ""}
-    if known is not None:
-        _, bound = bound_of(file, known)
-        period = {
-            "period_ms": float(bound.period_ns) / NS_PER_MS,
-            "cycle": list(bound.stages),
-            "limit": bound.limit,
-        }
-    streams = [_stream(file, name, rule, types) for name, rule in rules.items()]
-    memory = [each["memory_bytes"] for each in streams]
-    return {
-        "schema": 1,
-        "file": str(file.path),
-        "run": file.run.model_dump(mode="json", exclude_defaults=True) | {"policy": file.run.policy},
-        "latency_to": file.latency_to,
-        "units": {name: {"hardware": file.hardware(name)} for name in file.units},
-        "stages": [_stage(file, name, prices.get(name)) for name in file.stages],
-        "streams": streams,
-        "routes": _routes(file, rules),
-        **period,
-        "memory_bytes": sum(each for each in memory if each is not None),
-        "memory_unknown": [each["from"] for each in streams if each["memory_bytes"] is None],
-        "imports": sorted({each.python for each in file.stages.values() if isinstance(each, PythonStage)}),
-    }
+    bound = bound_of(file, prices)[1] if len(prices) == len(file.stages) else None
+    memory = {name: _memory(file, name, rule, types.get(name)) for name, rule in rules.items()}
+    past = () if file.bypass is None else graph_of(file, rules).bypassed
+    imports = sorted({each.python for each in file.stages.values() if isinstance(each, PythonStage)})
+    return CheckedFile(str(file.path), file, types, prices, bound, rules, memory, past, imports)
 
 
-def _stage(file: PipelineFile, name: str, price: StagePrice | None) -> dict[str, Any]:
-    stage = file.stages[name]
-    return {
-        "name": name,
-        "unit": stage.unit,
-        "kind": stage.kind,
-        "what": _what(stage),
-        "in": [_input(each) for each in stage.inputs],
-        "every": stage.every,
-        "time_ms": None if price is None else price.time.mean_ms,
-        "time_from": "" if price is None else price.source,
-    }
-
-
-def _routes(file: PipelineFile, rules: Mapping[str, str]) -> list[dict[str, Any]]:
-    """Return a list with the bypass as a mapping; an empty list if the file has no bypass.
-
-    The keys are `from` and `to`: stages where the bypass begins and ends; `past`: names of the stages between the two;
-    `share`: share of the frames that take the bypass, None if the file does not state it.
-
-    `file`: pipeline file. `rules`: rule of each edge, by the stage that writes to the edge.
-    """
-    if file.bypass is None:
-        return []
-    begin, way = file.bypass
-    share = None if way.taken is None else float(way.taken)
-    return [{"from": begin, "to": way.to, "past": list(graph_of(file, rules).bypassed), "share": share}]
-
-
-def _what(stage: StageKeys) -> str:
+def what(stage: StageKeys) -> str:
     """Return the stage's network file, Python factory or block; "" for a stage with a set time and nothing to run."""
     return str(getattr(stage, stage.kind)) if stage.kind != "time_ms" else ""
 
 
-def _input(each: Any) -> dict[str, Any]:
-    source = f"{each.stage}.{each.from_port}" if each.from_port else each.stage
-    sync = {"sync": "latest", "max_age_ms": each.max_age_ms or None} if each.latest else {"sync": "frame"}
-    return {"port": each.port, "from": source, **sync}
+def source(each: PortInput) -> str:
+    """Return the stage that an input reads, or `STAGE.PORT`."""
+    return f"{each.stage}.{each.from_port}" if each.from_port else each.stage
 
 
-def _stream(file: PipelineFile, name: str, rule: str, types: PortTypes) -> dict[str, Any]:
-    ports: Mapping[str, Any] = types.get(name, {})
-    slots = edge_rule(rule).slots
-    slot_bytes = sum(port.payload_bytes for port in ports.values()) if ports else None
-    if slot_bytes is not None and slots * slot_bytes > MOST_STREAM_BYTES:
+def _sync(each: PortInput) -> dict[str, Any]:
+    return {"sync": "latest", "max_age_ms": each.max_age_ms or None} if each.latest else {"sync": "frame"}
+
+
+def _memory(file: PipelineFile, name: str, rule: str, ports: Mapping[str, PortType] | None) -> int | None:
+    """Return the bytes of the slots behind stage `name`; None if the types of its `ports` are not known.
+
+    `rule`: rule of the edge. Raises BadInputError for more than MOST_STREAM_BYTES.
+    """
+    if not ports:
+        return None
+    slots, slot_bytes = edge_rule(rule).slots, sum(port.payload_bytes for port in ports.values())
+    if slots * slot_bytes > MOST_STREAM_BYTES:
         found = f"{slots} slots of {slot_bytes >> 20} MiB behind {name}"
         expected = f"at most {MOST_STREAM_BYTES >> 30} GiB for a stream"
         raise BadInputError(f"{file.path}: edges.{name}", found, expected, "fewer slots or a smaller port")
-    return {
-        "from": name,
-        "to": file.readers[name],
-        "slots": slots,
-        "rule": rule,
-        "ports": {port: str(kind) for port, kind in ports.items()},
-        "memory_bytes": None if slot_bytes is None else slots * slot_bytes,
-    }
-
-
-class CheckedScene(NamedTuple):
-    """The check of a scene.
-
-    `document`: result of `check_file` for the scene's pipeline, with the further key `notes`: list of sentences.
-    `text`: pipeline file that describes this pipeline.
-    """
-
-    document: dict[str, Any]
-    text: str
+    return slots * slot_bytes
 
 
 def is_scene(text: str) -> bool:
@@ -175,8 +187,8 @@ def is_scene(text: str) -> bool:
     return bool(tables) and not {*tables} & {*TABLES}
 
 
-def check_scene(text: str, profile: str | None = None) -> CheckedScene:
-    """Check a scene, and return the document of the check with the scene's pipeline.
+def check_scene(text: str, profile: str | None = None) -> tuple[CheckedFile, str]:
+    """Return the checked pipeline of a scene, and the text of a pipeline file that describes it.
 
     `text`: name of a bundled scene, or a file.
     `profile`: chip for which the times of the stages are computed; None for stages without times.
@@ -188,24 +200,25 @@ def check_scene(text: str, profile: str | None = None) -> CheckedScene:
     from trilane.stages.run_options import RunOptions
 
     options = RunOptions(scene=text, skinning="gpu")
-    checked = configure(options, Path.cwd())
-    pipeline, scene = avatar_pipeline(checked.config, checked.assets, options.edge), checked.config.scene
+    configured = configure(options, Path.cwd())
+    pipeline, scene = avatar_pipeline(configured.config, configured.assets, options.edge), configured.config.scene
     run: dict[str, Any] = {"policy": options.policy, "frames": scene.frames}
     if POLICIES[options.policy].paced:
         run["fps"] = scene.fps
-    times: Mapping[str, float] = {}
-    taken: Mapping[str, Any] = {}
-    if profile is not None:
-        times, taken = _priced(text, profile)
+    times, taken = ({}, {}) if profile is None else _priced(text, profile)
     tables = tables_of(pipeline, run, times, taken)
-    document = _document_of(checked_tables(tables, Path(f"{scene.name}.toml")))
-    notes = [*unsaid(pipeline), *_said(profile, document["routes"][0]["share"])]
-    period = document["period_ms"]
+    checked = check_file(checked_tables(tables, Path(f"{scene.name}.toml")))
+    notes = [*unsaid(pipeline)]
+    if profile is None or checked.file.bypass is None or (share := checked.file.bypass[1].taken) is None:
+        notes.append("without times: --profile CHIP adds the times of a chip")
+    else:
+        notes.append(f"times are means of {profile}, {SUSTAINED}, for frames that the network paints")
+        notes.append(f"{float(share):.1%} of the scene's frames need no new picture and take the route")
     head = [f"the pipeline of the scene {scene.name}, as `trilane run {text}` runs it"]
-    if period is not None:
-        head.append(f"period {period:.6g} ms or more, by {document['limit']}: {' -> '.join(document['cycle'])}")
-    answer = {**document, "file": text, "imports": [], "notes": notes}
-    return CheckedScene(answer, file_text(tables, [*head, *notes]))
+    if checked.bound is not None:
+        cycle = " -> ".join(checked.bound.stages)
+        head.append(f"period {checked.period_ms:.6g} ms or more, by {checked.bound.limit}: {cycle}")
+    return replace(checked, name=text, imports=[], notes=notes), file_text(tables, [*head, *notes])
 
 
 def _priced(text: str, profile: str) -> tuple[Mapping[str, float], Mapping[str, Any]]:
@@ -230,99 +243,66 @@ def _priced(text: str, profile: str) -> tuple[Mapping[str, float], Mapping[str, 
     return rounded, {"pattern": pattern} if "1" in pattern else {"share": 0}
 
 
-def _said(profile: str | None, share: float | None) -> list[str]:
-    """Return notes on the source of the stages' times, and on the frames that take the bypass.
-
-    `profile`: chip of the times; None for stages without times. `share`: share of the frames that take the bypass; None
-    if unknown.
-    """
-    if profile is None or share is None:
-        return ["without times: --profile CHIP adds the times of a chip"]
-    said = f"times are means of {profile}, {SUSTAINED}, for frames that the network paints"
-    return [said, f"{share:.1%} of the scene's frames need no new picture and take the route"]
-
-
 COLUMN, LANE, BOX, HEIGHT, LEFT, TOP = 170, 84, 130, 44, 90, 20
 OVER: Final = 10  # pixels between a row of boxes and a line that passes above them
 LETTERS: Final = 17  # of a stage's name, at most, in its box
-DASHES: Final = {"frame": "", "latest": " stroke-dasharray='5 4'"}
-DOTS: Final = " stroke-dasharray='1 4'"
+DASHES, DOTS = " stroke-dasharray='5 4'", " stroke-dasharray='1 4'"
 STYLE: Final = "font-family='sans-serif' font-size='12'"
 
 
-def draw_graph(document: Mapping[str, Any]) -> str:
-    """Return the drawing of a pipeline as the text of an SVG file. `document`: result of `check_file`."""
-    columns = _columns(document)
-    rows = _rows(document, columns)
-    tops, height = _lanes(document, rows)
-    places = {name: (LEFT + COLUMN * columns[name], tops[unit] + LANE * row + 16) for name, (unit, row) in rows.items()}
-    width, names = LEFT + COLUMN * (1 + max(columns.values())), [*tops]
-    ends = [*[tops[unit] for unit in names[1:]], height]
-    body = [
-        f"<rect x='0' y='{tops[unit]}' width='{width}' height='{end - tops[unit] - 6}' fill='#f3f4f6'/>"
-        f"<text x='10' y='{tops[unit] + 20}' {STYLE} font-weight='bold'>{escape(unit)}</text>"
-        for unit, end in zip(names, ends, strict=True)
-    ]
+def draw_graph(checked: CheckedFile) -> str:
+    """Return the drawing of a pipeline as the text of an SVG file."""
+    file, cells = checked.file, _cells(checked.file)
+    width, height = LEFT + COLUMN * (1 + max(column for column, _ in cells.values())), TOP
+    places: dict[str, tuple[int, int]] = {}
+    body = []
+    for unit in file.units:
+        own = {name: cells[name] for name, stage in file.stages.items() if stage.unit == unit}
+        lane = LANE * (1 + max(row for _, row in own.values()))
+        body.append(
+            f"<rect x='0' y='{height}' width='{width}' height='{lane - 6}' fill='#f3f4f6'/>"
+            f"<text x='10' y='{height + 20}' {STYLE} font-weight='bold'>{escape(unit)}</text>"
+        )
+        places |= {name: (LEFT + COLUMN * column, height + LANE * row + 16) for name, (column, row) in own.items()}
+        height += lane
     body += [
-        _line(places[each["from"].partition(".")[0]], places[stage["name"]], DASHES[each["sync"]])
-        for stage in document["stages"]
-        for each in stage["in"]
+        _line(places[each.stage], places[name], DASHES if each.latest else "")
+        for name, stage in file.stages.items()
+        for each in stage.inputs
     ]
-    body += [_line(places[each["from"]], places[each["to"]], DOTS) for each in document["routes"]]
-    body += [_box(stage, *places[stage["name"]], stage["name"] in document["cycle"]) for stage in document["stages"]]
+    if file.bypass is not None:
+        body.append(_line(places[file.bypass[0]], places[file.bypass[1].to], DOTS))
+    body += [_box(checked, name, *places[name]) for name in file.stages]
     head = f"<svg xmlns='http://www.w3.org/2000/svg' width='{width}' height='{height}' viewBox='0 0 {width} {height}'>"
     return "\n".join([head, "<rect width='100%' height='100%' fill='white'/>", *body, "</svg>", ""])
 
 
-def _columns(document: Mapping[str, Any]) -> dict[str, int]:
-    """Return the number of each stage's column, by the stage's name. Column 0 is on the left.
+def _cells(file: PipelineFile) -> dict[str, tuple[int, int]]:
+    """Return (column, row) of each stage, by its name. Column 0 is on the left, row 0 on top in the lane of the unit.
 
-    A stage stands to the right of every stage that it reads.
+    A stage stands to the right of every stage that it reads. Stages in one lane and column get different rows.
     """
-    found: dict[str, int] = {}
-    for stage in document["stages"]:
-        before = [found[each["from"].partition(".")[0]] for each in stage["in"]]
-        found[stage["name"]] = max(before, default=-1) + 1
+    found: dict[str, tuple[int, int]] = {}
+    used = Counter[tuple[str, int]]()
+    for name, stage in file.stages.items():
+        column = 1 + max((found[each.stage][0] for each in stage.inputs), default=-1)
+        found[name] = column, used[stage.unit, column]
+        used[stage.unit, column] += 1
     return found
 
 
-def _rows(document: Mapping[str, Any], columns: Mapping[str, int]) -> dict[str, tuple[str, int]]:
-    """Return a pair for each stage, by its name: its unit, and its row in the lane of the unit, from 0 at the top.
-
-    Stages in one lane and column get different rows. `document`: result of `check_file`. `columns`: result of
-    `_columns`.
-    """
-    used: dict[tuple[str, int], int] = {}
-    found = {}
-    for stage in document["stages"]:
-        key = stage["unit"], columns[stage["name"]]
-        found[stage["name"]] = stage["unit"], used.get(key, 0)
-        used[key] = used.get(key, 0) + 1
-    return found
-
-
-def _lanes(document: Mapping[str, Any], rows: Mapping[str, tuple[str, int]]) -> tuple[dict[str, int], int]:
-    """Return the y coordinate of the top of each unit's lane, by unit, and the height of the drawing, in pixels.
-
-    `document`: result of `check_file`. `rows`: result of `_rows`.
-    """
-    tops, top = {}, TOP
-    for unit in document["units"]:
-        tops[unit] = top
-        top += LANE * (1 + max(row for other, row in rows.values() if other == unit))
-    return tops, top
-
-
-def _box(stage: Mapping[str, Any], x: int, y: int, is_bound: bool) -> str:
-    time = "" if stage["time_ms"] is None else f"{stage['time_ms']:g} ms"
-    every = f" every {stage['every']}" if stage["every"] > 1 else ""
-    name = stage["name"] if len(stage["name"]) <= LETTERS else stage["name"][: LETTERS - 1] + "…"
+def _box(checked: CheckedFile, name: str, x: int, y: int) -> str:
+    stage, time_ms = checked.file.stages[name], checked.time_ms(name)
+    time = stage.kind if time_ms is None else f"{time_ms:g} ms"
+    every = f" every {stage.every}" if stage.every > 1 else ""
+    short = name if len(name) <= LETTERS else name[: LETTERS - 1] + "…"
+    is_bound = checked.bound is not None and name in checked.bound.stages
     border = "stroke='#b91c1c' stroke-width='3'" if is_bound else "stroke='#374151'"
     return (
-        f"<g><title>{escape(stage['name'])}: {escape(stage['what'] or stage['kind'])}</title>"
+        f"<g><title>{escape(name)}: {escape(what(stage) or stage.kind)}</title>"
         f"<rect x='{x}' y='{y}' width='{BOX}' height='{HEIGHT}' rx='5' fill='white' {border}/>"
-        f"<text x='{x + 8}' y='{y + 18}' {STYLE}>{escape(name)}</text>"
-        f"<text x='{x + 8}' y='{y + 35}' {STYLE} fill='#6b7280'>{escape((time or stage['kind']) + every)}</text></g>"
+        f"<text x='{x + 8}' y='{y + 18}' {STYLE}>{escape(short)}</text>"
+        f"<text x='{x + 8}' y='{y + 35}' {STYLE} fill='#6b7280'>{escape(time + every)}</text></g>"
     )
 
 

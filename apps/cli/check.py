@@ -5,9 +5,8 @@ Rule: this module shows the results of `trilane.apps.check`. It computes nothing
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,6 +15,9 @@ from trilane.apps.cli.console import print_json, stdout_console, without_control
 
 if TYPE_CHECKING:
     from rich.table import Table
+
+    from trilane.apps.check.checked import CheckedFile
+    from trilane.pipeline.file_keys import PortInput
 
 app = Commands()
 
@@ -46,125 +48,122 @@ def check(file: FileArgument, svg: SvgOption = None, profile: ProfileOption = No
 
     For a scene, the command prints the pipeline file of its run. Nothing runs, and no Python of the file is imported.
     """
-    from trilane.apps.check.checked import draw_graph
+    from trilane.apps.check.checked import check_file, check_scene, draw_graph, is_scene
     from trilane.errors import BadInputError
+    from trilane.pipeline.pipeline_file import read_pipeline
     from trilane.writing import require_writable, write_bytes
 
     if svg is not None:
         if svg.suffix.lower() != ".svg":
             raise BadInputError("--svg", f"'{svg}'", "a name that ends in .svg")
         require_writable(svg)
-    document, text = _checked(file, profile)
+    text = ""
+    if is_scene(file):
+        checked, text = check_scene(file, profile)
+    elif profile is None:
+        checked = check_file(read_pipeline(Path(file)))
+    else:
+        remedy = f"`trilane predict {file} --profile {profile}` prices its stages"
+        raise BadInputError("--profile", f"{profile} beside a pipeline file", "a scene", remedy)
     if svg is not None:
-        write_bytes(svg, draw_graph(document).encode())
+        write_bytes(svg, draw_graph(checked).encode())
     if json:
-        print_json(document)
+        print_json(checked.as_json())
         return
     if text:
         print(text, end="")
         return
     console = stdout_console()
-    console.print(_head(document), soft_wrap=True, markup=False)
-    console.print(_stages(document))
-    if document["streams"]:
-        console.print(_streams(document))
-    for line in _tail(document):
+    console.print(_head(checked), soft_wrap=True, markup=False)
+    console.print(_stages(checked))
+    if checked.memory:
+        console.print(_streams(checked))
+    for line in _tail(checked):
         console.print(line, soft_wrap=True, markup=False)
 
 
-def _checked(file: str, profile: str | None) -> tuple[dict[str, Any], str]:
-    """Return the document for `--json`, and the text of a pipeline file that describes the pipeline of a scene.
-
-    If `file` is a pipeline file, this text is empty. `file`: pipeline file, or name or file of a scene.
-    `profile`: chip whose times the stages of a scene get; None for stages without times.
-
-    Raises BadInputError for a faulty file, and for a `profile` with a pipeline file. Raises MissingPartError for a
-    scene whose run needs a part that is not installed.
-    """
-    from trilane.apps.check.checked import check_file, check_scene, is_scene
-    from trilane.errors import BadInputError
-
-    if is_scene(file):
-        return check_scene(file, profile)
-    if profile is not None:
-        remedy = f"`trilane predict {file} --profile {profile}` prices its stages"
-        raise BadInputError("--profile", f"{profile} beside a pipeline file", "a scene", remedy)
-    return check_file(Path(file)), ""
-
-
-def _head(document: Mapping[str, Any]) -> str:
-    run = document["run"]
+def _head(checked: CheckedFile) -> str:
+    run = checked.file.run
     source = "a source that is always ready"
-    if "fps" in run:
-        source = f"{run['fps']:g} fps"
-    elif "arrivals" in run:
-        source = f"arrivals at {run['arrivals']['poisson']:g} a second"
-    count = f"{len(document['stages'])} stages on {len(document['units'])} units"
-    return f"{without_controls(document['file'])}: {count}, {source}, {run['policy']}"
+    if run.fps is not None:
+        source = f"{run.fps:g} fps"
+    elif run.arrivals is not None:
+        source = f"arrivals at {run.arrivals.poisson:g} a second"
+    count = f"{len(checked.file.stages)} stages on {len(checked.file.units)} units"
+    return f"{without_controls(checked.name)}: {count}, {source}, {run.policy}"
 
 
-def _stages(document: Mapping[str, Any]) -> Table:
-    """Return a table with a row for each stage, grouped by unit. `document`: result of `check_file`."""
+def _stages(checked: CheckedFile) -> Table:
+    """Return a table with a row for each stage, grouped by unit."""
     from rich.markup import escape
     from rich.table import Table
 
+    from trilane.apps.check.checked import what
+
     table = Table("unit", "stage", "what", "reads", "time, ms", "from")
-    for unit, facts in document["units"].items():
-        title = unit if facts["hardware"] in (None, unit) else f"{unit} ({facts['hardware']})"
-        for stage in document["stages"]:
-            if stage["unit"] != unit:
+    for unit in checked.file.units:
+        hardware = checked.file.hardware(unit)
+        title = unit if hardware in (None, unit) else f"{unit} ({hardware})"
+        for name, stage in checked.file.stages.items():
+            if stage.unit != unit:
                 continue
-            every = f", every {stage['every']}" if stage["every"] > 1 else ""
-            what = escape(" ".join(filter(None, (stage["kind"], without_controls(stage["what"])))))
-            reads = escape(", ".join(map(_input, stage["in"]))) or "-"
-            time = "?" if stage["time_ms"] is None else f"{stage['time_ms']:.4g}"
-            table.add_row(title, stage["name"], what + every, reads, time, stage["time_from"] or "-")
+            every = f", every {stage.every}" if stage.every > 1 else ""
+            kind = escape(" ".join(filter(None, (stage.kind, without_controls(what(stage))))))
+            reads = escape(", ".join(map(_input, stage.inputs))) or "-"
+            price = checked.prices.get(name)
+            time, source = ("?", "-") if price is None else (f"{price.time.mean_ms:.4g}", price.source or "-")
+            table.add_row(title, name, kind + every, reads, time, source)
             title = ""
     return table
 
 
-def _input(each: Mapping[str, Any]) -> str:
-    port = f"{each['port']}: " if each["port"] else ""
-    age = f" to {each['max_age_ms']:g} ms" if each.get("max_age_ms") else ""
-    name: str = without_controls(f"{port}{each['from']}")
-    return name + (f" (latest{age})" if each["sync"] == "latest" else "")
+def _input(each: PortInput) -> str:
+    from trilane.apps.check.checked import source
+
+    port = f"{each.port}: " if each.port else ""
+    age = f" to {each.max_age_ms:g} ms" if each.max_age_ms else ""
+    name: str = without_controls(f"{port}{source(each)}")
+    return name + (f" (latest{age})" if each.latest else "")
 
 
-def _streams(document: Mapping[str, Any]) -> Table:
+def _streams(checked: CheckedFile) -> Table:
     from rich.markup import escape
     from rich.table import Table
 
+    from trilane.transport.slots import edge_rule
+
     table = Table("stream", "readers", "rule", "slots", "ports", "memory")
-    for stream in document["streams"]:
-        ports = ", ".join(f"{name}: {kind}" if name else kind for name, kind in stream["ports"].items())
-        memory = "?" if stream["memory_bytes"] is None else f"{stream['memory_bytes'] / 1e6:.3g} MB"
-        readers = ", ".join(stream["to"])
-        table.add_row(
-            stream["from"], readers, stream["rule"], str(stream["slots"]), escape(without_controls(ports)), memory
+    for name, rule in checked.rules.items():
+        ports = ", ".join(
+            f"{port}: {kind}" if port else str(kind) for port, kind in checked.types.get(name, {}).items()
         )
+        size, slots = checked.memory[name], str(edge_rule(rule).slots)
+        memory = "?" if size is None else f"{size / 1e6:.3g} MB"
+        readers = ", ".join(checked.file.readers[name])
+        table.add_row(name, readers, rule, slots, escape(without_controls(ports)), memory)
     return table
 
 
-def _tail(document: Mapping[str, Any]) -> list[str]:
-    unknown = [stage["name"] for stage in document["stages"] if stage["time_ms"] is None]
+def _tail(checked: CheckedFile) -> list[str]:
+    file, period, bound = checked.file, checked.period_ms, checked.bound
     lines = []
-    if document["period_ms"] is None:
-        lines.append(
-            f"period    unknown, as no time is known of {', '.join(unknown)}; `trilane predict` prices networks"
-        )
+    if bound is None or period is None:
+        unknown = ", ".join(name for name in file.stages if name not in checked.prices)
+        lines.append(f"period    unknown, as no time is known of {unknown}; `trilane predict` prices networks")
     else:
-        period = document["period_ms"]
         rate = f" ({1e3 / period:.4g} a second)" if period else ""
-        limit = f", by {document['limit'].replace('_', ' ')}: {' -> '.join(document['cycle'])}"
-        lines.append(f"period    {period:.6g} ms or more{rate}{limit if document['cycle'] else ''}")
-    more = f", and what is unknown of {', '.join(document['memory_unknown'])}" if document["memory_unknown"] else ""
-    lines.append(f"memory    {document['memory_bytes'] / 1e6:.3g} MB of slots{more}")
-    for route in document["routes"]:
-        share = "frames that need nothing there" if route["share"] is None else f"{route['share']:.1%} of the frames"
-        lines.append(f"bypass    {route['from']} -> {route['to']}, past {', '.join(route['past'])}: {share}")
-    lines.append(f"latency   to the end of {document['latency_to']}")
-    if document["imports"]:
-        lines.append(f"imports   {', '.join(document['imports'])}, by `trilane run` alone")
+        limit = f", by {bound.limit.replace('_', ' ')}: {' -> '.join(bound.stages)}" if bound.stages else ""
+        lines.append(f"period    {period:.6g} ms or more{rate}{limit}")
+    unknown = ", ".join(name for name, size in checked.memory.items() if size is None)
+    more = f", and what is unknown of {unknown}" if unknown else ""
+    lines.append(f"memory    {sum(filter(None, checked.memory.values())) / 1e6:.3g} MB of slots{more}")
+    if file.bypass is not None:
+        begin, way = file.bypass
+        share = "frames that need nothing there" if way.taken is None else f"{float(way.taken):.1%} of the frames"
+        lines.append(f"bypass    {begin} -> {way.to}, past {', '.join(checked.past)}: {share}")
+    lines.append(f"latency   to the end of {file.latency_to}")
+    if checked.imports:
+        lines.append(f"imports   {', '.join(checked.imports)}, by `trilane run` alone")
     return lines
 
 

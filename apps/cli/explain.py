@@ -5,9 +5,9 @@ Rule: this module only reads options and shows results.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -24,10 +24,13 @@ from trilane.apps.cli.console import (
 )
 from trilane.errors import BadInputError
 from trilane.stages.run_options import PROFILE_HELP, RunOptions
-from trilane.units import PerformanceProfile
+from trilane.units import NS_PER_MS, PerformanceProfile
 
 if TYPE_CHECKING:
     from rich.table import Table
+
+    from trilane.apps.explain.explained_run import ExplainedFrame, ExplainedRun
+    from trilane.apps.explain.scene_plan import ImageSize, ModelledAvatar, Phase, PlanExplanation
 
 app = Commands()
 EPILOG = """\b
@@ -69,7 +72,7 @@ def explain(
     The output is the stage or wait that bounded the run, why jobs waited, and why the slowest frames were slow
     (docs/explain.md). `trilane plan` explains a scene before it runs.
     """
-    from trilane.apps.explain.explained_run import check_ending, explain_frame, explain_run, write_jobs
+    from trilane.apps.explain.explained_run import ExplainedRun, check_ending, explain_frame, explain_run, write_jobs
     from trilane.apps.watch.followed_run import follow
     from trilane.writing import require_writable
 
@@ -78,31 +81,33 @@ def explain(
         require_writable(jobs)
     folder = follow(run).folder
     with spinner("reading the journal"):
-        document = explain_run(folder, slowest) if frame is None else explain_frame(folder, frame)
+        explained = explain_run(folder, slowest) if frame is None else explain_frame(folder, frame)
         count = write_jobs(folder, jobs) if jobs is not None else 0
     if jobs is not None:
         say(f"jobs: {jobs}, {count} rows")
     if json:
-        print_json(document)
-        return
-    (_show_run if frame is None else _show_frame)(without_controls(document))
+        print_json(explained.as_json())
+    elif isinstance(explained, ExplainedRun):
+        _show_run(explained)
+    else:
+        _show_frame(explained)
 
 
-def _show_frame(document: Mapping[str, Any]) -> None:
+def _show_frame(frame: ExplainedFrame) -> None:
     from rich.table import Table
 
-    after = "" if document["after_ms"] is None else f" {document['after_ms']:.1f} ms after its release"
-    cause = "" if document["cause"] is None else f", cause {document['cause']} (docs/policies-and-edges.md)"
-    latency = "" if document["latency_ms"] is None else f", latency {document['latency_ms']:.1f} ms"
+    after = "" if frame.after_ms is None else f" {frame.after_ms:.1f} ms after its release"
+    cause = "" if frame.cause is None else f", cause {frame.cause} (docs/policies-and-edges.md)"
+    latency = "" if frame.latency_ms is None else f", latency {frame.latency_ms:.1f} ms"
     console = stdout_console()
-    print_line(f"Frame {document['frame']}: {document['outcome']}{after}{cause}{latency}")
-    if not document["jobs"]:
+    print_line(without_controls(f"Frame {frame.frame}: {frame.outcome}{after}{cause}{latency}"))
+    if not frame.jobs:
         console.print("no job of it began")
         return
     table = Table("stage (unit)", "began, ms", "took, ms", "waited, ms", "why, ms")
-    for row in document["jobs"]:
-        times = [f"{row[key]:.2f}" for key in ("begin_ms", "took_ms", "wait_ms")]
-        table.add_row(f"{row['stage']} ({row['unit']})", *times, _causes(row["causes_ms"]))
+    for row in frame.jobs:
+        times = [f"{ms:.2f}" for ms in (row.begin_ms, row.took_ms, row.wait_ms)]
+        table.add_row(*without_controls([f"{row.stage} ({row.unit})", *times, _causes(row.causes_ms)]))
     console.print(table)
 
 
@@ -110,49 +115,50 @@ def _causes(causes_ms: Mapping[str, float]) -> str:
     return ", ".join(f"{cause} {ms:.2f}" for cause, ms in causes_ms.items() if ms >= 0.005) or "-"
 
 
-def _show_run(document: Mapping[str, Any]) -> None:
+def _show_run(run: ExplainedRun) -> None:
     from trilane.apps.explain.explained_run import join_text
+    from trilane.apps.run.verdict_facts import verdict_of
 
     console = stdout_console()
-    if document["verdict"] and not document["remark"]:
-        print_verdict(document["verdict"]["lines"])
+    if run.report and not run.remark:
+        print_verdict(verdict_of(run.report, str(run.folder)).lines())
         console.print()
-    for line in _head(document):
-        print_line(line)
-    if not document["budget"]:
+    for line in _head(run):
+        print_line(without_controls(line))
+    if not run.budget:
         return
-    console.print(_budget(document))
-    for line in _shared(document["shared_cores"]):
-        print_line(line)
-    console.print(_waits(document["waits"]))
-    for row in document.get("joins", ()):
-        print_line(join_text(row))
-    console.print(_slowest(document))
-    for line in document["advice"]:
-        print_line(f"try: {line}")
-    print_line(f"times: {document['sources']['frames, waits_ms, service_ms, preempted_ms']}")
+    console.print(_budget(run))
+    for line in _shared(run):
+        print_line(without_controls(line))
+    console.print(_waits(run))
+    for stage, inputs in run.joins.items():
+        print_line(without_controls(join_text(stage, inputs)))
+    console.print(_slowest(run))
+    for line in run.advice:
+        print_line(without_controls(f"try: {line}"))
+    print_line(f"times: {run.source}")
 
 
-def _head(document: Mapping[str, Any]) -> Iterator[str]:
-    if document["remark"]:
-        yield document["remark"]
-    frame_ms = document["frame_ms"]
+def _head(run: ExplainedRun) -> Iterator[str]:
+    if run.remark:
+        yield run.remark
+    frame_ms, failure = run.frame_ms, run.report.failure if run.report else None
     mean = "fewer than two frames: no frame time" if frame_ms is None else f"{frame_ms:.2f} ms a frame"
-    scene = f"scene {document['scene']}, " if document["scene"] else ""
-    yield f"Run {document['run']}: {scene}policy {document['policy']}, {document['frames']} frames, {mean}"
-    for kind, counts in document["left"].items():
+    scene = f"scene {run.scene}, " if run.scene else ""
+    yield f"Run {run.folder}: {scene}policy {run.begun.settings.policy}, {run.frames} frames, {mean}"
+    for kind, counts in run.left.items():
         causes = ", ".join(f"{cause} {count}" for cause, count in counts.items())
-        yield f"frames {kind}: {sum(counts.values())} ({causes})"
-    if frame_ms and document["nobodys_ms"] >= LEAST_SHARE * frame_ms:
+        yield f"frames {kind}: {counts.total()} ({causes})"
+    if frame_ms and run.nobodys_ms >= LEAST_SHARE * frame_ms:
         yield (
-            f"other programs: {document['nobodys_ms']:.1f} of {frame_ms:.1f} ms a frame were nobody's of this run: a "
+            f"other programs: {run.nobodys_ms:.1f} of {frame_ms:.1f} ms a frame were nobody's of this run: a "
             "stage on the path had no core, and no job of this run had it"
         )
-    yield from _efficiency(document)
-    if document["failure"]:
-        yield f"the run failed: {document['failure']}"
-    yield from (f"in the run: {message}" for message in shown_messages(document["messages"], document["failure"]))
-    for name, facts in document["accuracy"].items():
+    yield from _efficiency(run)
+    if failure:
+        yield f"the run failed: {failure}"
+    yield from (f"in the run: {message}" for message in shown_messages(run.messages, failure))
+    for name, facts in run.accuracy.items():
         if "psnr_db_by_band" in facts:
             bands = ", ".join(f"{band} {value:.1f}" for band, value in facts["psnr_db_by_band"].items())
             yield f"avatar {name}: PSNR on held-out views, dB: {bands} ({facts['source']})"
@@ -160,27 +166,26 @@ def _head(document: Mapping[str, Any]) -> Iterator[str]:
             yield f"avatar {name}: {facts.get('source', 'no figures')} of accuracy"
 
 
-def _efficiency(document: Mapping[str, Any]) -> Iterator[str]:
-    """Yield lines on the bound and the efficiencies of the run. `document`: document of `trilane explain --json`."""
-    if bound := document.get("bound"):
+def _efficiency(run: ExplainedRun) -> Iterator[str]:
+    """Yield lines on the bound and the efficiencies of the run."""
+    if bound := run.figures["bound"]:
         from trilane.apps.explain.reasons import bound_text
 
         yield f"bound: {bound_text(bound)}"
-    if document["cores"]:
-        numbers, efficiency = ",".join(map(str, document["cores"]["numbers"])), document["machine_efficiency"]
-        cpu_ms, had_ms = document["cores"]["cpu_ms"], document["cores"]["had_ms"]
+    if cores := run.cores:
+        slowest, fullest, every = (run.figures[f"{of}efficiency"] for of in ("", "core_", "machine_"))
+        numbers, cpu_ms, had_ms = ",".join(map(str, cores.numbers)), cores.cpu_ms, cores.had_ms
         yield (
-            f"efficiency: {document['efficiency']:.0%} of the slowest unit, {document['core_efficiency']:.0%} of the "
-            f"fullest cores, {efficiency:.0%} of all (cores {numbers}: {cpu_ms:.2f} of {had_ms:.2f} ms a frame in jobs)"
+            f"efficiency: {slowest:.0%} of the slowest unit, {fullest:.0%} of the fullest cores, {every:.0%} of all "
+            f"(cores {numbers}: {cpu_ms:.2f} of {had_ms:.2f} ms a frame in jobs)"
         )
 
 
-def _budget(document: Mapping[str, Any]) -> Table:
+def _budget(run: ExplainedRun) -> Table:
     """Return a table of the frame time on the critical path.
 
     Each row has a stage, a cause, the milliseconds per frame and the share. The last row adds up the parts whose share
     is below LEAST_SHARE.
-    `document`: document of `trilane explain --json`.
     """
     from rich.table import Table
 
@@ -194,49 +199,49 @@ def _budget(document: Mapping[str, Any]) -> Table:
         caption=READ_PATH_SO,
         caption_justify="left",
     )
-    small = [row for row in document["budget"] if row["share"] < LEAST_SHARE]
-    for row in document["budget"]:
-        if row["share"] >= LEAST_SHARE:
-            table.add_row(f"{row['stage']} ({row['unit']})", row["why"], f"{row['ms']:.2f}", f"{row['share']:.1%}")
+    small = [row for row in run.budget if row.share < LEAST_SHARE]
+    for row in run.budget:
+        if row.share >= LEAST_SHARE:
+            stage = without_controls(f"{row.stage} ({row.unit})")
+            table.add_row(stage, row.why, f"{row.ms:.2f}", f"{row.share:.1%}")
     if small:
-        ms, share = (sum(row[key] for row in small) for key in ("ms", "share"))
+        ms, share = sum(row.ms for row in small), sum(row.share for row in small)
         table.add_row("", f"smaller parts, {len(small)}: --json has them", f"{ms:.2f}", f"{share:.1%}")
     return table
 
 
-def _shared(rows: list[dict[str, Any]]) -> Iterator[str]:
-    """Yield a line for each stage whose jobs lacked a core for a noticeable time, with the stages that had the core.
-
-    `rows`: value of `shared_cores` in the document of `trilane explain --json`.
-    """
-    for row in rows:
-        if row["preempted_ms"] < LEAST_SHARE * row["service_ms"]:
+def _shared(run: ExplainedRun) -> Iterator[str]:
+    """Yield a line for each stage whose jobs lacked a core for a noticeable time, with the stages that had the core."""
+    for stage, taken in run.taken.items():
+        if taken.preempted_ns < LEAST_SHARE * taken.service_ns:
             continue
-        lead = f"{row['stage']}: {row['preempted_ms']:.2f} of {row['service_ms']:.2f} ms a job without a core"
-        found = [
-            f"{ms:.2f} ms of it {other} had it, on core"
-            f"{'s' if len(row['shared'][other]) > 1 else ''} {','.join(map(str, row['shared'][other]))}"
-            for other, ms in row["taken_ms"].items()
-        ]
-        found.append(f"{row['others_ms']:.2f} ms nobody of this run")
-        yield f"{lead}; {'; '.join(found)}"
+        job_ms, found = taken.jobs * NS_PER_MS, []
+        for other, ns in taken.of.items():
+            cores = run.shared(taken.unit, other)
+            on = f"core{'s' if len(cores) > 1 else ''} {','.join(map(str, cores))}"
+            found.append(f"{ns / job_ms:.2f} ms of it {other} had it, on {on}")
+        found.append(f"{taken.other_ns / job_ms:.2f} ms nobody of this run")
+        without, service = taken.preempted_ns / job_ms, taken.service_ns / job_ms
+        yield f"{stage}: {without:.2f} of {service:.2f} ms a job without a core; {'; '.join(found)}"
 
 
-def _waits(rows: list[dict[str, Any]]) -> Table:
+def _waits(run: ExplainedRun) -> Table:
     from rich.table import Table
 
     table = Table("stage (unit)", "jobs", "wait, ms", "why, ms", title="Why jobs waited", title_justify="left")
-    for row in rows:
-        waited = f"{row['wait_ms']:.2f}"
-        table.add_row(f"{row['stage']} ({row['unit']})", str(row["jobs"]), waited, _causes(row["causes_ms"]))
+    for stage, unit in run.unit_of.items():
+        wait_ms, causes_ms = run.waits(stage)
+        cells = without_controls([f"{stage} ({unit})", str(run.jobs[stage]), f"{wait_ms:.2f}", _causes(causes_ms)])
+        table.add_row(*cells)
     return table
 
 
-def _slowest(document: Mapping[str, Any]) -> Table:
+def _slowest(run: ExplainedRun) -> Table:
     from rich.table import Table
 
-    usual = document["usual"]["frame_ms"]
-    title = f"The slowest frames (the median takes {usual:.2f} ms)"
+    from trilane.apps.explain.reasons import notes, reasons
+
+    title = f"The slowest frames (the median takes {run.usual.frame_ns / NS_PER_MS:.2f} ms)"
     table = Table(
         "frame",
         "ms",
@@ -247,13 +252,14 @@ def _slowest(document: Mapping[str, Any]) -> Table:
         caption=SLOWEST_SO,
         caption_justify="left",
     )
-    for row in document["slowest"]:
-        reasons = [f"{reason['longer_ms']:.1f} ms: {reason['text']}" for reason in row["why"]]
+    for shown in run.slowest:
+        latency_ns = shown.now.latency_ns
+        why = [f"{reason.longer_ms:.1f} ms: {reason.text}" for reason in reasons(shown, run.usual)]
         table.add_row(
-            str(row["frame"]),
-            f"{row['frame_ms']:.1f}",
-            "-" if row["latency_ms"] is None else f"{row['latency_ms']:.1f}",
-            "\n".join([*row["notes"], *reasons]) or "hardly longer than the median",
+            str(shown.now.frame),
+            f"{shown.frame_ns / NS_PER_MS:.1f}",
+            "-" if latency_ns is None else f"{latency_ns / NS_PER_MS:.1f}",
+            "\n".join(without_controls([*notes(shown), *why])) or "hardly longer than the median",
         )
     return table
 
@@ -300,7 +306,7 @@ def plan(
     Nothing runs. `trilane explain` says where the time of a run went.
     """
     _refuse_other_things(Path(scene))
-    from trilane.apps.explain.scene_plan import draw_plan, explain
+    from trilane.apps.explain.scene_plan import PlanExplanation, draw_plan
     from trilane.stages.configure import configure
     from trilane.writing import require_writable
 
@@ -310,16 +316,16 @@ def plan(
         require_writable(out)
     with spinner("planning"):
         checked = configure(options.changed(scene=scene), Path.cwd())
-        explanation = explain(checked, profile, str(performance_profile))
+        explanation = PlanExplanation(checked, profile, str(performance_profile))
     for note in checked.notes:
         say(note)
     if out is not None:
-        draw_plan(explanation.plan, explanation.first_frames, out)
+        draw_plan(explanation.plan, [phase.frames[0] for phase in explanation.phases], out)
         say(f"picture: {out}\nin the picture: {RECTANGLES}")
     if json:
-        print_json(explanation.document)
+        print_json(explanation.as_json())
         return
-    _show_plan(without_controls(explanation.document))
+    _show_plan(explanation)
 
 
 def _refuse_other_things(path: Path) -> None:
@@ -332,109 +338,91 @@ def _refuse_other_things(path: Path) -> None:
         raise BadInputError(path, "a folder", "a scene", f"`trilane explain {path}` is for the folder of a run")
 
 
-def _show_plan(document: dict[str, Any]) -> None:
-    console, config = stdout_console(), document["config"]
-    height, width = config["output"]
-    print_line(
-        f"Scene {document['scene']}: {config['frames']} frames of {width}x{height}, plan {config['plan']}, tensor size "
-        f"{config['size']}, error budget {config['error_budget_px']:g} px",
+def _show_plan(plan: PlanExplanation) -> None:
+    from trilane.apps.explain.scene_plan import EXPRESSION
+
+    console, scene = stdout_console(), plan.checked.config.scene
+    height, width = plan.plan.output
+    shapes = ", ".join(f"{h}x{w}" for h, w in plan.checked.config.buckets)
+    drawn = (
+        f"skinned by the {plan.skinned_on} unit; detail: {plan.detail}; texture filter {scene.texture_filter}; "
+        f"expression: {EXPRESSION}"
     )
-    shapes = ", ".join(f"{h}x{w}" for h, w in document["shapes"])
-    print_line(f"tensor shapes that are made ready: {shapes}")
-    for line in dict.fromkeys(_drawn(row) for row in document["avatars"]):
-        print_line(line)
-    console.print(_phase_table(document["phases"]))
-    left = len(document["phases"]) - MOST_ROWS
+    for line in (
+        f"Scene {scene.name}: {scene.frames} frames of {width}x{height}, plan {scene.plan}, tensor size {scene.size}, "
+        f"error budget {scene.error_budget_px:g} px",
+        f"tensor shapes that are made ready: {shapes}",
+        *dict.fromkeys(f"avatar {avatar.bundle}: {drawn}" for avatar in scene.avatars),
+    ):
+        print_line(without_controls(line))
+    console.print(_phase_table(plan.phases))
+    left = len(plan.phases) - MOST_ROWS
     if left > 0:
         console.print(f"{left} more phases: --json has all of them")
-    for line in (*_left_out(document["phases"]), _image(document["image"])):
-        print_line(line)
-    print_line(READ_PLAN_SO)
-    firsts = {phase["why"]: phase["first_frame"] for phase in reversed(document["phases"])}
+    for line in (*_left_out(plan.phases), _image(plan.image), READ_PLAN_SO):
+        print_line(without_controls(line))
+    firsts = {phase.why: phase.frames[0].frame for phase in reversed(plan.phases)}
     for why, first in sorted(firsts.items(), key=lambda one: one[1]):
         print_line(f"frame {first} and others like it: {why}")
-    print_line(f"placement: {document['placement']['why']}")
-    for line in _totals(document["totals"], config):
-        print_line(line)
-
-
-def _drawn(row: dict[str, Any]) -> str:
-    """Return a line on how an avatar is drawn in all frames. `row`: an entry of `avatars` in the plan's document.
-
-    The line names the bundle. Therefore two avatars of one bundle with equal settings have the same line.
-    """
-    return (
-        f"avatar {row['bundle']}: skinned by the {row['skinned_on']} unit; detail: {row['detail']}; "
-        f"texture filter {row['texture_filter']}; expression: {row['expression']}"
+    print_line(without_controls(f"placement: {plan.placement['why']}"))
+    planned, fixed = plan.planned, plan.fixed
+    print_line(
+        f"beside a fixed tensor of 512x512: {planned.pixels / fixed.pixels:.1%} of the tensor's pixels, "
+        f"{planned.gmac:.1f} of {fixed.gmac:.1f} GMAC"
+    )
+    print_line(
+        f"work of all stages: {planned.work_ms:.0f} of {fixed.work_ms:.0f} ms, "
+        f"{1 - planned.work_ms / fixed.work_ms:.0%} saved "
+        f"(computed by the profile {without_controls(plan.profile)}; `trilane bench planner` measures)"
     )
 
 
-def _phase_table(phases: list[dict[str, Any]]) -> Table:
+def _phase_table(phases: Sequence[Phase]) -> Table:
     from rich.table import Table
 
     table = Table("frames", "tensor", "density", "avatar: modelled, bound / measured px", "saved: kpixel, GMAC, ms")
     for phase in phases[:MOST_ROWS]:
-        tensor, density = phase["tensor"], phase["density"]
+        tensor, density, saved = phase.frames[0].plan.shape, phase.density, phase.saved
         table.add_row(
-            f"{phase['first_frame']}-{phase['last_frame']}",
-            f"{tensor[0]}x{tensor[1]}" if tensor and phase["work"] == "full" else phase["work"],
+            f"{phase.frames[0].frame}-{phase.frames[-1].frame}",
+            f"{tensor[0]}x{tensor[1]}" if tensor and phase.work == "full" else phase.work,
             f"{density[0]:.2f}-{density[1]:.2f}" if density else "-",
-            _modelled(phase["avatars"]) or "-",
-            _saved(phase["saved"]),
+            _modelled(phase.avatars) or "-",
+            f"{saved['pixels'] / 1000:.0f}, {saved['gmac']:.1f}, {saved['work_ms']:.1f}",
         )
     return table
 
 
-def _saved(saved: dict[str, float]) -> str:
-    return f"{saved['pixels'] / 1000:.0f}, {saved['gmac']:.1f}, {saved['work_ms']:.1f}"
-
-
-def _left_out(phases: list[dict[str, Any]]) -> list[str]:
+def _left_out(phases: Sequence[Phase]) -> list[str]:
     """Return a line for each level of detail in use. The line names the parts of the body that the level leaves out."""
-    rows = [row for phase in phases for row in phase["avatars"]]
-    lines = {}
-    for row in rows:
-        out = ", ".join(row["left_out"]) or "nothing that this body has"
-        lines[row["modelled"], out] = f'"{row["modelled"]}" leaves out {out}'
-    return list(lines.values())
+    rows = [(row.modelled, ", ".join(row.left_out)) for phase in phases for row in phase.avatars]
+    return [f'"{level}" leaves out {out or "nothing that this body has"}' for level, out in dict.fromkeys(rows)]
 
 
-def _image(image: dict[str, Any]) -> str:
-    if image["work"] is None:
-        return f"image: {image['source']}"
-    loss = "an unknown loss" if image["psnr_loss_db"] is None else f"{image['psnr_loss_db']:.1f} dB lost"
-    return f"image: {image['work']:.0%} of the pixels that the network was trained for, {loss} ({image['source']})"
+def _image(image: ImageSize) -> str:
+    if image.work is None:
+        return f"image: {image.source}"
+    loss = "an unknown loss" if image.psnr_loss_db is None else f"{image.psnr_loss_db:.1f} dB lost"
+    return f"image: {image.work:.0%} of the pixels that the network was trained for, {loss} ({image.source})"
 
 
-def _modelled(rows: list[dict[str, Any]]) -> str:
+def _modelled(rows: Sequence[ModelledAvatar]) -> str:
     """Return a text with a line for each level of detail among the avatars of a phase.
 
     The line ends with the largest bound of the error, and the largest measured error, of these avatars, in pixels.
-    `rows`: avatars of the phase.
     """
     lines = []
     for modelled in dict.fromkeys(_model(row) for row in rows):
         own = [row for row in rows if _model(row) == modelled]
-        known = [row["measured_px"] for row in own if row["measured_px"] is not None]
+        known = [row.measured_px for row in own if row.measured_px is not None]
         measured = f"{max(known):.2f}" if known else "-"
-        names = ", ".join(row["name"] for row in own)
-        lines.append(f"{names}: {modelled}, {max(row['bound_px'] for row in own):.2f} / {measured}")
+        names = without_controls(", ".join(row.name for row in own))
+        lines.append(f"{names}: {modelled}, {max(row.bound_px for row in own):.2f} / {measured}")
     return "\n".join(lines)
 
 
-def _model(row: dict[str, Any]) -> str:
+def _model(row: ModelledAvatar) -> str:
     """Return an avatar's level of detail in words. For a coarser mesh, the level of the mesh comes first."""
-    mesh = row["mesh"]
+    mesh = row.mesh
     coarser = f"mesh level {mesh['level']} ({mesh['triangles']} of {mesh['of']} triangles), " if mesh["level"] else ""
-    return f"{coarser}{row['modelled']}"
-
-
-def _totals(totals: dict[str, Any], config: dict[str, Any]) -> list[str]:
-    """Return sentences that compare the work of the whole scene with the work of a fixed square tensor."""
-    share = 1 - totals["work_ms"] / totals["fixed_work_ms"]
-    return [
-        f"beside a fixed tensor of 512x512: {totals['pixels'] / totals['fixed_pixels']:.1%} of the tensor's pixels, "
-        f"{totals['gmac']:.1f} of {totals['fixed_gmac']:.1f} GMAC",
-        f"work of all stages: {totals['work_ms']:.0f} of {totals['fixed_work_ms']:.0f} ms, {share:.0%} saved "
-        f"(computed by the profile {config['profile']}; `trilane bench planner` measures)",
-    ]
+    return f"{coarser}{row.modelled}"

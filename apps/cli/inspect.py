@@ -6,7 +6,7 @@ the bars of distributions.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,6 +19,7 @@ from trilane.errors import BadInputError
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from trilane.apps.inspect.inspection import Inspection
     from trilane.pipeline.measurements.measurement import Measurement, Measurements
 
 app = Commands()
@@ -58,23 +59,19 @@ def inspect(file: FileArgument, out: SheetOption = None, json: JsonOption = Fals
     with spinner("reading"):
         found = inspect_file(file)
         sheet = _draw(found, out)
-    document = found.document(file, sheet)
     if json:
-        print_json(document)
+        print_json(found.document(file, sheet))
     else:
-        for line in lines(without_controls(document)):
-            print_line(line)
+        for line in lines(found, file, sheet):
+            print_line(without_controls(line))
     if out is not None and sheet is None:
-        say(f"no sheet: nothing to draw of {document['what']}")
+        say(f"no sheet: nothing to draw of {found.what}")
     if not found.usable:
         raise typer.Exit(UNUSABLE)
 
 
-def _draw(found: Any, out: Path | None) -> Path | None:
-    """Write the contact sheet to `out` and return `out`; None if `out` is None, or if the file has no sheet.
-
-    `found`: result of `inspect_file`.
-    """
+def _draw(found: Inspection, out: Path | None) -> Path | None:
+    """Write the contact sheet to `out` and return `out`; None if `out` is None, or if the file has no sheet."""
     from trilane.writing import write_atomically
 
     if out is None or found.draw is None:
@@ -85,52 +82,45 @@ def _draw(found: Any, out: Path | None) -> Path | None:
     return out
 
 
-def lines(document: Mapping[str, Any]) -> Iterator[str]:
+def lines(found: Inspection, file: Path, sheet: Path | None) -> Iterator[str]:
     """Yield the lines that `trilane inspect` prints without `--json`.
 
-    `document`: document of `trilane inspect --json`.
+    `file`: inspected file. `sheet`: contact sheet that was written; None if no sheet was written.
     """
-    yield f"{document['file']}: {document['what']}"
+    detected, length = found.detected, found.length
+    rate = f" at {length.rate_hz:.4g}/s" if length and length.rate_hz else ""
+    pairs = [name if name == theirs else f"{name} = {theirs}" for name, theirs in detected.joints.items()]
+    facts: dict[str, Any] = without_controls(found.facts)
+    yield f"{file}: {found.what}"
     rows = {
-        "not usable": document["problem"],
-        "format": _because(document["detected"]["format"], document["detected"]["reason"]),
-        **{key: document["detected"][key] for key in ("axes", "unit", "rate", "lens")},
-        "length": _length(document["length"]),
-        **_joints(document["joints"]),
-        **{key.replace("_", " "): "" if value is None else str(value) for key, value in document["facts"].items()},
+        "not usable": found.problem,
+        "format": _because(detected.format, detected.reason),
+        "axes": detected.axes,
+        "unit": detected.unit,
+        "rate": detected.rate,
+        "lens": detected.lens,
+        "length": f"{length.samples} samples{rate}, {length.seconds:.2f} s" if length else "",
+        "joints mapped": _listed(pairs),
+        "joints of the file without a partner": _listed(detected.unmapped),
+        "body joints that the file does not have": _listed(found.missing),
+        **{key.replace("_", " "): "" if value is None else str(value) for key, value in facts.items()},
     }
     for key, value in rows.items():
         if value:
             yield f"  {key}: {value}"
-    for said in document["notes"]:
+    for said in found.notes:
         yield f"  note: {said}"
-    if document["sheet"]:
-        yield f"  sheet: {document['sheet']}"
-    if document["advice"]:
-        yield f"  {'what to do' if document['problem'] else 'use'}: {document['advice']}"
+    if sheet:
+        yield f"  sheet: {sheet}"
+    if found.advice:
+        yield f"  {'what to do' if found.problem else 'use'}: {found.advice}"
 
 
 def _because(what: str, why: str) -> str:
     return f"{what}, detected by {why}" if what and why else what
 
 
-def _length(length: Mapping[str, Any]) -> str:
-    if length["samples"] is None:
-        return ""
-    rate = f" at {length['rate_hz']:.4g}/s" if length["rate_hz"] else ""
-    return f"{length['samples']} samples{rate}, {length['seconds']:.2f} s"
-
-
-def _joints(joints: Mapping[str, Any]) -> dict[str, str]:
-    pairs = [name if name == theirs else f"{name} = {theirs}" for name, theirs in joints["mapped"].items()]
-    return {
-        "joints mapped": _listed(pairs),
-        "joints of the file without a partner": _listed(joints["unmapped"]),
-        "body joints that the file does not have": _listed(joints["missing"]),
-    }
-
-
-def _listed(names: list[str]) -> str:
+def _listed(names: Sequence[str]) -> str:
     more = f" and {len(names) - MOST_JOINTS} more" if len(names) > MOST_JOINTS else ""
     return f"{len(names)}: {', '.join(names[:MOST_JOINTS])}{more}" if names else ""
 

@@ -13,14 +13,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 from operator import attrgetter
 from pathlib import Path
-from typing import Any, Final, get_type_hints
+from typing import Any, Final, NamedTuple, get_type_hints
 
-from trilane.apps.explain.reasons import MOST_SAMPLES, ShownFrame, SlowFrames, Usual, advice, notes, reasons
+from trilane.apps.explain.reasons import MOST_SAMPLES, BudgetRow, ShownFrame, SlowFrames, Usual, advice, notes, reasons
 from trilane.apps.run.report import Report, read_report
 from trilane.apps.run.verdict_facts import verdict_of
 from trilane.apps.watch.followed_run import CUT_OFF, FollowedRun, RunState
 from trilane.errors import BadInputError, MissingPartError
-from trilane.pipeline.critical_path import WHATS, Part, Taken
+from trilane.pipeline.critical_path import WHATS, Taken
 from trilane.pipeline.journal import NAME, Begun, Ended, Record, Said, Worked, config_of, journal_in, read_journal
 from trilane.pipeline.reckoning import Reckoning, places_of
 from trilane.pipeline.result import MOST_MESSAGES
@@ -53,16 +53,6 @@ ROWS_AT_ONCE: Final = 8192
 ENDINGS = (".csv", ".parquet")
 
 
-def _explained_jobs(begun: Begun, records: Iterable[Record]) -> Iterator[ExplainedJob]:
-    """Yield every job of a journal with the causes of its wait, in the order of the jobs' ends.
-
-    `begun`: first record of the journal. `records`: records after the first.
-    """
-    timeline = Timeline(begun.graph, begun.settings, waits=True)
-    for record in records:
-        yield from (fact for fact in timeline.add(record) if isinstance(fact, ExplainedJob))
-
-
 def open_journal(folder: Path) -> tuple[Begun, Iterator[Record]]:
     """Return (first record, iterator over the other records) of the journal in the run folder `folder`.
 
@@ -79,91 +69,140 @@ def open_journal(folder: Path) -> tuple[Begun, Iterator[Record]]:
     return begun, records
 
 
-class RunExplanation:
-    """Explains where the time of a run went.
+class CoreUse(NamedTuple):
+    """The use of a run's cores: their `numbers`, the CPU time of all jobs of a mean frame, and the time they had."""
 
-    `begun`: first record of the run's journal. `report`: report of the run; None while the run goes on.
-    `slowest`: number of slowest frames to describe. `name`: folder of the run, for the verdict.
+    numbers: list[int]
+    cpu_ms: float
+    had_ms: float
+
+
+class ExplainedRun:
+    """Where the time of the run in `folder` went.
+
+    `begun`, `records`: first record, and other records, of the run's journal. `report`: report of the run; None while
+    the run goes on. `slowest`: number of slowest frames to describe.
+
+    `remark`: sentence on a journal that ends before the run; empty for a whole journal.
+    `messages`: messages of the run. `frames`: number of presented frames.
+    `frame_ms`: mean frame time; None for fewer than two frames.
+    `left`: numbers of dropped and lost frames, by cause. `figures`: `bottleneck`, `bound` and efficiencies of a report.
+    `cores`: use of the cores; None if the mean frame time, the efficiency or a unit's cores are unknown.
+    `budget`: parts of the critical path, the largest first. `taken`: jobs without a core, by stage.
+    `unit_of`, `jobs`: unit and number of jobs of each stage.
+    `slowest`, `usual`: slowest frames, the slowest first, and medians over the run.
     """
 
-    def __init__(self, begun: Begun, report: Report | None, slowest: int, name: str = "") -> None:
-        self._begun, self._report, self._places, self._name = begun, report, places_of(begun), name
-        self._timeline = Timeline(begun.graph, begun.settings, waits=True)
-        self._reckoning = Reckoning(begun.graph, begun.settings, self._places, self._timeline)
-        self._slow = SlowFrames(begun.graph, self._reckoning.paths, self._reckoning.sharing, slowest)
-        self._waits: dict[str, dict[str, int]] = {stage.name: {} for stage in begun.graph.stages}
-        self._jobs = dict.fromkeys(self._waits, 0)
-        self._joins = Joins(begun.graph)
-        self._frames, self._first_ns, self._last_ns = 0, 0, 0
-        self._left: dict[str, Counter[str]] = {}
-        self._said: deque[str] = deque(maxlen=MOST_MESSAGES)
+    def __init__(
+        self, folder: Path, begun: Begun, records: Iterable[Record], report: Report | None, slowest: int = 10
+    ) -> None:
+        self.folder, self.begun, self.report, self._places = folder, begun, report, places_of(begun)
+        graph, settings, config = begun.graph, begun.settings, config_of(begun)
+        self.unit_of = {stage.name: stage.unit for stage in graph.stages}
+        self._waits_ns = {name: Counter[str]() for name in self.unit_of}
+        self.clock, self.jobs = str(begun.facts.get("clock", HOST_CLOCK)), Counter[str]()
+        self.left: dict[str, Counter[str]] = {}
+        timeline = Timeline(graph, settings, waits=True)
+        reckoning = Reckoning(graph, settings, self._places, timeline)
+        slow = SlowFrames(graph, reckoning.paths, reckoning.sharing, slowest)
+        joins, said = Joins(graph), deque[str](maxlen=MOST_MESSAGES)
+        self.frames, first_ns, last_ns, record = 0, 0, 0, None
+        for record in records:
+            if isinstance(record, Said):
+                said.append(record.text)
+            for fact in timeline.add(record):
+                if isinstance(fact, Gone):
+                    self.left.setdefault(fact.kind, Counter())[fact.cause] += 1
+                elif isinstance(fact, ExplainedJob):
+                    for each in (reckoning, slow, joins):
+                        each.add(fact)
+                    self.jobs[fact.job.stage] += 1
+                    self._waits_ns[fact.job.stage].update(fact.waits_ns)
+                    if fact.presented is not None:
+                        self.frames += 1
+                        first_ns, last_ns = first_ns or fact.job.end_ns, fact.job.end_ns
+        goes_on = not isinstance(record, Ended) and FollowedRun(folder).state is RunState.GOES_ON
+        self.remark = "" if isinstance(record, Ended) else GOES_ON if goes_on else CUT_OFF
+        self.messages = list(said if report is None else report.messages)
+        budget, taken, self.figures = reckoning.close()
+        self.slowest, self.usual = slow.close()
+        self.taken = {stage: each for stage, each in taken.items() if each.preempted_ns}
+        self.joins = joins.rows()
+        intervals, total_ns = max(self.frames - 1, 1), max(sum(budget.values()), 1)
+        self.frame_ms = (last_ns - first_ns) / intervals / NS_PER_MS if self.frames > 1 else None
+        self.budget = [
+            BudgetRow(stage, self.unit_of[stage], what, WHATS[what], ns / intervals / NS_PER_MS, ns / total_ns)
+            for (what, stage), ns in sorted(budget.items(), key=lambda row: -row[1])
+        ]
+        allowed = begun.facts.get("machine", {}).get("cpu", {}).get("cores_allowed", ())
+        self.advice = advice(self.budget, settings.policy, len(allowed) - len(graph.units), "pipeline" in config)
+        self.accuracy: Mapping[str, Mapping[str, Any]] = begun.facts.get("accuracy", {})
+        self.source = MEASURED if self.clock == HOST_CLOCK else COMPUTED
+        self.scene: str | None = config.get("scene", {}).get("name")
+        self.nobodys_ms = sum(row.ms for row in self.budget if row.what == PREEMPTED)
 
-    def add(self, record: Record) -> None:
-        """Take the next record of the journal; the first call takes the record after `begun`."""
-        if isinstance(record, Said):
-            self._said.append(record.text)
-        for fact in self._timeline.add(record):
-            if isinstance(fact, ExplainedJob):
-                self._count(fact)
-            elif isinstance(fact, Gone):
-                self._left.setdefault(fact.kind, Counter())[fact.cause] += 1
+    @property
+    def cores(self) -> CoreUse | None:
+        numbers = sorted({core for place in self._places.values() for core in place.cores})
+        efficiency = self.figures["machine_efficiency"]
+        is_placed = numbers and len(self._places) == len(self.begun.graph.units)
+        if self.frame_ms is None or efficiency is None or not is_placed:
+            return None
+        had_ms = len(numbers) * self.frame_ms
+        return CoreUse(numbers, efficiency * had_ms, had_ms)
 
-    def _count(self, explained: ExplainedJob) -> None:
-        job = explained.job
-        self._reckoning.add(explained)
-        self._slow.add(explained)
-        self._joins.add(explained)
-        self._jobs[job.stage] += 1
-        sums = self._waits[job.stage]
-        for cause, ns in explained.waits_ns.items():
-            sums[cause] = sums.get(cause, 0) + ns
-        if explained.presented is not None:
-            self._frames += 1
-            self._first_ns, self._last_ns = self._first_ns or job.end_ns, job.end_ns
+    def waits(self, stage: str) -> tuple[float, dict[str, float]]:
+        """Return the mean wait of a stage's jobs in ms, and its parts by cause, the longest first."""
+        waits_ns, per_job = self._waits_ns[stage], max(self.jobs[stage], 1) * NS_PER_MS
+        return sum(waits_ns.values()) / per_job, _causes_ms(waits_ns, per_job)
 
-    def document(self) -> dict[str, Any]:
-        """Return the document of `trilane explain RUN --json` without `run` and `remark`.
+    def shared(self, unit: str, other: str) -> list[int]:
+        """Return the cores that `unit` shares with the unit of the stage `other`."""
+        own = self._places[unit].cores if unit in self._places else ()
+        return sorted(set(own) & set(self._places[self.unit_of[other]].cores))
 
-        Call it once, after the last record.
-
-        docs/explain.md describes the keys.
-        """
-        budget, taken, figures = self._reckoning.close()
-        slowest, usual = self._slow.close()
-        unit_of = {stage.name: stage.unit for stage in self._begun.graph.stages}
-        intervals = max(self._frames - 1, 1)
-        clock = str(self._begun.facts.get("clock", HOST_CLOCK))
-        frame_ms = (self._last_ns - self._first_ns) / intervals / NS_PER_MS if self._frames > 1 else None
-        rows = _budget_rows(budget, unit_of, intervals)
-        shared = [self._shared(stage, row) for stage, row in taken.items() if row.preempted_ns]
+    def as_json(self) -> dict[str, Any]:
+        """Return the document of `trilane explain RUN --json`. docs/explain.md describes the keys."""
+        report, usual = self.report, self.usual
+        joins = [
+            {"stage": stage, "inputs": {name: each._asdict() for name, each in inputs.items()}}
+            for stage, inputs in self.joins.items()
+        ]
         return {
+            "run": str(self.folder),
+            "remark": self.remark,
             "schema": SCHEMA,
-            "clock": clock,
-            **self._of_run(),
-            "verdict": None if self._report is None else verdict_of(self._report, self._name).shown(),
-            "frames": self._frames,
-            "left": {kind: dict(causes) for kind, causes in self._left.items()},
-            "frame_ms": frame_ms,
-            **figures,
-            "cores": self._of_cores(frame_ms, figures["machine_efficiency"]),
-            "nobodys_ms": sum(row["ms"] for row in rows if row["what"] == PREEMPTED),
-            "budget": rows,
-            "shared_cores": shared,
-            "waits": [_wait_row(name, unit_of[name], self._jobs[name], self._waits[name]) for name in self._waits],
-            **({"joins": joins} if (joins := self._joins.rows()) else {}),
+            "clock": self.clock,
+            "scene": self.scene,
+            "policy": self.begun.settings.policy,
+            "edges": list(self.begun.graph.edges),
+            "accuracy": self.accuracy,
+            "interrupted": None if report is None else report.interrupted,
+            "failure": None if report is None else report.failure,
+            "messages": self.messages,
+            "verdict": None if report is None else verdict_of(report, str(self.folder)).shown(),
+            "frames": self.frames,
+            "left": {kind: dict(causes) for kind, causes in self.left.items()},
+            "frame_ms": self.frame_ms,
+            **self.figures,
+            "cores": self.cores and self.cores._asdict(),
+            "nobodys_ms": self.nobodys_ms,
+            "budget": [row._asdict() for row in self.budget],
+            "shared_cores": [self._shared_row(stage, each) for stage, each in self.taken.items()],
+            "waits": [
+                {"stage": stage, "unit": unit, "jobs": self.jobs[stage], "wait_ms": wait_ms, "causes_ms": causes_ms}
+                for stage, unit in self.unit_of.items()
+                for wait_ms, causes_ms in [self.waits(stage)]
+            ],
+            **({"joins": joins} if joins else {}),
             "usual": {
                 "frame_ms": usual.frame_ns / NS_PER_MS,
                 "service_ms": {name: ns / NS_PER_MS for name, ns in usual.service_ns.items()},
             },
-            "slowest": [_slow_row(shown, usual) for shown in slowest],
-            "advice": advice(
-                rows,
-                self._begun.settings.policy,
-                self._spare_cores(unit_of),
-                is_of_file="pipeline" in config_of(self._begun),
-            ),
+            "slowest": [_slow_row(shown, usual) for shown in self.slowest],
+            "advice": self.advice,
             "sources": {
-                "frames, waits_ms, service_ms, preempted_ms": MEASURED if clock == HOST_CLOCK else COMPUTED,
+                "frames, waits_ms, service_ms, preempted_ms": self.source,
                 "efficiency, core_efficiency, machine_efficiency, cores": "CPU time of the run's own jobs",
                 "budget, bound": "the same times along the path that ends with the last frame",
                 "taken_ms": "computed: whose jobs ran then on the same cores",
@@ -171,94 +210,69 @@ class RunExplanation:
             },
         }
 
-    def _of_run(self) -> dict[str, Any]:
-        """Return the part of the document that describes the run itself and how it ended.
-
-        The run's facts are `scene`, `policy`, `edges` and `accuracy`. Its end is described by `interrupted` and
-        `failure`, both None while the run goes on, and by `messages`.
-        """
-        facts, report = self._begun.facts, self._report
-        return {
-            "scene": config_of(self._begun).get("scene", {}).get("name"),
-            "policy": self._begun.settings.policy,
-            "edges": list(self._begun.graph.edges),
-            "accuracy": facts.get("accuracy", {}),
-            "interrupted": None if report is None else report.interrupted,
-            "failure": None if report is None else report.failure,
-            "messages": list(self._said if report is None else report.messages),
-        }
-
-    def _shared(self, stage: str, taken: Taken) -> dict[str, Any]:
+    def _shared_row(self, stage: str, taken: Taken) -> dict[str, Any]:
         per_job = taken.jobs * NS_PER_MS
-        unit_of = {each.name: each.unit for each in self._begun.graph.stages}
-        cores = self._places[taken.unit].cores if taken.unit in self._places else ()
         return {
             "stage": stage,
             "unit": taken.unit,
-            "cores": list(cores),
+            "cores": list(self._places[taken.unit].cores) if taken.unit in self._places else [],
             "service_ms": taken.service_ns / per_job,
             "preempted_ms": taken.preempted_ns / per_job,
             "taken_ms": {other: ns / per_job for other, ns in taken.of.items()},
-            "shared": {other: sorted(set(cores) & set(self._places[unit_of[other]].cores)) for other in taken.of},
+            "shared": {other: self.shared(taken.unit, other) for other in taken.of},
             "others_ms": taken.other_ns / per_job,
         }
 
-    def _of_cores(self, frame_ms: float | None, efficiency: float | None) -> dict[str, Any] | None:
-        """Return figures of the run's cores; None if the mean frame time, the efficiency or a unit's cores are unknown.
 
-        Keys:
-        `numbers`: numbers of the cores.
-        `had_ms`: mean frame time multiplied by the number of cores.
-        `cpu_ms`: CPU time of all jobs of a mean frame.
-
-        `frame_ms`: mean frame time. `efficiency`: machine efficiency.
-        """
-        cores = sorted({core for place in self._places.values() for core in place.cores})
-        if frame_ms is None or efficiency is None or not cores or len(self._places) < len(self._begun.graph.units):
-            return None
-        had_ms = len(cores) * frame_ms
-        return {"numbers": cores, "cpu_ms": efficiency * had_ms, "had_ms": had_ms}
-
-    def _spare_cores(self, unit_of: Mapping[str, str]) -> int:
-        """Return how many more cores than units the run had. A negative number means that units had to share cores.
-
-        `unit_of`: unit of each stage.
-        """
-        cpu = self._begun.facts.get("machine", {}).get("cpu", {})
-        return len(cpu.get("cores_allowed", ())) - len(set(unit_of.values()))
-
-
-def explain_run(folder: Path, slowest: int = 10) -> dict[str, Any]:
-    """Return the document of `trilane explain RUN --json` for the run in `folder`: where its time went.
+def explain_run(folder: Path, slowest: int = 10) -> ExplainedRun:
+    """Return where the time of the run in `folder` went.
 
     `slowest`: number of slowest frames to describe.
 
     Raises BadInputError if `folder` is no run folder, or if its journal or report cannot be read.
     """
     report = read_report(folder) if (folder / "report.json").exists() else None  # there is none while a run goes on
-    begun, records = open_journal(folder)
-    explanation, is_whole = RunExplanation(begun, report, slowest, str(folder)), False
-    for record in records:
-        explanation.add(record)
-        is_whole = isinstance(record, Ended)
-    goes_on = not is_whole and FollowedRun(folder).state is RunState.GOES_ON
-    remark = "" if is_whole else GOES_ON if goes_on else CUT_OFF
-    return {"run": str(folder), "remark": remark, **explanation.document()}
+    return ExplainedRun(folder, *open_journal(folder), report, slowest)
 
 
-def explain_frame(folder: Path, number: int) -> dict[str, Any]:
-    """Return what became of frame `number` of the run in `folder`, as plain data.
+class FrameJob(NamedTuple):
+    """A job of an explained frame. Its begin counts from the frame's release."""
 
-    Keys:
-    `schema`: version of the keys.
-    `run`: folder of the run.
-    `frame`: number of the frame.
+    stage: str
+    unit: str
+    begin_ms: float
+    took_ms: float
+    wait_ms: float
+    causes_ms: dict[str, float]
+
+
+class ExplainedFrame(NamedTuple):
+    """What became of a frame of a run.
+
+    `schema`: version of the keys in JSON. `run`: folder of the run. `frame`: number of the frame.
     `outcome`: `presented`, `dropped`, `lost` or `under way`.
     `cause`: key of the report that counts the dropped or lost frame; None for any other frame.
     `after_ms`: time from the frame's release until it was presented, dropped or lost; None for a frame under way.
     `latency_ms`: latency; None if not known.
-    `jobs`: a row for each job of the frame. Its `begin_ms` counts from the frame's release. For a frame under way, it
-    counts from when the frame's first job was ready.
+    `jobs`: jobs of the frame. For a frame under way, their begins count from when the first of them was ready.
+    """
+
+    schema: int
+    run: str
+    frame: int
+    outcome: str
+    cause: str | None
+    after_ms: float | None
+    latency_ms: float | None
+    jobs: list[FrameJob]
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the document of `trilane explain RUN --frame N --json`."""
+        return self._asdict() | {"jobs": [job._asdict() for job in self.jobs]}
+
+
+def explain_frame(folder: Path, number: int) -> ExplainedFrame:
+    """Return what became of frame `number` of the run in `folder`.
 
     Raises BadInputError for a folder without a journal, for a broken journal, and for a frame that is not in the
     journal.
@@ -285,58 +299,27 @@ def explain_frame(folder: Path, number: int) -> dict[str, Any]:
     left = presented or gone
     release_ns = left.release_ns if left is not None else min(one.job.ready_ns for one in jobs)
     end_ns = presented.end_ns if presented is not None else gone.at_ns if gone is not None else None
-    return {
-        "schema": SCHEMA,
-        "run": str(folder),
-        "frame": number,
-        "outcome": "presented" if presented is not None else gone.kind if gone is not None else "under way",
-        "cause": None if gone is None else gone.cause,
-        "after_ms": None if end_ns is None else (end_ns - release_ns) / NS_PER_MS,
-        "latency_ms": None if presented is None or presented.latency_ns is None else presented.latency_ns / NS_PER_MS,
-        "jobs": [_job_row(one, release_ns) for one in jobs],
-    }
+    return ExplainedFrame(
+        SCHEMA,
+        str(folder),
+        number,
+        "presented" if presented is not None else gone.kind if gone is not None else "under way",
+        None if gone is None else gone.cause,
+        None if end_ns is None else (end_ns - release_ns) / NS_PER_MS,
+        None if presented is None or presented.latency_ns is None else presented.latency_ns / NS_PER_MS,
+        [_frame_job(one, release_ns) for one in jobs],
+    )
 
 
-def _job_row(one: ExplainedJob, release_ns: int) -> dict[str, Any]:
+def _frame_job(one: ExplainedJob, release_ns: int) -> FrameJob:
     job = one.job
-    return {
-        "stage": job.stage,
-        "unit": job.unit,
-        "begin_ms": (job.begin_ns - release_ns) / NS_PER_MS,
-        "took_ms": (job.end_ns - job.begin_ns) / NS_PER_MS,
-        "wait_ms": (job.begin_ns - job.ready_ns) / NS_PER_MS,
-        "causes_ms": _causes_ms(one.waits_ns, NS_PER_MS),
-    }
+    times_ns = (job.begin_ns - release_ns, job.end_ns - job.begin_ns, job.begin_ns - job.ready_ns)
+    begin_ms, took_ms, wait_ms = (ns / NS_PER_MS for ns in times_ns)
+    return FrameJob(job.stage, job.unit, begin_ms, took_ms, wait_ms, _causes_ms(one.waits_ns, NS_PER_MS))
 
 
 def _causes_ms(waits_ns: Mapping[str, int], per: float) -> dict[str, float]:
     return {cause: ns / per for cause, ns in sorted(waits_ns.items(), key=lambda row: -row[1])}
-
-
-def _budget_rows(budget: Mapping[Part, int], unit_of: Mapping[str, str], intervals: int) -> list[dict[str, Any]]:
-    total_ns = max(sum(budget.values()), 1)
-    return [
-        {
-            "stage": stage,
-            "unit": unit_of[stage],
-            "what": what,
-            "why": WHATS[what],
-            "ms": ns / intervals / NS_PER_MS,
-            "share": ns / total_ns,
-        }
-        for (what, stage), ns in sorted(budget.items(), key=lambda row: -row[1])
-    ]
-
-
-def _wait_row(stage: str, unit: str, jobs: int, waits_ns: Mapping[str, int]) -> dict[str, Any]:
-    per_job = max(jobs, 1) * NS_PER_MS
-    return {
-        "stage": stage,
-        "unit": unit,
-        "jobs": jobs,
-        "wait_ms": sum(waits_ns.values()) / per_job,
-        "causes_ms": _causes_ms(waits_ns, per_job),
-    }
 
 
 def _slow_row(shown: ShownFrame, usual: Usual) -> dict[str, Any]:
@@ -368,8 +351,11 @@ def job_rows(folder: Path, figures: Sequence[str]) -> Iterator[tuple[Any, ...]]:
     `figures`: names of metrics of the stages. Raises BadInputError as `open_journal` does.
     """
     values = [value for _, value in COLUMNS.values()]
-    for one in _explained_jobs(*open_journal(folder)):
-        yield (*(value(one) for value in values), *(one.figures.get(name) for name in figures))
+    begun, records = open_journal(folder)
+    timeline = Timeline(begun.graph, begun.settings, waits=True)
+    for one in (fact for record in records for fact in timeline.add(record)):
+        if isinstance(one, ExplainedJob):
+            yield (*(value(one) for value in values), *(one.figures.get(name) for name in figures))
 
 
 def check_ending(target: Path) -> None:
@@ -381,10 +367,9 @@ def check_ending(target: Path) -> None:
 def write_jobs(folder: Path, target: Path) -> int:
     """Write every job of the run in `folder` to `target`, a .csv or .parquet file, and return the number of jobs.
 
-    Raises BadInputError for another ending, a folder that is no run folder, and a file that cannot be written. Raises
+    Raises BadInputError for a folder that is no run folder, and for a file that cannot be written. Raises
     MissingPartError for .parquet if PyArrow is not installed.
     """
-    check_ending(target)
     figures = figure_names(folder)
     write = _write_parquet if target.suffix.lower() == ".parquet" else _write_csv
     with write_atomically(target) as draft:
@@ -424,6 +409,17 @@ def _write_parquet(target: Path, figures: Sequence[str], rows: Iterator[tuple[An
 MOST_ENDS: Final = 1024  # frames whose ends are kept for each stage; far more than can be in flight
 
 
+class JoinInput(NamedTuple):
+    """An input of a stage with several inputs.
+
+    `last`: number of jobs in which this input came last. `after_ms`: in these jobs, the mean time by which it came
+    after the input before it.
+    """
+
+    last: int
+    after_ms: float
+
+
 class Joins:
     """For stages with several inputs: which input of a frame came last, and how long after the input before it.
 
@@ -452,38 +448,26 @@ class Joins:
             if len(kept) > MOST_ENDS:
                 del kept[next(iter(kept))]
 
-    def rows(self) -> list[dict[str, Any]]:
-        """Return a row for each stage with several inputs.
-
-        Keys:
-        `stage`: name of the stage.
-        `inputs`: two figures of each input, by the name of the stage that writes it.
-
-        The figures are:
-        `last`: number of jobs in which this input came last.
-        `after_ms`: in these jobs, the mean time by which it came after the input before it.
-        """
-        return [
-            {
-                "stage": stage,
-                "inputs": {
-                    name: {"last": last[name], "after_ms": self._after_ns[stage][name] / max(last[name], 1) / NS_PER_MS}
-                    for name in self._reads[stage]
-                },
+    def rows(self) -> dict[str, dict[str, JoinInput]]:
+        """Return the inputs of each stage with several inputs: by stage, then by the stage that writes the input."""
+        return {
+            stage: {
+                name: JoinInput(last[name], self._after_ns[stage][name] / max(last[name], 1) / NS_PER_MS)
+                for name in self._reads[stage]
             }
             for stage, last in self._last.items()
-        ]
+        }
 
 
-def join_text(row: dict[str, Any]) -> str:
-    """Return a sentence about `row`, one of `Joins.rows`. The input that came last in most jobs is named first."""
-    inputs = sorted(row["inputs"].items(), key=lambda each: -each[1]["last"])
-    jobs = sum(each["last"] for _, each in inputs)
+def join_text(stage: str, inputs: Mapping[str, JoinInput]) -> str:
+    """Return a sentence about a stage with several `inputs`. The input that came last in most jobs is named first."""
+    by_last = sorted(inputs.items(), key=lambda each: -each[1].last)
+    jobs = sum(each.last for each in inputs.values())
     found = [
-        f"for {name} in {each['last']} of {jobs} jobs, {each['after_ms']:.2f} ms after the others"
-        for name, each in inputs
-        if each["last"]
+        f"for {name} in {each.last} of {jobs} jobs, {each.after_ms:.2f} ms after the others"
+        for name, each in by_last
+        if each.last
     ]
-    never = [name for name, each in inputs if not each["last"]]
+    never = [name for name, each in by_last if not each.last]
     rest = f"; never for {', '.join(never)}" if never else ""
-    return f"{row['stage']} waited {'; '.join(found) or 'for nothing'}{rest}"
+    return f"{stage} waited {'; '.join(found) or 'for nothing'}{rest}"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping, Sequence
-from heapq import heappush, heappushpop
+from heapq import heappop, heappush
 from statistics import median
 from typing import Any, Final, Generic, NamedTuple, TypeVar
 
@@ -69,6 +69,20 @@ class Usual(NamedTuple):
     parts_ns: Mapping[Part, float]
     service_ns: Mapping[str, float]
     unit_of: Mapping[str, str]
+
+
+class BudgetRow(NamedTuple):
+    """A part of a run's critical path.
+
+    `what`: kind of the part. `why`: the kind in words. `ms`: time for a frame. `share`: share of the path.
+    """
+
+    stage: str
+    unit: str
+    what: str
+    why: str
+    ms: float
+    share: float
 
 
 class Reason(NamedTuple):
@@ -134,12 +148,9 @@ class SlowFrames:
         while self._waiting:
             self._look(self._waiting.popleft())
         slowest = [shown for _, _, shown in sorted(self._slowest, reverse=True)]
-        return slowest, self._usual()
-
-    def _usual(self) -> Usual:
         frames = self._frames.values
         kinds = {part for _, parts_ns in frames for part in parts_ns}
-        return Usual(
+        return slowest, Usual(
             _median([frame_ns for frame_ns, _ in frames]),
             {part: _median([parts_ns.get(part, 0) for _, parts_ns in frames]) for part in kinds},
             {stage: _median(sample.values) for stage, sample in self._services.items()},
@@ -160,18 +171,13 @@ class SlowFrames:
                 sums[part] = sums.get(part, 0) + ns
                 if ns > longest.get(part, (0, piece.job))[0]:
                     longest[part] = (ns, piece.job)
-        self._frames.add((end_ns - begin_ns, sums))
-        if len(self._slowest) == self._most and self._slowest[0][0] >= end_ns - begin_ns:
-            return
-        jobs = {part: job for part, (_, job) in longest.items()}
-        self._keep(ShownFrame(now, before, end_ns - begin_ns, sums, jobs))
-
-    def _keep(self, shown: ShownFrame) -> None:
-        entry = (shown.frame_ns, -shown.now.frame, shown)
-        if len(self._slowest) < self._most:
-            heappush(self._slowest, entry)
-        else:
-            heappushpop(self._slowest, entry)
+        frame_ns = end_ns - begin_ns
+        self._frames.add((frame_ns, sums))
+        if len(self._slowest) < self._most or self._slowest[0][0] < frame_ns:
+            jobs = {part: job for part, (_, job) in longest.items()}
+            heappush(self._slowest, (frame_ns, -now.frame, ShownFrame(now, before, frame_ns, sums, jobs)))
+            if len(self._slowest) > self._most:
+                heappop(self._slowest)
 
 
 def _median(values: Sequence[int]) -> float:
@@ -307,46 +313,44 @@ OF_CAUSES = {
 }
 
 
-def advice(
-    budget: Sequence[Mapping[str, Any]], policy: str, spare_cores: int, *, is_of_file: bool = False
-) -> list[str]:
+def advice(budget: Sequence[BudgetRow], policy: str, spare_cores: int, is_of_file: bool = False) -> list[str]:
     """Return sentences about what a user could try, each with its reason.
 
     The policy comes first, then time that other programs took, then the largest rows.
 
-    `budget`: rows of the document's `budget`, the largest first. `policy`: policy of the run.
+    `budget`: parts of the critical path, the largest first. `policy`: policy of the run.
     `spare_cores`: number of cores beyond one for each unit; negative if units share cores.
     `is_of_file`: whether a pipeline file was run. If not, the stages are the avatar's.
     """
     found = []
-    works = [row for row in budget if row["what"] == WORK]
+    works = [row for row in budget if row.what == WORK]
     if works_on_one_frame(policy) and len(works) > 1:
         found.append("one frame is worked on at a time: `--policy pipelined` lets the units work at once")
-    nobodys = [row for row in budget if row["what"] == PREEMPTED]
-    if sum(row["share"] for row in nobodys) >= LEAST_ADVISED_SHARE:
+    nobodys = [row for row in budget if row.what == PREEMPTED]
+    if sum(row.share for row in nobodys) >= LEAST_ADVISED_SHARE:
         found.append(
-            f"{sum(row['ms'] for row in nobodys):.1f} ms a frame, {', '.join(row['stage'] for row in nobodys)} "
+            f"{sum(row.ms for row in nobodys):.1f} ms a frame, {', '.join(row.stage for row in nobodys)} "
             f"({PREEMPTED}): no job of this run had the core: end other programs; threads that spin take it too"
         )
     found += [
-        f"{row['ms']:.1f} ms a frame, {row['stage']} ({row['what']}): {_try(row, spare_cores, is_of_file)}"
+        f"{row.ms:.1f} ms a frame, {row.stage} ({row.what}): {_try(row, spare_cores, is_of_file)}"
         for row in budget
-        if row["share"] >= LEAST_ADVISED_SHARE and row["what"] != PREEMPTED
+        if row.share >= LEAST_ADVISED_SHARE and row.what != PREEMPTED
     ]
     return found[:MOST_ADVICE]
 
 
-def _try(row: Mapping[str, Any], spare_cores: int, is_of_file: bool) -> str:
-    stage, unit = row["stage"], row["unit"]
-    if is_of_file and row["what"] in (WORK, TAKEN):
-        own_core = row["what"] == TAKEN and spare_cores >= 0
+def _try(row: BudgetRow, spare_cores: int, is_of_file: bool) -> str:
+    stage, unit = row.stage, row.unit
+    if is_of_file and row.what in (WORK, TAKEN):
+        own_core = row.what == TAKEN and spare_cores >= 0
         return (
             f"`cores` of {unit} in [units]: a core of its own" if own_core else f"less work in {stage}, or another unit"
         )
-    if row["what"] == TAKEN and spare_cores >= 0:
+    if row.what == TAKEN and spare_cores >= 0:
         return f"this machine has a core for every unit: `--cores` gives {unit} one of its own"
-    if row["what"] in (WORK, TAKEN):
+    if row.what in (WORK, TAKEN):
         more_cores = ", or more cores for it (`--cores dsp=...`)" if stage == "infer" and spare_cores > 0 else ""
         return SHORTER.get(stage, f"shorter work of {stage}, or a unit of its own for it") + more_cores
     known = OF_CAUSES | OF_FILES if is_of_file else OF_CAUSES
-    return known.get(row["what"], "nothing: it is before what is known").format(stage=stage, unit=unit)
+    return known.get(row.what, "nothing: it is before what is known").format(stage=stage, unit=unit)

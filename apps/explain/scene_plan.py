@@ -17,7 +17,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -70,19 +70,21 @@ class ScenePlan:
     """Plans the frames of a checked configuration, one after the other.
 
     `config`: checked configuration. `assets`: arrays of the run. `output`: (height, width) of the picture.
+    `bodies`: body of each avatar. `kept`: for each avatar, the vertices that each level of its mesh keeps.
     """
 
     def __init__(self, config: RunConfig, assets: Assets) -> None:
-        self.config, self._assets = config, assets
+        self.config = config
         self.output = (config.scene.output.height, config.scene.output.width)
         self._stage = PoseStage(config, assets)
         self._packet = _packet(config)
         self._stage.bind([], [self._packet])
         self._drawn = posed_vertices(self._packet.payload, config.posed_vertices)
-        bodies = [shaped_body(assets, number) for number in range(len(distinct(config)))]
-        self._bodies = [bodies[distinct(config).index(folder)] for folder in config.avatar_dirs]
-        kept = [_kept(assets, number) for number in range(len(bodies))]
-        self._kept = [kept[distinct(config).index(folder)] for folder in config.avatar_dirs]
+        folders = distinct(config)
+        bodies = [shaped_body(assets, number) for number in range(len(folders))]
+        kept = [_kept(assets, number) for number in range(len(folders))]
+        numbers = [folders.index(folder) for folder in config.avatar_dirs]
+        self.bodies, self.kept = [bodies[number] for number in numbers], [kept[number] for number in numbers]
         self._skinners = {id(body): CpuSkinner(body) for body in bodies}
         self._staged = staged_of(assets)
 
@@ -111,14 +113,14 @@ class ScenePlan:
         """
         if not self._drawn:
             return 0.0
-        kept = self._kept[avatar][int(self._packet.header["avatars"][avatar]["mesh"])]
+        kept = self.kept[avatar][int(self._packet.header["avatars"][avatar]["mesh"])]
         exact = self.places(frame, avatar)[kept]
         drawn = self._places(self._drawn[avatar][: len(exact)].astype(np.float64), frame)
         moved = np.linalg.norm(exact - drawn, axis=1)
         return float(np.nanmax(moved, initial=0.0)) if np.isfinite(moved).any() else 0.0
 
     def _exact(self, frame: int, avatar: int) -> F64:
-        body, mover = self._bodies[avatar], self._staged.movers[avatar]
+        body, mover = self.bodies[avatar], self._staged.movers[avatar]
         pose, translation = mover.sample(frame / self.config.scene.fps)
         posed = Skeleton(body.joints, body.body.parents).pose(pose, translation, mover.world)
         return self._skinners[id(body)].vertices(posed)
@@ -217,6 +219,7 @@ def _label(planned: PlannedFrame) -> str:
 #: Tensor shape of the reference application. Every plan is compared with it.
 FIXED: Shape = (512, 512)
 MOST_MEASURED = 24  # phases whose error is measured, at one frame each
+EXPRESSION = "part of the avatar's shape: it costs nothing per frame"
 BOUND = "proved bound, in pixels of the picture"
 WHY = {
     FrameWork.NONE: "nobody is on the screen: nothing is drawn, packed or inferred",
@@ -230,170 +233,207 @@ FIRST: Networks = (0,)
 ALWAYS = ("pose", "composite", "present")
 
 
-@dataclass(frozen=True)
-class PlanExplanation:
-    """An explained plan.
+class ModelledAvatar(NamedTuple):
+    """A visible avatar of a phase.
 
-    `document`: document of `trilane plan --json`. `plan`, `first_frames`: the plan and the first frame of each phase,
-    for `draw_plan`.
+    `avatar`, `name`: its number and name. `modelled`: its level of detail. `mesh`: level of its mesh, number of
+    triangles, and number `of` all triangles. `left_out`: parts of the body that are not modelled.
+    `bound_px`: largest bound of the error in the phase. `measured_px`: error in the first frame; None if not measured.
     """
 
-    document: dict[str, Any]
-    plan: ScenePlan
-    first_frames: Sequence[PlannedFrame]
+    avatar: int
+    name: str
+    modelled: str
+    mesh: dict[str, int]
+    left_out: list[str]
+    bound_px: float
+    measured_px: float | None
 
 
-def explain(checked: Checked, profile: str, performance_profile: str) -> PlanExplanation:
-    """Return the explained plan of the scene in `checked`.
+@dataclass(frozen=True)
+class Phase:
+    """A phase of a scene.
+
+    `cost`, `fixed`: cost of its first frame, by the plan and with a tensor of the shape `FIXED`. `why`: reason for the
+    size of the tensor, in words.
+    """
+
+    frames: Sequence[PlannedFrame]
+    avatars: Sequence[ModelledAvatar]
+    cost: FrameCost
+    fixed: FrameCost
+    why: str
+
+    @property
+    def work(self) -> str:
+        return self.frames[0].plan.work.name.lower()
+
+    @property
+    def density(self) -> list[float] | None:
+        """The least and the largest density; None for a tensor whose size is not planned, and for no tensor."""
+        first, found = self.frames[0].plan, [planned.plan.density or 0.0 for planned in self.frames]
+        return [min(found), max(found)] if first.shape and first.density is not None else None
+
+    @property
+    def saved(self) -> dict[str, float]:
+        """The pixels, gmac and work_ms that a frame saves."""
+        keys = ("pixels", "gmac", "work_ms")
+        return {key: getattr(self.fixed, key) - getattr(self.cost, key) for key in keys}
+
+    def as_json(self) -> dict[str, Any]:
+        tensor = self.frames[0].plan.shape
+        return {
+            "first_frame": self.frames[0].frame,
+            "last_frame": self.frames[-1].frame,
+            "frames": len(self.frames),
+            "work": self.work,
+            "tensor": list(tensor) if tensor else None,
+            "density": self.density,
+            "avatars": [each._asdict() for each in self.avatars],
+            "cost": self.cost._asdict(),
+            "saved": self.saved,
+            "why": self.why,
+        }
+
+
+class ImageSize(NamedTuple):
+    """The size of planned tensors. If the scene fixes the size, `work` and `psnr_loss_db` are None.
+
+    `work`: pixels of a tensor, as a share of its network's own pixels. `psnr_loss_db`: PSNR that this size costs; None
+    if not known. `source`: source of both.
+    """
+
+    work: float | None
+    psnr_loss_db: float | None
+    source: str
+
+
+class PlanExplanation:
+    """The explained plan of the scene in `checked`.
 
     `profile`: hardware profile for which the costs are computed. `performance_profile`: performance profile of its
     units.
 
+    `plan`: plan that decided the frames. `skinned_on`, `detail`: unit that skins, and how levels of detail are chosen.
+    `planned`, `fixed`: costs of all frames, by the plan and with tensors of the shape `FIXED`: sums, but of `frame_ms`
+    the mean.
+
     Raises BadInputError for an unknown profile, and for cores that were chosen for another chip than this machine.
     """
-    scene, plan = checked.config.scene, ScenePlan(checked.config, checked.assets)
-    networks, painters = networks_of(checked.assets), checked.config.networks_of
-    costs = CostModel(networks, profile, performance_profile, painters)
-    rows: list[list[float | None]] = []
-    frames: list[PlannedFrame] = []
-    for frame in range(scene.frames):
-        planned = plan.decide(frame)
-        if len(phases([*frames[-1:], planned])) > len(frames[-1:]):
-            measured = len(rows) < MOST_MEASURED
-            rows.append([plan.measured_px(frame, avatar) if measured else None for avatar in planned.plan.seen])
-        frames.append(planned)
-    groups, bodies = phases(frames), _Bodies(checked)
-    names = [str(spec.name) for spec in scene.avatars]
-    limited = [any(_is_limited(planned, checked.config, plan.output) for planned in group) for group in groups]
-    document = {
-        "scene": scene.name,
-        "config": {
-            "frames": scene.frames,
-            "fps": scene.fps,
-            "output": [scene.output.height, scene.output.width],
-            "plan": scene.plan,
-            "size": scene.size,
-            "error_budget_px": scene.error_budget_px,
-            "error_budget_db": scene.error_budget_db,
-            "profile": profile,
-            "performance_profile": performance_profile,
-        },
-        "shapes": [list(shape) for shape in checked.config.buckets],
-        "avatars": [_avatar(checked, number) for number in range(len(scene.avatars))],
-        "phases": [
-            _phase(group, errors, costs, names, bodies) | {"why": _why(group, checked.config, is_limited)}
-            for group, errors, is_limited in zip(groups, rows, limited, strict=True)
-        ],
-        "image": _image(checked, any(limited)),
-        "totals": _totals(frames, costs),
-        "placement": costs.placement(*_usual(frames, costs), checked.asked_cores),
-        "notes": list(checked.notes),
-        "sources": {
-            "bound_px": BOUND,
-            "measured_px": f"{MEASURED}, at a phase's first frame, at the vertices that are drawn",
-            "pixels, gmac": "counted",
-            "ms": COMPUTED,
-        },
-    }
-    return PlanExplanation(document, plan, [group[0] for group in groups])
+
+    def __init__(self, checked: Checked, profile: str, performance_profile: str) -> None:
+        config, scene = checked.config, checked.config.scene
+        self.checked, self.profile, self._performance_profile = checked, profile, performance_profile
+        self.plan = plan = ScenePlan(config, checked.assets)
+        costs = CostModel(networks_of(checked.assets), profile, performance_profile, config.networks_of)
+        errors: list[list[float | None]] = []
+        frames: list[PlannedFrame] = []
+        for frame in range(scene.frames):
+            planned = plan.decide(frame)
+            if len(phases([*frames[-1:], planned])) > len(frames[-1:]):
+                measured = len(errors) < MOST_MEASURED
+                errors.append([plan.measured_px(frame, avatar) if measured else None for avatar in planned.plan.seen])
+            frames.append(planned)
+        groups = phases(frames)
+        limited = [any(_is_limited(planned, config, plan.output) for planned in group) for group in groups]
+        parts = cache(lambda avatar, level: left_out(DETAILS[level], plan.bodies[avatar].body))
+
+        def modelled(number: int, group: Sequence[PlannedFrame], error: float | None) -> ModelledAvatar:
+            one, triangles = group[0].plan.seen[number], len(plan.bodies[number].body.faces)
+            return ModelledAvatar(
+                number,
+                str(scene.avatars[number].name),
+                DETAILS[one.level].name,
+                {"level": one.mesh, "triangles": one.triangles, "of": triangles},
+                parts(number, one.level),
+                max(planned.plan.seen[number].error_px for planned in group),
+                error,
+            )
+
+        self.phases = [
+            Phase(
+                group,
+                [modelled(number, group, px) for number, px in zip(group[0].plan.seen, measured_px, strict=True)],
+                _cost(group[0].plan, costs),
+                costs.of(FIXED, *costs.in_view(group[0].plan)),
+                _why(group, config, is_limited),
+            )
+            for group, measured_px, is_limited in zip(groups, errors, limited, strict=True)
+        ]
+        self.image = _image(checked, any(limited))
+        self.planned = _total([_cost(one.plan, costs) for one in frames])
+        self.fixed = _total([costs.of(FIXED, *costs.in_view(one.plan)) for one in frames])
+        self.placement = costs.placement(*_usual(frames, costs), checked.asked_cores)
+        self.skinned_on = "cpu" if config.posed_vertices else "gpu"
+        self.detail = "by its bound in pixels" if config.posed_vertices and config.budget_px else "everything"
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the document of `trilane plan --json`."""
+        config, scene = self.checked.config, self.checked.config.scene
+        totals = (("", self.planned), ("fixed_", self.fixed))
+        return {
+            "scene": scene.name,
+            "config": {
+                "frames": scene.frames,
+                "fps": scene.fps,
+                "output": list(self.plan.output),
+                "plan": scene.plan,
+                "size": scene.size,
+                "error_budget_px": scene.error_budget_px,
+                "error_budget_db": scene.error_budget_db,
+                "profile": self.profile,
+                "performance_profile": self._performance_profile,
+            },
+            "shapes": [list(shape) for shape in config.buckets],
+            "avatars": [
+                {
+                    "avatar": number,
+                    "name": avatar.name,
+                    "bundle": avatar.bundle,
+                    "skinned_on": self.skinned_on,
+                    "expression": EXPRESSION,
+                    "detail": self.detail,
+                    "mesh_levels": len(self.plan.kept[number]) - 1,  # without the whole mesh
+                    "texture_filter": scene.texture_filter,
+                }
+                for number, avatar in enumerate(scene.avatars)
+            ],
+            "phases": [phase.as_json() for phase in self.phases],
+            "image": self.image._asdict(),
+            "totals": {of + key: getattr(cost, key) for key in FrameCost._fields for of, cost in totals},
+            "placement": self.placement,
+            "notes": list(self.checked.notes),
+            "sources": {
+                "bound_px": BOUND,
+                "measured_px": f"{MEASURED}, at a phase's first frame, at the vertices that are drawn",
+                "pixels, gmac": "counted",
+                "ms": COMPUTED,
+            },
+        }
 
 
-class _Bodies:
-    """The bodies of the avatars, and the parts that each level of detail leaves out.
-
-    `left_out`: cached function from (number of the avatar, level of detail) to the names of the parts left out.
-    """
-
-    def __init__(self, checked: Checked) -> None:
-        folders = distinct(checked.config)
-        bodies = [shaped_body(checked.assets, number).body for number in range(len(folders))]
-        self._bodies = [bodies[folders.index(folder)] for folder in checked.config.avatar_dirs]
-        self.left_out = cache(self._left_out)
-
-    def triangles(self, avatar: int) -> int:
-        """Return the number of triangles of the whole mesh of avatar number `avatar`."""
-        return len(self._bodies[avatar].faces)
-
-    def _left_out(self, avatar: int, level: int) -> list[str]:
-        return left_out(DETAILS[level], self._bodies[avatar])
-
-
-def _image(checked: Checked, is_limited: bool) -> dict[str, Any]:
-    """Return the part of the document about the size of planned tensors.
-
-    Keys: `work`: pixels of a tensor, as a share of its network's own pixels. `psnr_loss_db`: PSNR that this size costs;
-    None if not known. `source`: source of both. If the scene fixes the size, both are None.
+def _image(checked: Checked, is_limited: bool) -> ImageSize:
+    """Return the size of planned tensors.
 
     `is_limited`: whether `most_side` limits the tensor of a frame, so that its loss was not measured.
     """
     if not checked.config.scene.plans_tensor:
-        return {"work": None, "psnr_loss_db": None, "source": "the scene fixes the tensor's size"}
+        return ImageSize(None, None, "the scene fixes the tensor's size")
     work = checked.config.works[0]
     if is_limited:
         source = f"most_side = {checked.config.scene.most_side} gives avatars fewer pixels than they need"
-        return {"work": work / ALL_WORK, "psnr_loss_db": None, "source": source}
+        return ImageSize(work / ALL_WORK, None, source)
     sources = "; ".join(dict.fromkeys(loss.source for loss in checked.losses))
-    return {"work": work / ALL_WORK, "psnr_loss_db": worst_loss(work, checked.losses), "source": sources}
-
-
-def _avatar(checked: Checked, number: int) -> dict[str, Any]:
-    config = checked.config
-    where = "cpu" if config.posed_vertices else "gpu"
-    return {
-        "avatar": number,
-        "name": config.scene.avatars[number].name,
-        "bundle": config.scene.avatars[number].bundle,
-        "skinned_on": where,
-        "expression": "part of the avatar's shape: it costs nothing per frame",
-        "detail": "by its bound in pixels" if where == "cpu" and config.budget_px else "everything",
-        "mesh_levels": len(mesh_levels_of(checked.assets, distinct(config).index(config.avatar_dirs[number]))),
-        "texture_filter": config.scene.texture_filter,
-    }
-
-
-def _phase(
-    group: Sequence[PlannedFrame],
-    errors: Sequence[float | None],
-    costs: CostModel,
-    names: Sequence[str],
-    bodies: _Bodies,
-) -> dict[str, Any]:
-    first = group[0].plan
-    cost = _cost(first, costs)
-    return {
-        "first_frame": group[0].frame,
-        "last_frame": group[-1].frame,
-        "frames": len(group),
-        "work": first.work.name.lower(),
-        "tensor": list(first.shape) if first.shape else None,
-        "density": [_least(group), _most(group)] if first.shape and first.density is not None else None,
-        "avatars": [
-            {
-                "avatar": number,
-                "name": names[number],
-                "modelled": DETAILS[one.level].name,
-                "mesh": {"level": one.mesh, "triangles": one.triangles, "of": bodies.triangles(number)},
-                "left_out": bodies.left_out(number, one.level),
-                "bound_px": max(planned.plan.seen[number].error_px for planned in group),
-                "measured_px": error,
-            }
-            for (number, one), error in zip(first.seen.items(), errors, strict=True)
-        ],
-        "cost": cost.as_json(),
-        "saved": _saved(cost, costs.of(FIXED, *costs.in_view(first))),
-    }
+    return ImageSize(work / ALL_WORK, worst_loss(work, checked.losses), sources)
 
 
 def _cost(plan: FramePlan, costs: CostModel) -> FrameCost:
     return costs.of(plan.shape, *costs.in_view(plan), plan.meshes) if plan.work is FrameWork.FULL else costs.of(None)
 
 
-def _least(group: Sequence[PlannedFrame]) -> float:
-    return min(planned.plan.density or 0.0 for planned in group)
-
-
-def _most(group: Sequence[PlannedFrame]) -> float:
-    return max(planned.plan.density or 0.0 for planned in group)
+def _total(costs: Sequence[FrameCost]) -> FrameCost:
+    pixels, gmac, work_ms, frame_ms = (sum(each) for each in zip(*costs, strict=True))
+    return FrameCost(pixels, gmac, work_ms, frame_ms / len(costs))
 
 
 def _tolerance(config: RunConfig) -> str:
@@ -429,17 +469,9 @@ def _why(group: Sequence[PlannedFrame], config: RunConfig, is_limited: bool) -> 
         return f"as many pixels as most_side = {config.scene.most_side} allows: the avatars need more"
     if tolerance := _tolerance(config):
         return f"the fewest pixels within {tolerance} of the best size, by the table `by_size` in the manifest"
-    if _most(group) >= MOST_DENSITY:
+    if max(planned.plan.density or 0.0 for planned in group) >= MOST_DENSITY:
         return f"{MOST_DENSITY:g} tensor pixels along a side of a pixel of the picture: more make no better picture"
     return "the pixels that the network was trained to paint, in the shape that fits best of those that are ready"
-
-
-def _saved(cost: FrameCost, fixed: FrameCost) -> dict[str, float]:
-    return {
-        "pixels": fixed.pixels - cost.pixels,
-        "gmac": fixed.gmac - cost.gmac,
-        "work_ms": fixed.work_ms - cost.work_ms,
-    }
 
 
 def _usual(frames: Sequence[PlannedFrame], costs: CostModel) -> tuple[Shape | None, int, Networks]:
@@ -452,28 +484,7 @@ def _usual(frames: Sequence[PlannedFrame], costs: CostModel) -> tuple[Shape | No
     return kinds.most_common(1)[0][0] if kinds else (None, 0, FIRST)
 
 
-def _totals(frames: Sequence[PlannedFrame], costs: CostModel) -> dict[str, Any]:
-    """Return the sums of the costs of all frames, and the mean frame times.
-
-    Keys with the prefix `fixed_` are for tensors of the shape `FIXED` with the same avatars, other keys for the plan.
-    The keys have the meaning of the fields of `FrameCost`; `frame_ms` is a mean.
-    """
-    planned = [_cost(one.plan, costs) for one in frames]
-    fixed = [costs.of(FIXED, *costs.in_view(one.plan)) for one in frames]
-    return {
-        "pixels": sum(cost.pixels for cost in planned),
-        "fixed_pixels": sum(cost.pixels for cost in fixed),
-        "gmac": sum(cost.gmac for cost in planned),
-        "fixed_gmac": sum(cost.gmac for cost in fixed),
-        "work_ms": sum(cost.work_ms for cost in planned),
-        "fixed_work_ms": sum(cost.work_ms for cost in fixed),
-        "frame_ms": sum(cost.frame_ms for cost in planned) / len(frames),
-        "fixed_frame_ms": sum(cost.frame_ms for cost in fixed) / len(frames),
-    }
-
-
-@dataclass(frozen=True)
-class FrameCost:
+class FrameCost(NamedTuple):
     """The cost of one frame.
 
     `pixels`: pixels of its tensors. `gmac`: multiply-accumulates of its networks, in 1e9.
@@ -484,9 +495,6 @@ class FrameCost:
     gmac: float
     work_ms: float
     frame_ms: float
-
-    def as_json(self) -> dict[str, Any]:
-        return {"pixels": self.pixels, "gmac": self.gmac, "work_ms": self.work_ms, "frame_ms": self.frame_ms}
 
 
 def least_frame_ms(chip: Profile, times: Mapping[tuple[str, UnitName], float]) -> float:

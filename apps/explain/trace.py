@@ -134,26 +134,6 @@ class RunTracks:
             self._sink.count(self._samples[name], sampled.now_ns, value)
 
 
-class TraceWriter:
-    """Writes the trace of a run as Perfetto's packets.
-
-    `file`: file for bytes; the caller closes it after `close`. `begun`: first record of the run's journal.
-    """
-
-    def __init__(self, file: IO[bytes], begun: Begun) -> None:
-        self._sink = PacketSink(file)
-        self._tracks = RunTracks(self._sink, begun)
-
-    def add(self, record: Record) -> None:
-        """Take the next record of the journal; the first call takes the record after `begun`."""
-        self._tracks.add(record)
-
-    def close(self) -> None:
-        """Write the rest of the trace. The file stays open."""
-        self._tracks.close()
-        self._sink.close()
-
-
 def write_trace(records: Iterable[Record], file: IO[bytes]) -> None:
     """Write the trace of a run to `file` as Perfetto's packets. `records`: all records of the run's journal."""
     write_tracks(PacketSink(file), {"trilane": records})

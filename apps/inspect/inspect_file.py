@@ -105,8 +105,8 @@ MOST_LOOKED_AT, MOST_NAMED = 50, 6
 UNKNOWN = Inspection(
     OTHER,
     "nothing that Trilane knows",
-    f"found neither content nor an ending by which it is known, expected {EXPECTED}",
     "motions: .bvh, .npz, .npy; cameras: tables of numbers, transforms.json; docs/motion-and-camera.md has all of them",
+    problem=f"found neither content nor an ending by which it is known, expected {EXPECTED}",
 )
 AS_BVH = "export the motion as BVH, such as in Blender: File > Import, then File > Export > Motion Capture (.bvh)"
 
@@ -167,7 +167,7 @@ def _kind_or_none(file: Path) -> str | None:
 def _foreign(signature: Signature) -> Inspection:
     problem = f"found {signature.name}, which Trilane does not read, expected {EXPECTED}"
     found = Detected(signature.name.split(" ", 1)[-1], "the head of the file")
-    return Inspection(OTHER, signature.name, problem, signature.remedy, found)
+    return Inspection(OTHER, signature.name, signature.remedy, found, problem=problem)
 
 
 def kind_of(path: Path) -> tuple[str, Signature | None]:

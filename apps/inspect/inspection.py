@@ -18,7 +18,7 @@ from typing import Any, Final
 import numpy as np
 from PIL import Image, ImageDraw
 
-from trilane.arrays import F64
+from trilane.arrays import F32, F64
 from trilane.body.joints import BODY_JOINTS, JOINT_NAMES, JOINT_PARENTS
 from trilane.errors import BadInputError
 from trilane.scene.recordings import NOTHING, Detected
@@ -69,35 +69,40 @@ class Length:
 class Inspection:
     """The description of one file.
 
-    `kind`: kind of the file in a word, such as `motion`. `what`: description of the file in words. `problem`: reason
-    why the file is not usable; empty for a usable file. `advice`: command that uses the file, or remedy.
-    `detected`: format and conventions that the reader detected. `length`: length of a recording; None for other files.
+    `kind`: kind of the file in a word, such as `motion`. `what`: description of the file in words.
+    `advice`: command that uses the file, or remedy. `detected`: format and conventions that the reader detected.
+    `length`: length of a recording; None for other files.
     `facts`: further facts, by name. `notes`: notes as a run prints them. `draw`: function that draws the contact sheet;
-    None for a file without a sheet.
+    None for a file without a sheet. `problem`: reason why the file is not usable; empty for a usable file.
     """
 
     kind: str
     what: str
-    problem: str = ""
     advice: str = ""
     detected: Detected = NOTHING
     length: Length | None = None
     facts: Mapping[str, Any] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     draw: Callable[[], Image.Image] | None = None
+    problem: str = ""
 
     @property
     def usable(self) -> bool:
         return not self.problem
+
+    @property
+    def missing(self) -> list[str]:
+        """The body joints that the file does not have; empty for a file without joints."""
+        mapped = self.detected.joints
+        return [name for name in BODY_JOINTS if name not in mapped] if mapped else []
 
     def document(self, file: Path, sheet: Path | None) -> dict[str, Any]:
         """Return the document that `trilane inspect --json` prints.
 
         `file`: inspected file. `sheet`: contact sheet that was written; None if no sheet was written.
         """
-        found = {key: value for key, value in asdict(self.detected).items() if key not in ("joints", "unmapped")}
-        mapped = dict(self.detected.joints)
-        missing = [name for name in BODY_JOINTS if name not in mapped] if mapped else []
+        detected = asdict(self.detected)
+        joints = {"mapped": detected.pop("joints"), "unmapped": list(detected.pop("unmapped")), "missing": self.missing}
         return {
             "file": str(file),
             "kind": self.kind,
@@ -105,9 +110,9 @@ class Inspection:
             "usable": self.usable,
             "problem": self.problem,
             "advice": self.advice,
-            "detected": found,
+            "detected": detected,
             "length": asdict(self.length) if self.length else {"samples": None, "seconds": None, "rate_hz": None},
-            "joints": {"mapped": mapped, "unmapped": list(self.detected.unmapped), "missing": missing},
+            "joints": joints,
             "facts": dict(self.facts),
             "notes": list(self.notes),
             "sheet": str(sheet) if sheet else None,
@@ -132,7 +137,7 @@ def refused(kind: str, what: str, error: BadInputError, file: Path) -> Inspectio
         if where.startswith(itself):
             where = where.removeprefix(itself).lstrip(", :/")
     place = f"{where}: " if where else ""
-    return Inspection(kind, what, f"{place}found {error.found}, expected {error.expected}", error.remedy)
+    return Inspection(kind, what, error.remedy, problem=f"{place}found {error.found}, expected {error.expected}")
 
 
 @dataclass(frozen=True)
@@ -210,12 +215,13 @@ def drawn_cameras(turns: F64, places: F64) -> Image.Image:
     return _sheet([tiles])
 
 
-def drawn_points(vertices: F64) -> Image.Image:
+def drawn_points(vertices: F32) -> Image.Image:
     """Return a sheet with three views of a body's points. `vertices` (V, 3): places of the points, in metres, Y up."""
-    tiles, extent = [], _extent(vertices)
-    radius = 0.5 if len(vertices) > SPARSE else 3
+    points = vertices.astype(np.float64)
+    tiles, extent = [], _extent(points)
+    radius = 0.5 if len(points) > SPARSE else 3
     for name, view in VIEWS.items():
-        flat = vertices @ view.T
+        flat = points @ view.T
         low, high = flat.min(axis=0), flat.max(axis=0)
         picture, tile = _blank(PATH_TILE, (low + high) / 2, _scale(PATH_TILE, extent))
         tile.dots(flat, MIDDLE, radius)

@@ -27,7 +27,6 @@ from trilane.apps.inspect.inspection import Inspection, Length, drawn_cameras, d
 from trilane.apps.run.report import read_report
 from trilane.apps.run.run_files import SHEET
 from trilane.apps.sweep.definition import read_sweep
-from trilane.arrays import F32
 from trilane.avatars.bundle import DEFAULT, MANIFEST, bundle_folder, load_bundle
 from trilane.avatars.network_file import read_network
 from trilane.body.body import ShapedBody, load_body
@@ -69,16 +68,11 @@ def inspect_body(path: Path) -> Inspection:
     return Inspection(
         "body",
         f"a body of {len(shaped.vertices)} vertices, {height:.2f} m tall",
-        "",
         f"trilane body inspect {path}",
         Detected("body in the SMPL-X layout", "an array `v_template`", "Y up, as the layout has it", "m"),
         facts=facts,
-        draw=partial(_drawn_body, shaped.vertices),
+        draw=partial(drawn_points, shaped.vertices),
     )
-
-
-def _drawn_body(vertices: F32) -> Image.Image:
-    return drawn_points(vertices.astype(np.float64))
 
 
 def inspect_avatar(path: Path) -> Inspection:
@@ -98,11 +92,10 @@ def inspect_avatar(path: Path) -> Inspection:
     return Inspection(
         "avatar",
         f"the avatar {manifest.name!r}",
-        "",
         used("--avatar", folder),
         Detected("avatar bundle", f"a file {MANIFEST}"),
         facts=facts,
-        draw=partial(_drawn_body, vertices),
+        draw=partial(drawn_points, vertices),
     )
 
 
@@ -111,7 +104,7 @@ def inspect_texture(path: Path) -> Inspection:
     shape = list(read_npz(path, ("texture",), "a neural texture")["texture"].shape)
     what = f"a neural texture of shape {tuple(shape)}, a part of an avatar"
     found = Detected("neural texture", "an array `texture`")
-    return Inspection("texture", what, "", f"trilane inspect {path.parent}", found, facts={"shape": shape})
+    return Inspection("texture", what, f"trilane inspect {path.parent}", found, facts={"shape": shape})
 
 
 def inspect_network(path: Path) -> Inspection:
@@ -130,7 +123,7 @@ def inspect_network(path: Path) -> Inspection:
         notes = (f"no avatar's network: found {error.found}, expected {error.expected}",)
     detected = Detected("ONNX network", "a protobuf message with nodes and operator sets")
     advice = f"trilane predict --network {path}"
-    return Inspection("network", what, "", advice, detected, facts=facts, notes=notes)
+    return Inspection("network", what, advice, detected, facts=facts, notes=notes)
 
 
 def inspect_scene(path: Path) -> Inspection:
@@ -147,7 +140,7 @@ def inspect_scene(path: Path) -> Inspection:
     what = f"the scene {values['name']!r} with {len(avatars)} avatar{'s' if len(avatars) != 1 else ''}"
     advice = "give the files that it names" if missing else used("", path)
     found = Detected("scene", "TOML with keys of the scene schema")
-    return Inspection("scene", what, notes[0] if missing else "", advice, found, facts=facts, notes=notes)
+    return Inspection("scene", what, advice, found, facts=facts, notes=notes, problem=notes[0] if missing else "")
 
 
 def inspect_profile(path: Path) -> Inspection:
@@ -157,7 +150,6 @@ def inspect_profile(path: Path) -> Inspection:
     return Inspection(
         "hardware profile",
         f"the hardware profile of {profile.title}",
-        "",
         f"trilane predict --profile {path}",
         found,
         facts={"name": profile.name},
@@ -175,11 +167,11 @@ def inspect_run(path: Path) -> Inspection:
     draw = partial(_copied, sheet) if sheet.is_file() else None
     if (folder / "report.json").is_file():
         found = inspect_report(folder)
-        return Inspection("run", f"a run folder with {found.what}", "", found.advice, detected, found.length,
+        return Inspection("run", f"a run folder with {found.what}", found.advice, detected, found.length,
                           found.facts, draw=draw)  # fmt: skip
     records = sum(1 for _ in read_journal(folder / JOURNAL))
     what = f"a run folder without a report: a journal of {records} records of a run that goes on or was killed"
-    return Inspection("run", what, "", f"trilane explain {folder}", detected, facts={"records": records}, draw=draw)
+    return Inspection("run", what, f"trilane explain {folder}", detected, facts={"records": records}, draw=draw)
 
 
 def _copied(sheet: Path) -> Image.Image:
@@ -200,7 +192,7 @@ def inspect_report(path: Path) -> Inspection:
     what = f"the report of {rate} on the {report.clock} clock"
     advice = f"trilane explain {path if path.is_dir() else path.parent}"
     length = Length(presented, float(seconds), report.fps)
-    return Inspection("report", what, "", advice, Detected("report of a run", "its key `clock`"), length, facts)
+    return Inspection("report", what, advice, Detected("report of a run", "its key `clock`"), length, facts)
 
 
 def inspect_sweep(path: Path) -> Inspection:
@@ -208,7 +200,7 @@ def inspect_sweep(path: Path) -> Inspection:
     entries = read_entries([path])
     what = f"a folder of {len(entries)} trials of a sweep"
     found = Detected("sweep", "a file trials.jsonl")
-    return Inspection("sweep", what, "", f"trilane report {path}", found, facts={"trials": len(entries)})
+    return Inspection("sweep", what, f"trilane report {path}", found, facts={"trials": len(entries)})
 
 
 def inspect_sweep_file(path: Path) -> Inspection:
@@ -217,14 +209,14 @@ def inspect_sweep_file(path: Path) -> Inspection:
     command = " ".join(sweep.command)
     facts = {"command": command, "axes": list(sweep.axes)}
     found = Detected("sweep file", "TOML with a `command`")
-    return Inspection("sweep file", f"a sweep of `trilane {command}`", "", f"trilane sweep {path}", found, facts=facts)
+    return Inspection("sweep file", f"a sweep of `trilane {command}`", f"trilane sweep {path}", found, facts=facts)
 
 
 def inspect_trace(path: Path) -> Inspection:
     """Describe a trace in Perfetto's or Chrome's format. Raises BadInputError if `path` is no trace."""
     events = _trace_events(path)
     found, advice = Detected("trace", "its events"), "open it at https://ui.perfetto.dev"
-    return Inspection("trace", f"a trace of {events} events", "", advice, found, facts={"events": events})
+    return Inspection("trace", f"a trace of {events} events", advice, found, facts={"events": events})
 
 
 def _trace_events(path: Path) -> int:
@@ -263,7 +255,6 @@ def inspect_motion(path: Path) -> Inspection:
     return Inspection(
         "motion",
         f"a motion: {motion.detected.format or 'a recording'}",
-        "",
         used("--motion", path),
         motion.detected,
         Length.of(motion.times_s),
@@ -289,7 +280,6 @@ def inspect_camera(path: Path) -> Inspection:
     return Inspection(
         "camera",
         f"a camera path: {camera.detected.format or 'a recording'}",
-        "",
         used("--camera", path),
         camera.detected,
         Length.of(camera.times_s),
@@ -345,7 +335,6 @@ def inspect_picture(path: Path) -> Inspection:
     return Inspection(
         "picture",
         f"a {encoding} picture of {facts['width']}x{facts['height']} pixels",
-        "",
         used("--background", path),
         Detected(f"{encoding} picture", "the head of the file", axes=_turned(facts["exif_orientation"])),
         facts=facts,
@@ -396,7 +385,6 @@ def inspect_folder(path: Path) -> Inspection:
     return Inspection(
         "pictures",
         f"a folder of {len(names)} pictures of {first if len(sizes) == 1 else f'{len(sizes)} sizes'}",
-        "",
         used("--background", path),
         Detected("folder of pictures", f"{len(names)} files end as pictures do", rate=_folder_rate(footage)),
         facts={
@@ -424,23 +412,22 @@ def inspect_video(path: Path) -> Inspection:
     try:
         with av.open(str(path), metadata_errors="replace") as container:
             stream = container.streams.video[0]
-            facts = _video_facts(stream)
+            pixels, codec = stream.format, stream.codec_context.name
+            rate = float(stream.average_rate) if stream.average_rate else None
+            bits = max((part.bits for part in pixels.components), default=8) if pixels else 8
+            width, height, turn = stream.width, stream.height, _rotation(stream)
             seconds, stated = _seconds(container, stream), stream.frames
     except (av.FFmpegError, ValueError, OSError) as error:
         raise BadInputError(path, f"no readable video ({error})", "a video that FFmpeg can decode") from error
-    rate, turn = facts["rate_hz"], facts["turned_deg"]
     frames = stated or _counted(path)
     turned = f", turned by {turn} degrees" if turn else ""
     return Inspection(
         "video",
-        f"a video ({facts['codec']}) of {facts['width']}x{facts['height']} pixels{turned}",
-        "",
+        f"a video ({codec}) of {width}x{height} pixels{turned}",
         used("--background", path),
-        Detected(
-            f"{facts['codec']} video", "streams that FFmpeg finds", rate="; ".join((*footage.rate, *footage.what[1:]))
-        ),
+        Detected(f"{codec} video", "streams that FFmpeg finds", rate="; ".join((*footage.rate, *footage.what[1:]))),
         Length(frames, seconds, rate if stated or not seconds else frames / seconds),
-        facts,
+        {"codec": codec, "width": width, "height": height, "rate_hz": rate, "bits": bits, "turned_deg": turn},
         draw=partial(_film, path, seconds),
     )
 
@@ -450,18 +437,6 @@ def _counted(path: Path) -> int:
     with av.open(str(path), metadata_errors="replace") as container:
         packets = container.demux(container.streams.video[0])
         return sum(packet.size > 0 for packet in itertools.islice(packets, MOST_PACKETS))
-
-
-def _video_facts(stream: Any) -> dict[str, Any]:
-    pixels = stream.format
-    return {
-        "codec": stream.codec_context.name,
-        "width": stream.width,
-        "height": stream.height,
-        "rate_hz": float(stream.average_rate) if stream.average_rate else None,
-        "bits": max((part.bits for part in pixels.components), default=8) if pixels else 8,
-        "turned_deg": _rotation(stream),
-    }
 
 
 def _rotation(stream: Any) -> int:

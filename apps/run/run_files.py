@@ -21,7 +21,8 @@ import av
 from PIL import Image, ImageDraw
 
 from trilane.apps.explain.trace import NAME as TRACE_NAME
-from trilane.apps.explain.trace import TraceWriter
+from trilane.apps.explain.trace import RunTracks
+from trilane.apps.explain.trace_sinks import PacketSink
 from trilane.errors import UnwrittenError
 from trilane.pipeline.journal import NAME, Begun, Stepped, read_journal
 from trilane.scheduler.recording import header_line, step_line
@@ -80,18 +81,20 @@ def _write_from_journal(journal: Path, folder: Path) -> None:
 
     Raises BadInputError if the file is no journal.
     """
-    trace: TraceWriter | None = None
+    tracks: RunTracks | None = None
     with (folder / EVENTS).open("w", encoding="utf-8") as events, (folder / TRACE_NAME).open("wb") as file:
+        sink = PacketSink(file)
         for record in read_journal(journal):
             if isinstance(record, Begun):
-                trace = TraceWriter(file, record)
+                tracks = RunTracks(sink, record)
                 events.write(header_line(record.graph, record.settings))
-            elif trace is not None:
-                trace.add(record)
+            elif tracks is not None:
+                tracks.add(record)
                 if isinstance(record, Stepped):
                     events.write(step_line(*record))
-        if trace is not None:
-            trace.close()
+        if tracks is not None:
+            tracks.close()
+            sink.close()
 
 
 @dataclass(frozen=True)

@@ -161,7 +161,9 @@ def test_other_programs_move_frame_time_bound_preempted_share_and_efficiency(pro
     assert found.figures["efficiency"] == pytest.approx(1 - lost, rel=NEAR)
     assert found.figures["machine_efficiency"] == pytest.approx(ALONE_US / 3 / (INFER_US * (programs + 1)), rel=NEAR)
     folder = tmp_path / "run"
-    document = explain_run(write_run(folder, run, cores={unit: place.cores for unit, place in PLACES.items()}))
+    document = explain_run(
+        write_run(folder, run, cores={unit: place.cores for unit, place in PLACES.items()})
+    ).as_json()
     assert 1e3 * document["nobodys_ms"] == pytest.approx(INFER_US * programs, abs=INFER_US * (programs + 1) * NEAR)
 
 

@@ -144,7 +144,7 @@ def test_a_run_of_a_file_leaves_a_folder_that_everything_reads(cli: Cli, folder:
     loaded = trilane.load_run(folder / "first")
     assert loaded.frames()["frame"].tolist() == list(range(60))
     assert len(loaded.jobs) == sum(row["jobs"] for row in report["stages"].values())
-    explained = explain_run(folder / "first", 3)
+    explained = explain_run(folder / "first", 3).as_json()
     assert sum(row["ms"] for row in explained["budget"]) == pytest.approx(report["frame_time_ms"]["mean"], rel=1e-3)
     again = cli("run", "street.toml", "--out", "second", "--frames", "60")
     assert again.returncode == 0, again.stderr

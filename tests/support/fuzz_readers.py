@@ -102,10 +102,9 @@ def _network(path: Path) -> None:
 
 def _inspect(path: Path) -> Inspection:
     found = inspect_file(path)
-    document = found.document(path, None)
-    json.dumps(document, allow_nan=False)
-    for line in lines(without_controls(document)):
-        line.encode("utf-8", errors="surrogateescape")
+    json.dumps(found.document(path, None), allow_nan=False)
+    for line in lines(found, path, None):
+        without_controls(line).encode("utf-8", errors="surrogateescape")
     return found
 
 

@@ -16,15 +16,16 @@ import pytest
 from support.run_folders import write_run
 from trilane.apps.explain.explained_run import (
     COLUMNS,
+    ExplainedRun,
+    JoinInput,
     Joins,
-    RunExplanation,
     explain_frame,
     explain_run,
     join_text,
     open_journal,
     write_jobs,
 )
-from trilane.apps.explain.reasons import MOST_SAMPLES, EvenSample, ShownFrame, advice, notes
+from trilane.apps.explain.reasons import MOST_SAMPLES, BudgetRow, EvenSample, ShownFrame, advice, notes
 from trilane.apps.watch.followed_run import CUT_OFF
 from trilane.errors import BadInputError, MissingPartError
 from trilane.hw_profiles.application import application_graph
@@ -60,7 +61,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_the_slowest_frames_and_why(folder: Path) -> None:
-    found = explain_run(folder, 2)
+    found = explain_run(folder, 2).as_json()
     first, second = found["slowest"]
     assert found["usual"]["frame_ms"] == 4.0
     assert first["frame_ms"] > 50
@@ -81,30 +82,30 @@ def test_the_slowest_frames_and_why(folder: Path) -> None:
 
 def test_one_frame_by_its_jobs_or_by_why_it_left(folder: Path) -> None:
     found = explain_frame(folder, 20)
-    assert (found["outcome"], found["cause"]) == ("presented", None)
-    took = {row["stage"]: row["took_ms"] for row in found["jobs"]}
+    assert (found.outcome, found.cause) == ("presented", None)
+    took = {row.stage: row.took_ms for row in found.jobs}
     assert took == {**STAGE_MS, "composite": 20.0}
-    last = found["jobs"][-1]
-    assert found["after_ms"] == pytest.approx(last["begin_ms"] + last["took_ms"])
-    assert all(row["wait_ms"] == pytest.approx(sum(row["causes_ms"].values())) for row in found["jobs"])
-    outcomes = [explain_frame(folder, number)["outcome"] for number in range(40)]
+    last = found.jobs[-1]
+    assert found.after_ms == pytest.approx(last.begin_ms + last.took_ms)
+    assert all(row.wait_ms == pytest.approx(sum(row.causes_ms.values())) for row in found.jobs)
+    outcomes = [explain_frame(folder, number).outcome for number in range(40)]
     assert (outcomes.count("presented"), outcomes.count("lost")) == (39, 1)
-    assert explain_frame(folder, outcomes.index("lost"))["cause"] == "died:gpu"
+    assert explain_frame(folder, outcomes.index("lost")).cause == "died:gpu"
     with pytest.raises(BadInputError, match="40, expected a frame that began, of 0 to 39"):
         explain_frame(folder, 40)
 
 
 def test_a_frame_that_a_newer_one_replaced(tmp_path: Path) -> None:
     run = simulated({}, Settings(40, policy="latest", period_ns=2 * MS, in_flight=2))
-    found = explain_run(write_run(tmp_path / "run", run, run.jobs, cores=CORES))
+    found = explain_run(write_run(tmp_path / "run", run, run.jobs, cores=CORES)).as_json()
     each = [explain_frame(tmp_path / "run", number) for number in range(40)]
-    counts = {cause: sum(one["cause"] == cause for one in each) for cause in found["left"]["dropped"]}
+    counts = {cause: sum(one.cause == cause for one in each) for cause in found["left"]["dropped"]}
     assert counts == found["left"]["dropped"]
-    assert sum(one["outcome"] == "presented" for one in each) == found["frames"] == run.report["frames"]["presented"]
+    assert sum(one.outcome == "presented" for one in each) == found["frames"] == run.report["frames"]["presented"]
 
 
 def test_the_budget_sums_to_the_frame_time_and_names_shared_cores(folder: Path) -> None:
-    found = explain_run(folder)
+    found = explain_run(folder).as_json()
     assert sum(row["ms"] for row in found["budget"]) == pytest.approx(found["frame_ms"])
     assert sum(row["share"] for row in found["budget"]) == pytest.approx(1)
     assert found["frames"] == 39  # one was lost with the unit
@@ -124,7 +125,7 @@ def test_a_frame_that_skips_or_has_another_rung_says_so(tmp_path: Path) -> None:
         return 0 < frame < 10 and not fresh
 
     run = simulate(graph, settings, lambda stage, *_: STAGE_MS[stage] * MS, skips=skips, keep=True)
-    found = explain_run(write_run(tmp_path / "run", run), 40)
+    found = explain_run(write_run(tmp_path / "run", run), 40).as_json()
     rows = {row["frame"]: row for row in found["slowest"]}
     assert rows[10]["notes"] == ["the frame before took the bypass, it did not"]
     assert rows[1]["notes"] == ["it took the bypass"]
@@ -148,14 +149,14 @@ def test_what_was_unlike_the_frame_before_is_noted() -> None:
 def test_dropped_frames_and_late_input_are_named(tmp_path: Path) -> None:
     """A frame every 10 ms; infer of frame 5 takes 200 ms, so that frames are dropped behind it."""
     settings = Settings(40, "latest", period_ns=10 * MS, deadline_ns=30 * MS)
-    found = explain_run(write_run(tmp_path / "run", simulated({("infer", 5): 200}, settings)), 40)
+    found = explain_run(write_run(tmp_path / "run", simulated({("infer", 5): 200}, settings)), 40).as_json()
     assert any("before it were dropped or lost" in note for row in found["slowest"] for note in row["notes"])
     assert found["left"].keys() == {"dropped"}
     assert sum(found["left"]["dropped"].values()) == 40 - found["frames"] > 10
     assert {cause.rpartition(":")[2] for cause in found["left"]["dropped"]} == {"stale"}
     assert found["slowest"][0]["why"][0]["text"] == "infer was slow: 200.0 ms, median 4.0"
     assert any(row["what"] == "release" for row in found["budget"])
-    usual = explain_run(write_run(tmp_path / "usual", simulated({}, replace(settings, period_ns=40 * MS))))
+    usual = explain_run(write_run(tmp_path / "usual", simulated({}, replace(settings, period_ns=40 * MS)))).as_json()
     assert usual["budget"][0]["what"] == "release"
     assert usual["advice"][0].endswith("there is time to spare")
 
@@ -169,7 +170,7 @@ def test_a_frame_that_lacked_its_core_says_who_had_it(tmp_path: Path) -> None:
     run = simulate(application_graph(), Settings(20), service, keep=True)
     slow = next(job for job in run.jobs if (job.stage, job.frame) == ("infer", 10))
     jobs = [job._replace(preempted_ns=90 * MS) if job == slow else job for job in run.jobs]
-    (row,) = explain_run(write_run(tmp_path / "run", run, jobs, cores=CORES), 1)["slowest"]
+    (row,) = explain_run(write_run(tmp_path / "run", run, jobs, cores=CORES), 1).as_json()["slowest"]
     beside = [job for job in jobs if job.unit == "cpu" and job.begin_ns < slow.end_ns and job.end_ns > slow.begin_ns]
     beside_ms = sum(min(job.end_ns, slow.end_ns) - max(job.begin_ns, slow.begin_ns) for job in beside) / MS
     assert beside_ms >= 2
@@ -187,7 +188,7 @@ def test_what_is_printed(folder: Path, command: Command, check_printed: Callable
 
 def test_json_is_the_document(folder: Path, command: Command) -> None:
     out, _ = command("explain", folder, "--slowest", 3, "--json")
-    assert json.loads(out) == json.loads(json.dumps(explain_run(folder, 3)))
+    assert json.loads(out) == json.loads(json.dumps(explain_run(folder, 3).as_json()))
 
 
 def test_jobs_as_csv_are_those_of_the_run(folder: Path, command: Command) -> None:
@@ -249,7 +250,7 @@ def test_a_run_that_goes_on_is_explained_so_far(folder: Path, tmp_path: Path, co
     (folder / "report.json").unlink()
     journal = folder / NAME
     journal.write_bytes(journal.read_bytes()[: journal.stat().st_size // 2])
-    found = explain_run(folder.rename(tmp_path / "run.77.partial"))
+    found = explain_run(folder.rename(tmp_path / "run.77.partial")).as_json()
     assert (found["scene"], found["interrupted"]) == ("test", None)
     assert 10 < found["frames"] < 39
     out, _ = command("explain", tmp_path / "run", "--json")
@@ -258,11 +259,9 @@ def test_a_run_that_goes_on_is_explained_so_far(folder: Path, tmp_path: Path, co
 
 def test_messages_are_those_of_the_report_or_of_the_journal_so_far(folder: Path) -> None:
     begun, records = open_journal(folder)
-    explanation = RunExplanation(begun, None, 1)
-    for record in (*records, Said(1, "the chip is hot"), Said(2, "it is cool")):
-        explanation.add(record)
-    assert explanation.document()["messages"] == ["the chip is hot", "it is cool"]
-    assert explain_run(folder)["messages"] == json.loads((folder / "report.json").read_text())["messages"] == []
+    more = (*records, Said(1, "the chip is hot"), Said(2, "it is cool"))
+    assert ExplainedRun(folder, begun, more, None).messages == ["the chip is hot", "it is cool"]
+    assert explain_run(folder).messages == json.loads((folder / "report.json").read_text())["messages"] == []
 
 
 def test_a_run_is_found_by_its_name_below_runs(
@@ -319,7 +318,7 @@ def test_a_folder_without_a_journal_is_refused(folder: Path, tmp_path: Path, com
 def test_a_journal_that_was_cut_off_says_so_first(tmp_path: Path, command: Command) -> None:
     """Where its process lives the run goes on; else nobody knows what came after."""
     whole = write_run(tmp_path / "whole", simulated({}))
-    assert explain_run(whole)["remark"] == ""
+    assert explain_run(whole).remark == ""
     assert f"Run {whole}: " in command("explain", whole)[0]
     data = (whole / NAME).read_bytes()
     for name, said in (
@@ -330,14 +329,14 @@ def test_a_journal_that_was_cut_off_says_so_first(tmp_path: Path, command: Comma
         folder = tmp_path / name
         folder.mkdir()
         (folder / NAME).write_bytes(data[: len(data) * 3 // 4])
-        assert explain_run(folder)["remark"] == said
+        assert explain_run(folder).remark == said
         first, second, *_ = command("explain", folder)[0].splitlines()
         assert first == said and second.startswith(f"Run {folder}: ")
 
 
 def test_a_run_of_one_frame_has_no_frame_time(tmp_path: Path, command: Command) -> None:
     folder = write_run(tmp_path / "run", simulated({}, Settings(1)))
-    found = explain_run(folder)
+    found = explain_run(folder).as_json()
     assert (found["frames"], found["frame_ms"], found["budget"], found["slowest"]) == (1, None, [], [])
     assert "fewer than two frames" in command("explain", folder)[0]
 
@@ -351,10 +350,10 @@ def test_a_sample_is_evenly_spaced() -> None:
 
 def test_advice_is_about_what_bounds_a_tenth_at_least() -> None:
     rows = [
-        {"stage": "pose", "unit": "cpu", "what": "preempted", "share": 0.5, "ms": 5.0},
-        {"stage": "own", "unit": "gpu", "what": "work", "share": 0.3, "ms": 3.0},
-        {"stage": "infer", "unit": "dsp", "what": "throttled", "share": 0.11, "ms": 1.1},
-        {"stage": "present", "unit": "cpu", "what": "work", "share": 0.09, "ms": 0.9},
+        BudgetRow("pose", "cpu", "preempted", "", 5.0, 0.5),
+        BudgetRow("own", "gpu", "work", "", 3.0, 0.3),
+        BudgetRow("infer", "dsp", "throttled", "", 1.1, 0.11),
+        BudgetRow("present", "cpu", "work", "", 0.9, 0.09),
     ]
     assert advice(rows, "pipelined", -1) == [
         "5.0 ms a frame, pose (preempted): no job of this run had the core: end other programs; threads that spin take "
@@ -377,7 +376,7 @@ def test_advice_is_about_what_bounds_a_tenth_at_least() -> None:
 )
 def test_advice_is_what_this_machine_can_follow(what: str, spare: int, found: str) -> None:
     """With fewer cores than units none has one of its own; only what is left over can go to the network."""
-    row = {"stage": "infer", "unit": "dsp", "what": what, "share": 0.5, "ms": 5.0}
+    row = BudgetRow("infer", "dsp", what, "", 5.0, 0.5)
     assert advice([row], "pipelined", spare) == [f"5.0 ms a frame, infer ({what}): {found}"]
 
 
@@ -392,15 +391,15 @@ def test_advice_is_what_this_machine_can_follow(what: str, spare: int, found: st
 )
 def test_advice_for_a_stage_of_a_pipeline_file_is_not_the_avatars(what: str, spare: int, found: str) -> None:
     """A run of a file refuses --picture, --cores and --latch, and its stages may have any name."""
-    row = {"stage": "composite", "unit": "gpu", "what": what, "share": 0.5, "ms": 5.0}
+    row = BudgetRow("composite", "gpu", what, "", 5.0, 0.5)
     assert advice([row], "pipelined", spare, is_of_file=True) == [f"5.0 ms a frame, composite ({what}): {found}"]
 
 
 def test_what_other_programs_took_is_said_first() -> None:
     rows = [
-        {"stage": "infer", "unit": "dsp", "what": "work", "share": 0.6, "ms": 6.0},
-        {"stage": "pose", "unit": "cpu", "what": "preempted", "share": 0.06, "ms": 0.6},
-        {"stage": "raster", "unit": "gpu", "what": "preempted", "share": 0.05, "ms": 0.5},
+        BudgetRow("infer", "dsp", "work", "", 6.0, 0.6),
+        BudgetRow("pose", "cpu", "preempted", "", 0.6, 0.06),
+        BudgetRow("raster", "gpu", "preempted", "", 0.5, 0.05),
     ]
     assert [line.split(":")[0] for line in advice(rows, "pipelined", 0)] == [
         "1.1 ms a frame, pose, raster (preempted)",
@@ -445,12 +444,8 @@ def test_a_join_waited_for_what_came_last_of_each_frame() -> None:
     joins = Joins(GRAPH)
     for job in jobs:
         joins.add(job)
-    (row,) = joins.rows()
-    assert row == {
-        "stage": "composite",
-        "inputs": {"depth": {"last": 32, "after_ms": 4.0}, "seg": {"last": 8, "after_ms": 6.0}},
-    }
-    assert join_text(row) == (
+    assert joins.rows() == {"composite": {"depth": JoinInput(32, 4.0), "seg": JoinInput(8, 6.0)}}
+    assert join_text("composite", joins.rows()["composite"]) == (
         "composite waited for depth in 32 of 40 jobs, 4.00 ms after the others; "
         "for seg in 8 of 40 jobs, 6.00 ms after the others"
     )

@@ -20,8 +20,8 @@ from support.trace_reading import ReadTrace, read_trace
 from trilane.apps.explain.trace import (
     MOST_WAITING,
     Lanes,
+    RunTracks,
     Tiles,
-    TraceWriter,
     write_trace,
     write_tracks,
 )
@@ -361,12 +361,13 @@ def test_memory_is_flat_however_long_a_run_lasts() -> None:
         records = endless(2000)
         begun = next(records)
         assert isinstance(begun, Begun)
-        writer = TraceWriter(nothing, begun)
+        sink = PacketSink(nothing)
+        tracks = RunTracks(sink, begun)
 
         def write(frames: int) -> tuple[int, int]:
             for record in islice(records, 7 * frames):
-                writer.add(record)
-            writer._sink._write_block()  # what is not in the file yet
+                tracks.add(record)
+            sink._write_block()  # what is not in the file yet
             return tracemalloc.get_traced_memory()[0], allocated_bytes()
 
         tracemalloc.start()

@@ -331,7 +331,7 @@ def test_a_picture_that_moves_is_said_to_be_the_video_as_which_it_is_shown(tmp_p
 def test_what_is_not_known_is_not_printed(inputs: dict[str, Path]) -> None:
     found = inspect_file(inputs["amass.npz"])
     assert found.facts["leg_m"] is None
-    assert not any("None" in line for line in lines(found.document(inputs["amass.npz"], None)))
+    assert not any("None" in line for line in lines(found, inputs["amass.npz"], None))
 
 
 def test_frames_of_a_video_of_variable_rate_are_counted(tmp_path: Path) -> None:

@@ -256,7 +256,7 @@ def test_the_bound_is_the_same_wherever_it_is_said(scene: str, policy: str, held
     assert own.verdict is not None and own.verdict.bound is not None
     bound = own.verdict.bound.as_json()
     assert (bound["unit"], bound["stages"][0]) == (figures["bottleneck"], figures["bound"]["stage"]["name"])
-    explained = explain_run(folder)
+    explained = explain_run(folder).as_json()
     assert (explained["bottleneck"], explained["bound"]["stage"]["name"]) == (bound["unit"], bound["stages"][0])
     (look,) = looks(FollowedRun(folder), lambda: None)
     view = FinishedView(folder)
