@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from trilane.apps.explain.explained_run import ExplainedFrame, ExplainedRun
-    from trilane.apps.explain.scene_plan import ImageSize, ModelledAvatar, Phase, PlanExplanation
+    from trilane.apps.explain.scene_plan import ImageSize, ModelledAvatar, PlanExplanation, ScenePhase
 
 app = Commands()
 EPILOG = """\b
@@ -377,7 +377,7 @@ def _show_plan(plan: PlanExplanation) -> None:
     )
 
 
-def _phase_table(phases: Sequence[Phase]) -> Table:
+def _phase_table(phases: Sequence[ScenePhase]) -> Table:
     from rich.table import Table
 
     table = Table("frames", "tensor", "density", "avatar: modelled, bound / measured px", "saved: kpixel, GMAC, ms")
@@ -393,7 +393,7 @@ def _phase_table(phases: Sequence[Phase]) -> Table:
     return table
 
 
-def _left_out(phases: Sequence[Phase]) -> list[str]:
+def _left_out(phases: Sequence[ScenePhase]) -> list[str]:
     """Return a line for each level of detail in use. The line names the parts of the body that the level leaves out."""
     rows = [(row.modelled, ", ".join(row.left_out)) for phase in phases for row in phase.avatars]
     return [f'"{level}" leaves out {out or "nothing that this body has"}' for level, out in dict.fromkeys(rows)]

@@ -69,7 +69,7 @@ def open_journal(folder: Path) -> tuple[Begun, Iterator[Record]]:
     return begun, records
 
 
-class CoreUse(NamedTuple):
+class CoreTime(NamedTuple):
     """The use of a run's cores: their `numbers`, the CPU time of all jobs of a mean frame, and the time they had."""
 
     numbers: list[int]
@@ -142,14 +142,14 @@ class ExplainedRun:
         self.nobodys_ms = sum(row.ms for row in self.budget if row.what == PREEMPTED)
 
     @property
-    def cores(self) -> CoreUse | None:
+    def cores(self) -> CoreTime | None:
         numbers = sorted({core for place in self._places.values() for core in place.cores})
         efficiency = self.figures["machine_efficiency"]
         is_placed = numbers and len(self._places) == len(self.begun.graph.units)
         if self.frame_ms is None or efficiency is None or not is_placed:
             return None
         had_ms = len(numbers) * self.frame_ms
-        return CoreUse(numbers, efficiency * had_ms, had_ms)
+        return CoreTime(numbers, efficiency * had_ms, had_ms)
 
     def waits(self, stage: str) -> tuple[float, dict[str, float]]:
         """Return the mean wait of a stage's jobs in ms, and its parts by cause, the longest first."""

@@ -251,7 +251,7 @@ class ModelledAvatar(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Phase:
+class ScenePhase:
     """A phase of a scene.
 
     `cost`, `fixed`: cost of its first frame, by the plan and with a tensor of the shape `FIXED`. `why`: reason for the
@@ -351,7 +351,7 @@ class PlanExplanation:
             )
 
         self.phases = [
-            Phase(
+            ScenePhase(
                 group,
                 [modelled(number, group, px) for number, px in zip(group[0].plan.seen, measured_px, strict=True)],
                 _cost(group[0].plan, costs),
