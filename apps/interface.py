@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 from trilane.apps.explain.explained_run import COLUMNS, explain_run, figure_names, job_rows, open_journal
 from trilane.apps.old_names import in_new_name
 from trilane.apps.predict.predict_options import OF_A_PIPELINE_ALONE, PredictOptions
+from trilane.apps.predict.predicted_verdict import document_of, predicted_verdict
 from trilane.apps.run.asked_run import run_asked
-from trilane.apps.run.predicted_verdict import document_of, predicted_verdict
 from trilane.apps.run.report import Report, read_report
 from trilane.apps.run.verdict import Verdict
 from trilane.apps.run.verdict_facts import verdict_of

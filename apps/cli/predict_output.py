@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from trilane.apps.cli.console import print_json, print_verdict, stdout_console
-from trilane.apps.run.predicted_verdict import document_of, predicted_verdict
+from trilane.apps.predict.predicted_verdict import document_of, predicted_verdict
 from trilane.hw_profiles.schema import SHARE_TEXT
 from trilane.units import BURST, SUSTAINED
 

@@ -12,7 +12,7 @@ from typing import Any, Final
 from trilane.apps.check.port_types import port_types, read_networks
 from trilane.apps.explain.explained_run import open_journal
 from trilane.apps.predict.predict_options import PredictOptions
-from trilane.apps.run.predicted_verdict import pipeline_verdict
+from trilane.apps.predict.predicted_verdict import pipeline_verdict
 from trilane.apps.run.report import read_report
 from trilane.apps.run.verdict import Trust, trust_of
 from trilane.errors import BadInputError

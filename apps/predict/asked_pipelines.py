@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from trilane.apps.check.port_types import port_types, read_networks
 from trilane.apps.explain.scene_plan import ScenePlan
 from trilane.apps.predict.predict_options import PredictOptions
-from trilane.apps.run.predicted_verdict import pipeline_verdict
+from trilane.apps.predict.predicted_verdict import pipeline_verdict
 from trilane.arrays import Shape
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import LEAST_FPS, MOST_FPS, NETWORK_UNITS, Variant

@@ -12,7 +12,7 @@ import pytest
 
 from support.pipeline_files import DEPTH, additions
 from trilane.apps.predict import asked_pipelines as sources
-from trilane.apps.run.predicted_verdict import pipeline_verdict
+from trilane.apps.predict.predicted_verdict import pipeline_verdict
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan, stage_times_ms
 from trilane.hw_profiles.pipeline_prediction import predict_file, prices_of

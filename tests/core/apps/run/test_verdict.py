@@ -17,7 +17,7 @@ from support.run_folders import write_run
 from support.run_report import TIMES, make_report
 from trilane.apps.explain.explained_run import explain_run
 from trilane.apps.interface import load_run
-from trilane.apps.run.predicted_verdict import pipeline_verdict, predicted_verdict
+from trilane.apps.predict.predicted_verdict import pipeline_verdict, predicted_verdict
 from trilane.apps.run.report import Report, read_report
 from trilane.apps.run.verdict import COMPUTED, SO_FAR, Facts, LateFrames, NamedBound, Rate, Trust, judged, trust_of
 from trilane.apps.run.verdict_facts import verdict_of
