@@ -113,11 +113,12 @@ def staged_from_arrays(arrays: Mapping[str, NDArray[Any]]) -> Staged:
 
     `arrays`: arrays by name, perhaps read-only; the scene keeps them. Raises KeyError when an array is missing.
     """
-    movers = tuple(_mover(_below(arrays, f"mover.{index}.")) for index in range(int(arrays["movers"])))
-    return Staged(movers, _camera(_below(arrays, "camera.")), ())
+    movers = tuple(_mover(with_prefix(arrays, f"mover.{index}.")) for index in range(int(arrays["movers"])))
+    return Staged(movers, _camera(with_prefix(arrays, "camera.")), ())
 
 
-def _below(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Arrays:
+def with_prefix(arrays: Mapping[str, NDArray[Any]], prefix: str) -> Arrays:
+    """Return the arrays whose name begins with `prefix`, by the rest of their name."""
     return {key.removeprefix(prefix): value for key, value in arrays.items() if key.startswith(prefix)}
 
 
@@ -177,7 +178,7 @@ def _camera(arrays: Arrays) -> PlacedCamera:
         repeat_s=float(arrays["repeat_s"]),
         began_s=float(arrays["began_s"]) if "began_s" in arrays else None,
     )
-    parts = (_below(arrays, f"way.{index}.") for index in range(int(arrays["ways"])))
+    parts = (with_prefix(arrays, f"way.{index}.") for index in range(int(arrays["ways"])))
     ways = tuple(Way(part["times_s"], part["places"], WRAPS[int(part["wrap"])]) for part in parts)
     return PlacedCamera(path, arrays["turn"], arrays["shift"], arrays["mount"], (), ways)
 

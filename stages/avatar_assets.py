@@ -23,7 +23,7 @@ from trilane.body.body import Body, ShapedBody
 from trilane.errors import BadInputError
 from trilane.hw_profiles.network_work import Network, count_work, one_after_the_other
 from trilane.pipeline.memory import Assets
-from trilane.scene.staging import Staged, staged_from_arrays, staged_to_arrays
+from trilane.scene.staging import Staged, staged_from_arrays, staged_to_arrays, with_prefix
 from trilane.stages.config import Quantisation, RunConfig
 
 SCENE = "scene/"
@@ -118,7 +118,7 @@ def distinct(config: RunConfig) -> list[Path]:
 
 def shaped_body(assets: Assets, number: int) -> ShapedBody:
     """Return the shaped body of the distinct avatar `number`."""
-    own = _with_prefix(assets, f"body{number}/")
+    own = with_prefix(assets, f"body{number}/")
     arrays: dict[str, Any] = {name: own.get(name) for name in BODY_ARRAYS}  # `posedirs` and `offsets` may be None
     hands = (own[HANDS[0]], own[HANDS[1]])
     body = Body(source=f"avatar {number} of the run", hand_components=hands, **arrays)
@@ -137,7 +137,7 @@ def levels_of(assets: Assets, number: int) -> F32 | None:
 
 def mesh_levels_of(assets: Assets, number: int) -> tuple[MeshLevel, ...]:
     """Return the levels of the mesh of the distinct avatar `number`, the finest first; empty if it has none."""
-    arrays = _with_prefix(assets, f"meshes{number}/")
+    arrays = with_prefix(assets, f"meshes{number}/")
     return levels_from_arrays(arrays) if arrays else ()
 
 
@@ -193,8 +193,4 @@ def only_network_of(assets: Assets) -> NetworkFile:
 
 def staged_of(assets: Assets) -> Staged:
     """Return the scene's movers and camera."""
-    return staged_from_arrays(_with_prefix(assets, SCENE))
-
-
-def _with_prefix(assets: Assets, prefix: str) -> Mapping[str, NDArray[Any]]:
-    return {name.removeprefix(prefix): array for name, array in assets.items() if name.startswith(prefix)}
+    return staged_from_arrays(with_prefix(assets, SCENE))

@@ -49,7 +49,7 @@ def avatar_pipeline(config: RunConfig, assets: Assets, edge: str = DEFAULT_EDGE)
 def edge_bytes(config: RunConfig, assets: Assets) -> dict[str, int]:
     """Return the payload bytes of each edge, for the largest tensors of the run, in the order of the edges."""
     output, names = config.scene.output, config.infer_names
-    pixels = config.max_tensor_pixels * config.network_count
+    pixels = config.max_tensor_pixels * (len(set(config.networks)) or 1)
     crossings = crossing_bytes(config, only_network_of(assets)) if config.cuts else []
     return {
         "pose->raster": posed_vertices_bytes(config.posed_vertices),

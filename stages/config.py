@@ -197,11 +197,6 @@ class RunConfig(StrictModel):
         """The largest permitted error of a vertex on the picture, pixels; 0 if everything is modelled."""
         return self.scene.error_budget_px if self.scene.plan == "planned" else 0.0
 
-    @property
-    def network_count(self) -> int:
-        """The number of networks; each paints some of the avatars."""
-        return len(set(self.networks)) or 1
-
     def network_of(self, avatar: int) -> int:
         """Return the number of the network that paints the avatar with the number `avatar`."""
         return self.networks[avatar] if self.networks else 0

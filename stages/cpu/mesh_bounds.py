@@ -35,7 +35,7 @@ from numpy.typing import ArrayLike, NDArray
 from trilane.arrays import F32, F64, I64, Mask
 from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINTS, Posed
-from trilane.body.skinning import blend_matrices, branch_sums, joint_distance, largest_weights
+from trilane.body.skinning import blend_matrices, blend_reach, branch_sums, joint_distance, largest_weights
 from trilane.cache import Arrays, cached_arrays
 from trilane.scene.crop import Rect
 
@@ -180,7 +180,7 @@ def _build_levels(shaped: ShapedBody, weights: F64) -> list[Level]:
     ends = np.cumsum([len(groups) for groups in nested])
     children = [np.arange(end - len(groups), end) for groups, end in zip(nested, ends, strict=True)]
     fine = [group for groups in nested for group in groups]
-    blend = _blend_reach(shaped.body.posedirs, len(weights))
+    blend = blend_reach(shaped)
     return [
         _level(shaped, features, branches, blend, coarse, children),
         _level(shaped, features, branches, blend, fine, None),
@@ -200,17 +200,6 @@ def _level(
     give = change * np.linalg.norm(rest[centres][:, None] - shaped.joints, axis=2)
     reach = np.maximum.reduceat(blend[flat], starts, axis=0)
     return Level(centres, size, give[:, 1:], reach, members if parts is None else parts, groups)
-
-
-def _blend_reach(posedirs: NDArray[np.float32] | None, count: int) -> F64:
-    """Return how far each joint's pose blend shapes can move each vertex at |R - I| = 1 (V,54), metres.
-
-    `count`: number of vertices V.
-    """
-    if posedirs is None:
-        return np.zeros((count, 54))
-    blocks = posedirs.reshape(count, 3, 54, 9)
-    return np.asarray(np.sqrt(np.einsum("vajk,vajk->vj", blocks, blocks).astype(np.float64)))
 
 
 def _bisect(features: F64, rows: I64, extent: float) -> list[I64]:

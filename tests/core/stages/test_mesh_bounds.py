@@ -14,10 +14,10 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.joints import Posed, Skeleton
-from trilane.body.skinning import CpuSkinner
+from trilane.body.skinning import CpuSkinner, blend_reach
 from trilane.scene.crop import Rect
 from trilane.stages.cpu import mesh_bounds
-from trilane.stages.cpu.mesh_bounds import ROUNDING_M, MeshBounds, Outermost, _blend_reach
+from trilane.stages.cpu.mesh_bounds import ROUNDING_M, MeshBounds, Outermost
 
 LENS = np.array([(1.5, 0, 0.2, 0), (0, 2.0, -0.1, 0), (0, 0, -1.02, -0.202), (0, 0, -1, 0.0)])  # near 0.1, far 10
 
@@ -200,7 +200,7 @@ def test_a_mesh_that_only_its_blend_shapes_bring_into_the_picture(square: Shaped
 
 
 def test_the_reach_of_blend_shapes_is_their_norm(square: ShapedBody) -> None:
-    reach = _blend_reach(blended(square).body.posedirs, 4)
+    reach = blend_reach(blended(square))
     assert reach.shape == (4, 54)
     assert reach[:, 0] == pytest.approx([math.hypot(0.3, 0.2)] * 4)
     assert not reach[:, 1:].any()
