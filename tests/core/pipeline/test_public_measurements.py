@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import pytest
 
 from trilane.errors import BadInputError
-from trilane.pipeline.measurements.measurement import Measurement
-from trilane.pipeline.measurements.read_file import Measurements, chosen, read_measurements
+from trilane.pipeline.measurements.measurement import Measurement, Measurements
+from trilane.pipeline.measurements.read_file import chosen, read_measurements
 
 HEADER = "Msg Timestamp,Message,Time,Unit of Measurement,Timing Source,Event Level,Event Identifier\n"
 
