@@ -14,7 +14,8 @@ import pytest
 
 from support.mutations import mutated
 from trilane.errors import BadInputError
-from trilane.pipeline.measurements.read_file import OWN_COLUMNS, Measurements, chosen, read_measurements
+from trilane.pipeline.measurements.measurement import Measurements
+from trilane.pipeline.measurements.read_file import OWN_COLUMNS, chosen, read_measurements
 
 #: usefulsensors/qc_npu_benchmark, npu_quant_profile.csv; the second run is of tezheng/winml-cli, optrace_resnet50.csv.
 QNN = """Msg Timestamp,Message,Time,Unit of Measurement,Timing Source,Event Level,Event Identifier

@@ -8,7 +8,8 @@ from typing import NamedTuple
 import pytest
 
 from trilane.errors import BadInputError
-from trilane.pipeline.measurements.read_file import Measurements, chosen
+from trilane.pipeline.measurements.measurement import Measurements
+from trilane.pipeline.measurements.read_file import chosen
 
 HEADER = "Msg Timestamp,Message,Time,Unit of Measurement,Timing Source,Event Level,Event Identifier\n"
 

@@ -13,7 +13,7 @@ from google.protobuf import text_format
 from perfetto.protos.perfetto.trace.perfetto_trace_pb2 import Trace, TracePacket
 
 from trilane.errors import BadInputError
-from trilane.pipeline.measurements.read_file import Measurements
+from trilane.pipeline.measurements.measurement import Measurements
 
 #: google/perfetto, test/trace_processor/diff_tests, `test_slice_self_dur`: two slices, one in the other.
 ATRACE = """
