@@ -21,8 +21,6 @@ from trilane.scene.motion.motion import REST_PELVIS, SMPL_REST_PELVIS, T_POSE, M
 from trilane.scene.rotations import about, matrix_from_rotvec, rotvec_from_matrix
 from trilane.scene.schema import AvatarSpec, scene_from
 
-HALF = np.pi / 2
-
 
 def load(path: Path | str, **spec: Any) -> Motion:
     return load_motion(AvatarSpec(motion=str(path), **spec), Path("/"))
