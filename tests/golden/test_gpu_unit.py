@@ -148,20 +148,6 @@ def test_planes_lie_over_the_room_and_under_the_avatar(gl: Any, person: Any, cam
     assert not changed[green].any()
 
 
-@pytest.mark.parametrize("scale", [0.2, 0.7, 1.0, 3.0])
-def test_edges_have_no_halo(gl: Any, person: Any, camera: Camera, scale: float) -> None:
-    """At every size each pixel lies between background and avatar: red from transparent pixels never leaks."""
-    view = camera((0, 1.5, 3.0), (0, 1.4, -4.0), 30, 4 / 3)
-    far = person.pose(np.zeros(165))
-    far[:, :, 3] += (0, 0, 3.5)  # the shadow falls behind the camera
-    half = np.array([TENSOR[1] / OUTPUT[1], TENSOR[0] / OUTPUT[0]]) * scale
-    empty = np.zeros((*TENSOR, 4), np.uint8)
-    behind = composed(gl, person, empty, view, (*-half, *half), far).astype(int)
-    frame = composed(gl, person, disc(), view, (*-half, *half), far).astype(int)
-    colour = np.array([0, 160, 0])
-    low, high = np.minimum(behind, colour) - 2, np.maximum(behind, colour) + 2
-    assert ((frame >= low) & (frame <= high)).all()
-    assert (np.abs(frame - colour).max(axis=-1) <= 2).sum() > 0.7 * np.pi * (28 * scale - 2) ** 2 * 0.9
 
 
 def built(bundle: Path, background: Path) -> tuple[RasterStage, CompositeStage]:
