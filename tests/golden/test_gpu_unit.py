@@ -12,29 +12,23 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from support.doubles import lose_context
-from support.small_pipeline import assets_of
+from support.small_pipeline import assets_of, packet
 from trilane.avatars.bundle import load_bundle
 from trilane.errors import TrilaneError, UnitLostError
 from trilane.pipeline.description import UnitSettings
 from trilane.pipeline.stage import UnitContext
 from trilane.scene.schema import PlaneSpec, Scene
-from trilane.stages.config import Quantisation, RunConfig, pose_dtype
+from trilane.stages.config import Quantisation, RunConfig
 from trilane.stages.gpu import composite
 from trilane.stages.gpu import raster as raster_stage
 from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.raster import PackedAvatar, PackedPass, RasterStage
-from trilane.transport.packets import Packet, SlotLayout, view_packet
+from trilane.transport.packets import Packet
 
 TENSOR = (96, 64)
 OUTPUT = (240, 320)
 ENCODING = Quantisation(6 / 255, 117)
 Camera = Callable[..., Any]
-
-
-def packet(payload_bytes: int, avatars: int = 1) -> Packet:
-    """A slot of zeros."""
-    layout = SlotLayout(pose_dtype(avatars), payload_bytes)
-    return view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
 
 
 def fill_pose(slot: Packet, joints: Any, view: Any, projection: Any, rect: Any, tensor: Any = TENSOR) -> None:
@@ -146,8 +140,6 @@ def test_planes_lie_over_the_room_and_under_the_avatar(gl: Any, person: Any, cam
     green = (plain == (0, 160, 0)).all(axis=2)
     assert green.sum() > 500
     assert not changed[green].any()
-
-
 
 
 def built(bundle: Path, background: Path) -> tuple[RasterStage, CompositeStage]:
