@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -96,9 +97,8 @@ def test_limits_of_a_manifest_on_either_side(case: int) -> None:
     if not sentence:
         parse_manifest(manifest(**copy.deepcopy(changes)), Path("m"))
         return
-    with pytest.raises(BadInputError) as raised:
+    with pytest.raises(BadInputError, match=re.escape(f"m: {sentence}")):
         parse_manifest(manifest(**copy.deepcopy(changes)), Path("m"))
-    assert f"m: {sentence}" in str(raised.value)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", '{"name": 1}', "[" * 100_000])
@@ -207,9 +207,8 @@ def test_a_network_that_contradicts_its_manifest(tmp_path: Path) -> None:
         ({"output": {"scale": 0.25, "zero_point": 7}}, f" (output): {has_out} scale 0.25, zero point 7 by the manif"),
         ({"channels": 4}, ": found 3 channels, expected 4 by the manifest"),
     ):
-        with pytest.raises(BadInputError) as raised:
+        with pytest.raises(BadInputError, match=re.escape(f"{path}{sentence}")):
             with_entry(**entry).read_network()
-        assert f"{path}{sentence}" in str(raised.value)
 
 
 @pytest.mark.parametrize(
@@ -230,9 +229,8 @@ def test_files_of_a_bundle_lie_in_its_folder(tmp_path: Path, key: str, value: st
     else:
         content[key] = value
     path.write_text(json.dumps(content))
-    with pytest.raises(BadInputError) as raised:
+    with pytest.raises(BadInputError, match=re.escape(sentence)):
         load_bundle(tmp_path / "b")
-    assert sentence in str(raised.value)
 
 
 def test_a_bundle_with_a_wrong_network_is_not_written(tmp_path: Path) -> None:

@@ -272,9 +272,9 @@ def test_indices_may_reach_the_last_vertex_and_no_further(tmp_path: Path, body_a
     signed = body_arrays | {key: body_arrays[key].astype(np.int64) for key in ("f", "ft")}
     for key, last, of in (("f", 89, "vertices"), ("ft", 129, "texture coordinates")):
         loaded(tmp_path, changed(changed(signed, key, (0, 0), last), key, (0, 1), 0))
-        with pytest.raises(BadInputError) as raised:
+        said = f"[{key}]: found indices from 0 to {last + 1}, expected 0 to {last}, the {of}"
+        with pytest.raises(BadInputError, match=re.escape(said)):
             loaded(tmp_path, changed(changed(signed, key, (0, 0), last + 1), key, (0, 1), 0))
-        assert f"[{key}]: found indices from 0 to {last + 1}, expected 0 to {last}, the {of}" in str(raised.value)
         with pytest.raises(BadInputError, match="indices from -1 to"):
             loaded(tmp_path, changed(signed, key, (0, 0), -1))
 
@@ -370,9 +370,8 @@ WRONG_BLEND = {
 @pytest.mark.parametrize("case", WRONG_BLEND)
 def test_wrong_pose_blend_shapes_are_refused(tmp_path: Path, case: str) -> None:
     array, sentence = WRONG_BLEND[case]
-    with pytest.raises(BadInputError) as raised:
+    with pytest.raises(BadInputError, match=re.escape(sentence)):
         read_pose_blend(npz_with(tmp_path / "a.npz", array), (7, 3, 2))
-    assert sentence in str(raised.value)
 
 
 def test_pose_blend_shapes_have_a_largest_size_and_all_their_bytes(
@@ -416,9 +415,8 @@ def test_numbers_below_a_million_are_posed() -> None:
         ((pose,), "pose: found NaN, infinity or a huge number, expected joint angles below 1e6 rad"),
         ((np.zeros(165), [1.001e6, 0, 0]), "place of the body: found NaN, infinity or a huge number, expected metres"),
     ):
-        with pytest.raises(BadInputError) as raised:
+        with pytest.raises(BadInputError, match=re.escape(sentence)):
             skeleton.pose(*arguments)
-        assert sentence in str(raised.value)
 
 
 # --- skinning ---
