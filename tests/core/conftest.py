@@ -66,6 +66,13 @@ def body_arrays() -> dict[str, NDArray[Any]]:
     return arrays | {key: value.astype(np.uint32) for key, value in integers.items()}
 
 
+@pytest.fixture
+def shaped(tmp_path: Path, body_arrays: dict[str, NDArray[Any]]) -> ShapedBody:
+    """The body of `body_arrays` in its mean shape."""
+    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
+    return load_body(tmp_path / "body.npz").shape()
+
+
 HELD = Path(__file__).with_name("held.json")
 #: Relative to the sum of the magnitudes: the same sums in another order, or by another library, differ by less.
 CLOSE = 1e-6

@@ -18,8 +18,10 @@ from trilane.body.body import Body, load_body
 from trilane.body.joints import Skeleton
 from trilane.body.skinning import largest_weights
 from trilane.errors import MissingPartError
+from trilane.stages.configure import Checked, configure
 from trilane.stages.gpu.opengl import open_context
 from trilane.stages.gpu.skinned_mesh import MeshArrays, SkinnedMesh, mesh_arrays
+from trilane.stages.run_options import RunOptions
 
 HERE = Path(__file__).parent
 FAILED = HERE / "failed"
@@ -147,3 +149,22 @@ def golden() -> Callable[[str, NDArray[np.uint8], float, float], None]:
 def _keep(name: str, picture: NDArray[np.uint8]) -> None:
     FAILED.mkdir(exist_ok=True)
     Image.fromarray(picture).save(FAILED / f"{name}.png")
+
+
+@pytest.fixture(scope="session")
+def far_scene() -> Callable[[str | Path, Path], Checked]:
+    """Makes in a folder a scene of 12 small frames, in which the camera is far from the avatar."""
+
+    def made(bundle: str | Path, folder: Path) -> Checked:
+        file = folder / "far.toml"
+        size = 'size = "64x64"\noutput = {width = 160, height = 128}\ncamera = {source = "builtin:far"}'
+        file.write_text(f'frames = 12\nfps = 6\n{size}\n[[avatars]]\nbundle = "{bundle}"\n', encoding="utf-8")
+        return configure(RunOptions(scene=str(file), runtime="ort", skinning="cpu"), folder)
+
+    return made
+
+
+@pytest.fixture(scope="module")
+def checked(drawable_bundle: Path, far_scene: Any, tmp_path_factory: pytest.TempPathFactory) -> Checked:
+    """The far scene of the avatar with the tiny network."""
+    return far_scene(drawable_bundle, tmp_path_factory.mktemp("scene"))

@@ -12,12 +12,11 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from support.small_pipeline import without_bytes
+from support.small_pipeline import packet, without_bytes
 from trilane.arrays import F64, U8
 from trilane.bench.lib import float_raster
 from trilane.scene.crop import Rect, lay_out_at
 from trilane.scene.schema import PlaneSpec
-from trilane.stages.config import pose_dtype
 from trilane.stages.gpu import composite, composite_painters, opengl
 from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.composite_painters import (
@@ -30,7 +29,6 @@ from trilane.stages.gpu.composite_painters import (
     half_sides,
     room_mesh,
 )
-from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 SHAPE = (20, 27)
 EYE = np.eye(4)
@@ -286,11 +284,6 @@ def test_the_display_is_blended_at_its_corner(gl: Any, shape: tuple[int, int], m
     ImageDraw.Draw(sheet).multiline_text((8, 3), text, (255, 255, 255, 255), font, spacing=3)
     assert np.array_equal(display, np.asarray(sheet))
     assert display[..., :3].max() == 255 and display.shape == (62, 232, 4)
-
-
-def packet(payload_bytes: int, avatars: int = 1) -> Packet:
-    layout = SlotLayout(pose_dtype(avatars), payload_bytes)
-    return view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
 
 
 def test_the_display_renews_rate_and_age_four_times_a_second(gl: Any) -> None:

@@ -19,33 +19,15 @@ from trilane.arrays import F32, F64
 from trilane.bench.lib.cast import Cast
 from trilane.bench.lib.full_picture import FullPictures
 from trilane.stages.config import posed_vertices
-from trilane.stages.configure import Checked, configure
-from trilane.stages.run_options import RunOptions
+from trilane.stages.configure import Checked
 
 FRAME = 5
 #: Of the texture everywhere; float16 and bytes cannot hold it.
 GREY = 0.3
-SCENE = """
-frames = 12
-fps = 6
-size = "64x64"
-output = {{width = 160, height = 128}}
-camera = {{source = "builtin:far"}}
-[[avatars]]
-bundle = "{bundle}"
-"""
 
 
 def alone(cause: Cause) -> frozenset[Cause]:
     return needs(cause) | {cause}
-
-
-@pytest.fixture(scope="module")
-def checked(drawable_bundle: Path, tmp_path_factory: pytest.TempPathFactory) -> Checked:
-    folder = tmp_path_factory.mktemp("scene")
-    file = folder / "small.toml"
-    file.write_text(SCENE.format(bundle=drawable_bundle), encoding="utf-8")
-    return configure(RunOptions(scene=str(file), runtime="ort", skinning="cpu"), folder)
 
 
 @pytest.fixture(scope="module")

@@ -13,8 +13,6 @@ import pytest
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
-from trilane.bench.lib.float_raster import sample
-from trilane.stages.gpu.composite_painters import WHOLE
 from trilane.stages.gpu.opengl import build_program
 
 #: Metres and shares of a few units, after some ten roundings of float32.
@@ -62,29 +60,6 @@ def texture_of(gl: Any, image: NDArray[np.floating], unit: int = 0) -> Any:
     return texture
 
 
-def test_premultiplying_keeps_alpha_and_place(gl: Any) -> None:
-    image = np.random.default_rng(0).random((3, 5, 4))
-    texture_of(gl, image)
-    found = drawn(gl, "whole_screen.vert", "premultiply.frag", (3, 5), 3, {"image": 0})
-    np.testing.assert_allclose(found, image * np.c_[image[..., 3:].repeat(3, -1), np.ones((3, 5, 1))], atol=NEAR)
-
-
-def test_a_picture_is_copied_opaque(gl: Any) -> None:
-    image = np.random.default_rng(1).random((3, 5, 4))
-    texture_of(gl, image)
-    found = drawn(gl, "whole_screen.vert", "picture.frag", (3, 5), 3, {"picture": 0})
-    np.testing.assert_allclose(found[..., :3], image[..., :3], atol=NEAR)
-    assert (found[..., 3] == 1).all()
-
-
-def test_the_display_is_copied_from_its_corner_on(gl: Any) -> None:
-    """Pixel (column, row) of the target shows (column, row) - corner; all four numbers as they are."""
-    image = np.random.default_rng(2).random((6, 9, 4))
-    texture_of(gl, image)
-    found = drawn(gl, "whole_screen.vert", "head_up_display.frag", (4, 6), 3, {"picture": 0, "corner": (-3, -2)})
-    np.testing.assert_allclose(found, image[2:6, 3:9], atol=NEAR)
-
-
 @pytest.mark.parametrize("fragment", ["uv_and_coverage.frag", "uv_only.frag"])
 def test_u_and_v_are_written_as_they_are(gl: Any, fragment: str) -> None:
     shape, uv = (4, 7), np.array([(0.1, 0.9), (0.6, 0.9), (0.1, 0.2), (0.6, 0.2)])
@@ -115,42 +90,6 @@ def test_the_rooms_texture_is_multiplied_by_its_light(gl: Any) -> None:
     lit = np.stack([0.2 + 0.6 * column, 0.4 + 0.3 * row, 0.9 - 0.6 * row], axis=-1)
     np.testing.assert_allclose(found[..., :3], image[..., :3] * lit, atol=NEAR)
     assert (found[..., 3] == 1).all()
-
-
-def test_a_layer_is_quantised_and_clamped_before_the_target_clamps(gl: Any) -> None:
-    """Each number is a whole byte over 255, also in a target that would hold what lies beyond 0 and 1."""
-    shape = (4, 6)
-    real = np.random.default_rng(4).uniform(-3, 6, (2, *shape, 4))
-    real = np.where(np.abs(real / 0.02 % 1 - 0.5) < 0.02, 0.3, real).astype(np.float32)
-    array = gl.texture_array((6, 4, 2), 4, real.tobytes(), dtype="f4")
-    array.use(0)
-    corners, uv = np.array([(-1, -1, 0), (1, -1, 0), (-1, 1, 0), (1, 1, 0)]), [(0, 0), (1, 0), (0, 1), (1, 1)]
-    content = [(gl.buffer(np.c_[corners, uv].astype(np.float32).tobytes()), "3f 2f", "position", "uv")]
-    for layer in range(2):
-        uniforms = {"clip_from_world": FLAT, "neural": 0, "scale": 0.02, "zero_point": 31.0, "layer": layer}
-        found = drawn(gl, "posed_vertices.vert", "split.frag", shape, 4, uniforms, moderngl.TRIANGLE_STRIP, content)
-        expected = np.clip(np.rint(real[layer].astype(float) / 0.02) + 31, 0, 255)
-        assert {0, 255} < set(expected.ravel().tolist())
-        np.testing.assert_allclose(found * 255, expected, atol=1e-4)
-
-
-@pytest.mark.parametrize("strength", [0.72, 0.35])
-def test_a_shadow_falls_off_as_one_minus_r_squared_squared(gl: Any, strength: float) -> None:
-    """Light is multiplied by 1 - strength (1 - r²)², sRGB numbers accordingly; nothing beyond the disc's square."""
-    shape = (16, 16)
-    look_down = np.array([(1, 0, 0, 0), (0, 0, 1, 0), (0, 1, 0, 0), (0, 0, 0, 1.0)])  # clip x, y = world x, z
-    uniforms = {"clip_from_world": look_down.T, "blob": np.array([(0.25, -0.125, 0.5, strength)])}
-    found = drawn(gl, "shadow.vert", "shadow.frag", shape, 6, uniforms, BLOBS=1)
-    column, row = centres(shape)
-    x, z = (2 * column - 1 - 0.25) / 0.5, (2 * row - 1 + 0.125) / 0.5
-    inside = (np.abs(x) < 1) & (np.abs(z) < 1)
-    light = 1 - strength * np.maximum(1 - x * x - z * z, 0) ** 2
-    assert inside.sum() == 64
-    kept = found[inside][:, 3]
-    np.testing.assert_allclose(kept, light[inside] ** (1 / 2.4), atol=0.0007)
-    np.testing.assert_allclose(found[inside][:, :3], np.tile(0.055 * (1 - kept[:, None]), 3), atol=NEAR)
-    assert (found[~inside] == -7).all()
-    assert (light[inside] == 1).any()
 
 
 def sheet(across: F64, along: F64, dx: F64, dy: F64) -> F64:
@@ -191,31 +130,6 @@ def test_a_plane_has_lines_and_a_rim(gl: Any, side_m: float) -> None:
     np.testing.assert_allclose(found[inside][:, 3], expected[inside], atol=1e-4)  # fract() of metres over a pixel
     assert (found[inside][:, :3] == 1).all()
     assert (found[~inside] == -7).all()
-
-
-@pytest.mark.parametrize("taps", range(1, 5))
-def test_the_avatars_picture_is_averaged_over_the_pixel(gl: Any, taps: int) -> None:
-    """The mean of taps² bilinear reads spread evenly over the pixel, none outside `inside`."""
-    shape, random = (6, 8), np.random.default_rng(taps)
-    image = random.random((9, 13, 4))
-    texture = texture_of(gl, image)
-    texture.build_mipmaps()  # of which only the finest level may be read
-    texture.filter = (moderngl.LINEAR_MIPMAP_LINEAR, moderngl.LINEAR)
-    source, inside = np.array([0.08, 0.05, 0.83, 0.9]), np.array([0.15, 0.2, 0.8, 0.77])
-    uniforms = {"picture": 0, "rect": (-1.0, -1.0, 1.0, 1.0), "source": tuple(source), "inside": tuple(inside)}
-    strip = moderngl.TRIANGLE_STRIP
-    whole = [(gl.buffer(WHOLE.tobytes()), "4f/i", "part")]
-    found = drawn(gl, "avatar.vert", "avatar.frag", shape, 4, uniforms, strip, whole, TAPS=taps)
-    column, row = centres(shape)
-    size = (source[2:] - source[:2]) / shape[::-1]
-    expected = np.zeros((*shape, 4))
-    for down in (np.arange(taps) + 0.5) / taps - 0.5:
-        for right in (np.arange(taps) + 0.5) / taps - 0.5:
-            u = source[0] + (source[2] - source[0]) * column + right * size[0]
-            v = source[1] + (source[3] - source[1]) * row + down * size[1]
-            place = np.stack([np.clip(u, inside[0], inside[2]), np.clip(v, inside[1], inside[3])], axis=-1)
-            expected += sample(image, place) / taps**2
-    np.testing.assert_allclose(found, expected, atol=NEAR)
 
 
 def encoded(light: F64) -> F64:

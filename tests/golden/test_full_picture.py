@@ -17,33 +17,14 @@ from trilane.bench.lib.cast import Box, Cast, RasterLayer, blended, premultiplie
 from trilane.bench.lib.full_picture import SAMPLES, FullPictures, true_pictures
 from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.body.body import load_body
-from trilane.stages.configure import Checked, configure
+from trilane.stages.configure import Checked
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.gpu import opengl
 from trilane.stages.gpu.composite_painters import AvatarPainter, PicturePainter
-from trilane.stages.run_options import RunOptions
 from trilane.training.clothing import LOOKS, clothing_layers, find_landmarks
 from trilane.training.sample_renderer import ClothedBody
 from trilane.training.surface import body_arrays
 from trilane.units import AVATARS
-
-SCENE = """
-frames = 12
-fps = 6
-size = "64x64"
-output = {{width = 160, height = 128}}
-camera = {{source = "builtin:far"}}
-[[avatars]]
-bundle = "{bundle}"
-"""
-
-
-@pytest.fixture
-def checked(drawable_bundle: Path, tmp_path: Path) -> Checked:
-    """A small scene of the avatar with the tiny network."""
-    file = tmp_path / "small.toml"
-    file.write_text(SCENE.format(bundle=drawable_bundle), encoding="utf-8")
-    return configure(RunOptions(scene=str(file), runtime="ort", skinning="cpu"), tmp_path)
 
 
 def test_blending_is_what_the_painter_does_on_the_same_grid(gl: Any) -> None:
@@ -110,11 +91,9 @@ def test_the_body_is_in_one_place_at_every_density(checked: Checked, monkeypatch
 
 
 @pytest.mark.parametrize("name", AVATARS)
-def test_the_truth_is_what_the_training_draws(name: str, tmp_path: Path, gl: Any) -> None:
+def test_the_truth_is_what_the_training_draws(name: str, far_scene: Any, tmp_path: Path, gl: Any) -> None:
     """The clothes of the avatar's look on the skin; on the offsets, which are these clothes, they would stand off."""
-    file = tmp_path / "own.toml"
-    file.write_text(SCENE.format(bundle=name), encoding="utf-8")
-    cast = Cast(configure(RunOptions(scene=str(file), runtime="ort", skinning="cpu"), tmp_path))
+    cast = Cast(far_scene(name, tmp_path))
     (data,), (seen,), look = cast.avatars.values(), cast.seen(5), LOOKS[name]
     true = true_pictures(cast, gl)
     assert true is not None and data.shaped.body.offsets is not None

@@ -10,12 +10,13 @@ import moderngl
 import numpy as np
 import pytest
 
+from support.small_pipeline import packet
 from trilane.scene.planner import FrameWork
-from trilane.stages.config import Quantisation, pose_dtype, posed_vertices
+from trilane.stages.config import Quantisation, posed_vertices
 from trilane.stages.gpu.composite import CompositeStage
 from trilane.stages.gpu.raster import PackedAvatar, PackedPass, RasterStage
 from trilane.stages.gpu.skinned_mesh import PosedMesh, SkinnedMesh
-from trilane.transport.packets import Packet, SlotLayout, view_packet
+from trilane.transport.packets import Packet
 
 TENSOR, OUTPUT = (96, 64), (240, 320)
 HEADER = 24 + 168 + 4628 + 4  # of every packet, of the avatar's, of one avatar, to a multiple of 8
@@ -73,11 +74,6 @@ def moved_by(stage: Any, second: Counter[str], slot_out: int = 0) -> tuple[int, 
     said = stage.run(0, 0, slot_out)
     assert (said["bytes_uploaded"], said["bytes_read_back"]) == (second["uploaded"], second["read_back"])
     return tuple(said[f"bytes_{name}"] for name in ("read", "written", "uploaded", "read_back", "least"))
-
-
-def packet(payload_bytes: int) -> Packet:
-    layout = SlotLayout(pose_dtype(1), payload_bytes)
-    return view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
 
 
 def show(slot: Packet, joints: Any, camera: Any, rect: Any = WHOLE) -> None:

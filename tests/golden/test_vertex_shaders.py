@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from trilane.stages.gpu.composite_painters import WHOLE
 from trilane.stages.gpu.opengl import shader_source
 
 CLIP = np.array([[0.9, 0.1, -0.2, 0.3], [0.05, 1.1, 0.15, -0.4], [0.2, -0.3, 0.7, 0.6], [-0.1, 0.25, 0.35, 1.7]])
@@ -72,16 +71,6 @@ def test_one_triangle_covers_the_whole_target(gl: Any) -> None:
 def test_the_farthest_triangle_lies_at_depth_one(gl: Any) -> None:
     found = written(gl, "farthest.vert", {}, 3)
     assert found["gl_Position"].tolist() == [[-1, -1, 1, 1], [3, -1, 1, 1], [-1, 3, 1, 1]]
-
-
-def test_the_avatar_lies_at_its_rectangle_upright(gl: Any) -> None:
-    """The picture's top left corner comes first, at the rectangle's left and upper side; rows run downward."""
-    uniforms = {"rect": (-0.5, -0.75, 0.25, 1.5), "source": (0.1, 0.2, 0.7, 0.9)}
-    whole = [(gl.buffer(np.tile(WHOLE, (4, 1)).tobytes()), "4f", "part")]
-    found = written(gl, "avatar.vert", {"v_uv": 2}, 4, whole, uniforms)
-    expected = [[-0.5, -1.5, 0, 1], [0.25, -1.5, 0, 1], [-0.5, 0.75, 0, 1], [0.25, 0.75, 0, 1]]
-    np.testing.assert_allclose(found["gl_Position"], expected, **NEAR)
-    np.testing.assert_allclose(found["v_uv"], [(0.1, 0.2), (0.7, 0.2), (0.1, 0.9), (0.7, 0.9)], **NEAR)
 
 
 def test_a_part_of_the_avatar_lies_where_the_whole_has_it(gl: Any) -> None:

@@ -18,7 +18,7 @@ from trilane.pipeline.memory import BYTES, EdgeRegion
 from trilane.pipeline.unit_loop import UnitSpec
 from trilane.scene.staging import stage_scene
 from trilane.stages.avatar_assets import distinct, load_avatar, pack_assets
-from trilane.stages.config import RunConfig
+from trilane.stages.config import RunConfig, pose_dtype
 from trilane.transport.messages import JobPipeEnd
 from trilane.transport.packets import Packet, SlotLayout, header_dtype, view_packet
 
@@ -59,10 +59,15 @@ def spec_of(**changes: Any) -> UnitSpec:
     return UnitSpec(**{**values, **changes})
 
 
-def packets(header: np.dtype[Any], count: int) -> list[Packet]:
-    """`count` slots of 8 bytes in this process's own memory."""
-    layout = SlotLayout(header, 8)
+def packets(header: np.dtype[Any], count: int, payload_bytes: int = 8) -> list[Packet]:
+    """`count` slots of zeros in this process's own memory."""
+    layout = SlotLayout(header, payload_bytes)
     return [view_packet(memoryview(bytearray(layout.slot_bytes)), layout) for _ in range(count)]
+
+
+def packet(payload_bytes: int, avatars: int = 1) -> Packet:
+    """A slot of zeros that tells the pose of `avatars`."""
+    return packets(pose_dtype(avatars), 1, payload_bytes)[0]
 
 
 def assets_of(config: RunConfig) -> dict[str, NDArray[Any]]:

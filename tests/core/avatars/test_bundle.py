@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import dataclasses
 import json
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -19,24 +20,6 @@ from trilane.avatars.network_file import check_network
 from trilane.errors import BadInputError
 
 
-@pytest.fixture
-def copied(tiny_bundle, tmp_path):
-    return shutil.copytree(tiny_bundle, tmp_path / "copy")
-
-
-def edit(folder, **changes):
-    """Set keys of the manifest; a dotted key reaches inside (`network__width`)."""
-    path = folder / "manifest.json"
-    manifest = json.loads(path.read_text())
-    for key, value in changes.items():
-        *parents, last = key.split("__")
-        target = manifest
-        for parent in parents:
-            target = target[parent]
-        target[last] = value
-    path.write_text(json.dumps(manifest))
-
-
 def test_a_bundle_whose_parts_do_not_fit_is_not_written(tiny_bundle, tiny_quantised, tmp_path):
     manifest = Manifest(name="wrong", network=network_entry(tiny_quantised.network, "resnet18", "batch", 8))
     texture = np.zeros((4, 4, 6), np.float16)
@@ -45,47 +28,13 @@ def test_a_bundle_whose_parts_do_not_fit_is_not_written(tiny_bundle, tiny_quanti
     assert list(tmp_path.iterdir()) == []
 
 
-WRONG_MANIFEST = {
-    "scale text": ({"network__input": {"scale": "inf", "zero_point": 0}}, r"network\.input\.scale"),
-    "the folder itself": ({"texture": "."}, "outside the bundle"),
-    "missing": ({"network__file": "other.onnx"}, r"other\.onnx"),
-    "NaN": ({"betas": [float("nan")]}, "betas"),
-}
-
-
-@pytest.mark.parametrize("case", WRONG_MANIFEST)
-def test_wrong_manifests_are_named(copied, case):
-    changes, message = WRONG_MANIFEST[case]
-    edit(copied, **changes)
-    with pytest.raises(BadInputError, match=message):
-        load_bundle(copied)
-
-
-@pytest.mark.parametrize("text", ["", "{", "[]", '{"name": 1}', "[" * 100_000])
-def test_manifests_that_are_no_manifest(copied, text):
-    (copied / "manifest.json").write_text(text)
-    with pytest.raises(BadInputError, match=r"manifest\.json"):
-        load_bundle(copied)
-
-
-def test_a_missing_bundle_is_named(tmp_path):
-    with pytest.raises(BadInputError, match="nowhere"):
-        load_bundle(tmp_path / "nowhere")
-
-
-def test_a_link_out_of_the_bundle_is_refused(copied, tmp_path):
+def test_a_link_out_of_the_bundle_is_refused(tiny_bundle, tmp_path):
+    copied = shutil.copytree(tiny_bundle, tmp_path / "copy")
     (tmp_path / "body.npz").write_bytes((copied / "body.npz").read_bytes())
     (copied / "body.npz").unlink()
     (copied / "body.npz").symlink_to(tmp_path / "body.npz")
     with pytest.raises(BadInputError, match="outside the bundle"):
         load_bundle(copied)
-
-
-def test_a_truncated_texture_is_named(copied):
-    path = copied / "texture.npz"
-    path.write_bytes(path.read_bytes()[:200])
-    with pytest.raises(BadInputError, match=r"texture\.npz"):
-        load_bundle(copied).read_texture()
 
 
 def test_a_word_like_default_is_no_folder(tmp_path: Path) -> None:
@@ -134,6 +83,8 @@ LIMITS: list[tuple[dict[str, Any], str]] = [
     ({"name": "x" * 101}, f'name: found "{"x" * 56}... ('),
     ({"betas": [0] * 401}, "betas: found ["),
     ({"betas": [0, -100.1]}, "betas.1: found -100.1 ("),
+    ({"betas": [float("nan")]}, "betas.0: found "),
+    ({"network": {"input": {"scale": "inf", "zero_point": 0}}}, "network.input.scale: found "),
     ({"expression": [0] * 101}, "expression: found ["),
     ({"texture": 3}, "texture: found 3 ("),
     ({"more": "x" * 59}, f'more: found "{"x" * 56}... ('),
@@ -146,9 +97,14 @@ def test_limits_of_a_manifest_on_either_side(case: int) -> None:
     if not sentence:
         parse_manifest(manifest(**copy.deepcopy(changes)), Path("m"))
         return
-    with pytest.raises(BadInputError) as raised:
+    with pytest.raises(BadInputError, match=re.escape(f"m: {sentence}")):
         parse_manifest(manifest(**copy.deepcopy(changes)), Path("m"))
-    assert f"m: {sentence}" in str(raised.value)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", '{"name": 1}', "[" * 100_000])
+def test_manifests_that_are_no_manifest(text: str) -> None:
+    with pytest.raises(BadInputError, match=r"manifest\.json"):
+        parse_manifest(text, Path("manifest.json"))
 
 
 def test_the_entry_of_a_network() -> None:
@@ -193,8 +149,6 @@ def test_a_texture_of_bytes_is_scaled_by_channel(tmp_path: Path, scale: Any) -> 
 
 
 SHAPE = "expected (H, W, 3) with sides of 2 to 4096"
-
-
 SCALE = "an int8 texture without a usable scale, expected array 'scale', finite, shape (3,)"
 
 
@@ -253,9 +207,8 @@ def test_a_network_that_contradicts_its_manifest(tmp_path: Path) -> None:
         ({"output": {"scale": 0.25, "zero_point": 7}}, f" (output): {has_out} scale 0.25, zero point 7 by the manif"),
         ({"channels": 4}, ": found 3 channels, expected 4 by the manifest"),
     ):
-        with pytest.raises(BadInputError) as raised:
+        with pytest.raises(BadInputError, match=re.escape(f"{path}{sentence}")):
             with_entry(**entry).read_network()
-        assert f"{path}{sentence}" in str(raised.value)
 
 
 @pytest.mark.parametrize(
@@ -276,9 +229,8 @@ def test_files_of_a_bundle_lie_in_its_folder(tmp_path: Path, key: str, value: st
     else:
         content[key] = value
     path.write_text(json.dumps(content))
-    with pytest.raises(BadInputError) as raised:
+    with pytest.raises(BadInputError, match=re.escape(sentence)):
         load_bundle(tmp_path / "b")
-    assert sentence in str(raised.value)
 
 
 def test_a_bundle_with_a_wrong_network_is_not_written(tmp_path: Path) -> None:

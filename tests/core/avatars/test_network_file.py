@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -222,9 +223,8 @@ def test_a_wrong_network_is_refused_in_one_sentence(case: str) -> None:
     change, sentence = REFUSED[case]
     model = net()
     change(model)
-    with pytest.raises(BadInputError) as raised:
+    with pytest.raises(BadInputError, match=re.escape(f"here: found {sentence}")):
         check_network(model, "here")
-    assert f"here: found {sentence}" in str(raised.value)
 
 
 @pytest.mark.parametrize("scale", [1.01e-30, 0.99e30])
@@ -307,14 +307,6 @@ def test_names_and_constants_of_a_graph() -> None:
     constants = constants_of(model)
     assert {"in_scale", "w2", "made"} <= set(constants) and "conv1" not in constants
     assert numpy_helper.to_array(constants["made"]) == 3
-
-
-def test_a_truncated_file_is_named(tmp_path, tiny_quantised):
-    path = tmp_path / "network.onnx"
-    content = tiny_quantised.network.model.SerializeToString()
-    path.write_bytes(content[: len(content) // 2])
-    with pytest.raises(BadInputError, match=r"network\.onnx"):
-        read_network(path)
 
 
 # Network files by value: read, refused in whole sentences, and with tensors in files beside them.
@@ -411,6 +403,5 @@ def test_data_elsewhere_is_not_read(tmp_path: Path, location: str, sentence: str
     model = kept_outside(location)
     next(t for t in model.graph.initializer if t.name == "w1").external_data.add(key="offset", value="9")
     (folder / "a.onnx").write_bytes(model.SerializeToString())
-    with pytest.raises(BadInputError) as raised:
+    with pytest.raises(BadInputError, match=re.escape(sentence.format(above=tmp_path, folder=folder))):
         read_network(folder / "a.onnx")
-    assert sentence.format(above=tmp_path, folder=folder) in str(raised.value)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import dataclasses
 import io
 import pickle
+import re
 import zipfile
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -41,84 +41,23 @@ from trilane.errors import BadInputError
 Arrays = dict[str, NDArray[Any]]
 
 
-def save(path: Path, arrays: Arrays) -> Path:
-    np.savez_compressed(path, **arrays)
-    return path
-
-
-def load(tmp_path: Path, arrays: Arrays) -> Body:
-    return load_body(save(tmp_path / "body.npz", arrays))
-
-
-def test_reads_every_array(tmp_path: Path, body_arrays: Arrays) -> None:
-    """Arrays come back in their shapes, float32 and int32, and cannot be written to."""
-    body = load(tmp_path, body_arrays)
-    assert body.posedirs is not None
-    assert body.has_pose_blend_shapes
-    for ours, key in ((body.v_template, "v_template"), (body.posedirs, "posedirs"), (body.weights, "weights")):
-        np.testing.assert_array_equal(ours, body_arrays[key])
-        assert ours.dtype == np.float32
-        assert not ours.flags.writeable
-    np.testing.assert_array_equal(body.shape_dirs, body_arrays["shapedirs"][:, :, :10])
-    np.testing.assert_array_equal(body.expression_dirs, body_arrays["shapedirs"][:, :, 10:])
-    np.testing.assert_array_equal(body.uv_faces, body_arrays["ft"])
-    assert body.faces.dtype == np.int32
+def loaded(tmp_path: Path, arrays: Arrays) -> Body:
+    np.savez(tmp_path / "body.npz", allow_pickle=False, **arrays)
+    return load_body(tmp_path / "body.npz")
 
 
 def test_float64_and_column_order_are_read(tmp_path: Path, body_arrays: Arrays) -> None:
-    """Files in float64 and in Fortran order give the same body."""
     other = {k: np.asfortranarray(v.astype(np.float64)) if v.dtype.kind == "f" else v for k, v in body_arrays.items()}
-    ours, same = load(tmp_path, body_arrays), load(tmp_path, other)
+    ours, same = loaded(tmp_path, body_arrays), loaded(tmp_path, other)
     assert ours.posedirs is not None
     assert same.posedirs is not None
     np.testing.assert_array_equal(ours.posedirs, same.posedirs)
     np.testing.assert_array_equal(ours.v_template, same.v_template)
 
 
-def _without(key: str) -> Callable[[Arrays], None]:
-    return lambda arrays: arrays.__delitem__(key)
-
-
-def _with(key: str, value: Any) -> Callable[[Arrays], None]:
-    return lambda arrays: arrays.__setitem__(key, np.asarray(value))
-
-
-def _at(key: str, index: tuple[int, ...], value: float) -> Callable[[Arrays], None]:
-    return lambda arrays: arrays[key].__setitem__(index, value)
-
-
-#: What is done to a good file, and what the message must say.
-BROKEN: dict[str, tuple[Callable[[Arrays], None], str]] = {
-    "no uv": (_without("vt"), "no array 'vt'"),
-    "other vertex count": (_with("weights", np.ones((91, 55)) / 55), "weights"),
-    "no vertices": (_with("v_template", np.zeros((0, 3))), "shape|0 V"),
-    "NaN vertex": (_at("v_template", (3, 1), np.nan), "NaN"),
-    "NaN pose blend shape": (_at("posedirs", (3, 1, 7), np.nan), "NaN"),
-    "infinite weight": (_at("weights", (3, 1), np.inf), "NaN or infinity"),
-    "weights that sum to 2": (_at("weights", (5, 0), 2.0), "sum"),
-    "pose blend shapes of another body": (_with("posedirs", np.ones((91, 3, 486))), "posedirs"),
-    "pickled weights": (_with("weights", np.array([None, {}], dtype=object)), "pickled"),
-    "pickled pose blend shapes": (_with("posedirs", np.array([None], dtype=object)), "pickled"),
-    "skin of three numbers": (_with("skin", np.array([1, 2, 3])), "two integers"),
-    "skin of fractions": (_with("skin", np.array([1.0, 2.0])), "two integers"),
-    "skin without a vertex": (_with("skin", np.array([0, 2])), "1 to 90 vertices"),
-    "skin of too many faces": (_with("skin", np.array([90, 10**6])), "1 to 90 vertices, 1 to"),
-    "skin with a face of a garment": (_with("skin", np.array([1, 2])), "a face of the skin"),
-    "skin with a garment's joint": (_with("skin", np.array([89, 1])), "a joint that depends"),
-}
-
-
-@pytest.mark.parametrize("case", BROKEN)
-def test_broken_files_are_refused(tmp_path: Path, body_arrays: Arrays, case: str) -> None:
-    damage, words = BROKEN[case]
-    damage(body_arrays)
-    with pytest.raises(BadInputError, match=words) as caught:
-        load(tmp_path, body_arrays)
-    assert "body.npz" in str(caught.value)
-
-
 def test_files_that_are_no_archive(tmp_path: Path, body_arrays: Arrays) -> None:
-    whole = save(tmp_path / "whole.npz", body_arrays).read_bytes()
+    np.savez_compressed(tmp_path / "whole.npz", allow_pickle=False, **body_arrays)
+    whole = (tmp_path / "whole.npz").read_bytes()
     (tmp_path / "folder.npz").mkdir()
     contents = {"empty.npz": b"", "text.npz": b"body", "pickle.npz": pickle.dumps({"v_template": 1})}
     contents |= {f"cut{share}.npz": whole[: len(whole) * share // 10] for share in (1, 5, 9)}
@@ -142,7 +81,7 @@ def test_damaged_data_is_refused(tmp_path: Path, body_arrays: Arrays) -> None:
 def test_huge_header_takes_no_memory(tmp_path: Path, body_arrays: Arrays) -> None:
     for key in ("v_template", "posedirs"):
         path = tmp_path / f"{key}.npz"
-        save(path, {name: array for name, array in body_arrays.items() if name != key})
+        np.savez_compressed(path, **{name: array for name, array in body_arrays.items() if name != key})
         header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({10**12}, 3, 486), }}"
         header += " " * (63 - (10 + len(header)) % 64) + "\n"
         blob = b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header.encode()
@@ -152,12 +91,6 @@ def test_huge_header_takes_no_memory(tmp_path: Path, body_arrays: Arrays) -> Non
             load_body(path)
 
 
-@pytest.mark.parametrize("betas", [[0.0] * 11, [np.nan], [[1.0, 2.0]]])
-def test_bad_shapes_are_refused(tmp_path: Path, body_arrays: Arrays, betas: Any) -> None:
-    with pytest.raises(BadInputError, match="betas"):
-        load(tmp_path, body_arrays).shape(betas)
-
-
 def test_the_skin_is_the_body_without_its_garments(tmp_path: Path, body_arrays: Arrays) -> None:
     """The last ten vertices and the faces that use one of them are a garment; the skin has the same joints."""
     is_skin = (body_arrays["f"] < 80).all(axis=1)
@@ -165,10 +98,10 @@ def test_the_skin_is_the_body_without_its_garments(tmp_path: Path, body_arrays: 
     body_arrays["f"], body_arrays["ft"] = body_arrays["f"][order], body_arrays["ft"][order]
     body_arrays["J_regressor"][:, 80:] = 0
     faces = int(is_skin.sum())
-    whole = load(tmp_path, body_arrays).shape((1.0,), (0.5,))
+    whole = loaded(tmp_path, body_arrays).shape((1.0,), (0.5,))
     assert faces > 0 and whole.bare() is whole
     body_arrays["skin"] = np.array([80, faces])
-    dressed = load(tmp_path, body_arrays).shape((1.0,), (0.5,)).with_offsets(np.full((90, 3), 0.25, np.float32))
+    dressed = loaded(tmp_path, body_arrays).shape((1.0,), (0.5,)).with_offsets(np.full((90, 3), 0.25, np.float32))
     np.testing.assert_allclose(dressed.vertices, whole.vertices + 0.25, atol=2e-7)
     bare = dressed.bare()
     np.testing.assert_allclose(bare.vertices, whole.vertices[:80], atol=2e-7)
@@ -184,7 +117,7 @@ def test_the_skin_is_the_body_without_its_garments(tmp_path: Path, body_arrays: 
 
 
 def test_full_pose_adds_the_mean_hand(tmp_path: Path, body_arrays: Arrays) -> None:
-    body = load(tmp_path, body_arrays)
+    body = loaded(tmp_path, body_arrays)
     poses = np.zeros((2, 165))
     added = body.full_pose(poses, flat_hand_mean=False)
     mean = np.concatenate([body_arrays["hands_meanl"], body_arrays["hands_meanr"]])
@@ -216,16 +149,6 @@ head right_eye
 spine3 left_collar left_shoulder left_elbow left_wrist
 spine3 right_collar right_shoulder right_elbow right_wrist
 """
-
-
-def loaded(tmp_path: Path, arrays: Arrays) -> Body:
-    np.savez(tmp_path / "body.npz", allow_pickle=False, **arrays)
-    return load_body(tmp_path / "body.npz")
-
-
-@pytest.fixture
-def shaped(tmp_path: Path, body_arrays: Arrays) -> ShapedBody:
-    return loaded(tmp_path, body_arrays).shape()
 
 
 def test_joint_names_are_the_published_ones_in_their_order() -> None:
@@ -265,6 +188,9 @@ def test_every_array_of_the_file_is_where_its_name_says(tmp_path: Path, body_arr
     body = loaded(tmp_path, body_arrays)
     assert body.source == str(tmp_path / "body.npz")
     for ours, key in (
+        (body.v_template, "v_template"),
+        (body.posedirs, "posedirs"),
+        (body.weights, "weights"),
         (body.j_regressor, "J_regressor"),
         (body.faces, "f"),
         (body.uv, "vt"),
@@ -272,8 +198,10 @@ def test_every_array_of_the_file_is_where_its_name_says(tmp_path: Path, body_arr
         (body.hand_components[0], "hands_componentsl"),
         (body.hand_components[1], "hands_componentsr"),
     ):
+        assert ours is not None and not ours.flags.writeable
         np.testing.assert_array_equal(ours, body_arrays[key])
-        assert not ours.flags.writeable
+        assert ours.dtype == (np.int32 if key in ("f", "ft") else np.float32)
+    assert body.has_pose_blend_shapes
     np.testing.assert_array_equal(body.hand_mean[:45], body_arrays["hands_meanl"])
     np.testing.assert_array_equal(body.hand_mean[45:], body_arrays["hands_meanr"])
     assert body.parents.tolist() == [-1, *JOINT_PARENTS[1:]]
@@ -283,44 +211,55 @@ def test_every_array_of_the_file_is_where_its_name_says(tmp_path: Path, body_arr
     assert shaped.body is body
 
 
-#: What is done to a good file -> the whole sentence, without the path.
-SENTENCES: dict[str, tuple[str, Any, str]] = {
-    "no array": (
-        "f",
-        None,
-        "no array 'f', expected a body file in the SMPL-X layout (.npz); arrays that were found: J_regressor, ft",
-    ),
-    "dtype": ("vt", np.full((9, 2), "a"), "[vt]: found dtype <U1, expected numbers"),
-    "index dtype": ("f", np.zeros((5, 3)), "[f]: found dtype float64, expected integers"),
-    "uv": ("vt", np.zeros((130, 3)), "[vt]: found shape (130, 3), expected (130, 2)"),
-    "faces": ("ft", np.zeros((121, 3), int), "[ft]: found shape (121, 3), expected (120, 3)"),
-    "shape": ("shapedirs", np.zeros((90, 2, 20)), "[shapedirs]: found shape (90, 2, 20), expected (90, 3, *)"),
-    "regressor": ("J_regressor", np.zeros((54, 90)), "[J_regressor]: found shape (54, 90), expected (55, 90)"),
-    "tree": ("kintree_table", np.zeros((3, 55), int), "[kintree_table]: found shape (3, 55), expected (2, 55)"),
-    "left hand": ("hands_meanl", np.zeros(44), "[hands_meanl]: found shape (44,), expected (45)"),
-    "right hand": ("hands_meanr", np.zeros(46), "[hands_meanr]: found shape (46,), expected (45)"),
-    "left": ("hands_componentsl", np.zeros((6, 44)), "[hands_componentsl]: found shape (6, 44), expected (*, 45)"),
-    "right": ("hands_componentsr", np.zeros((6, 46)), "[hands_componentsr]: found shape (6, 46), expected (*, 45)"),
-    "too large": (
-        "J_regressor",
-        np.full((55, 90), 1e39),
-        "[J_regressor]: found NaN or infinity, expected finite numbers",
-    ),
-    "19 columns": (
-        "shapedirs",
-        np.zeros((90, 3, 19)),
-        "[shapedirs]: found 19 columns, expected 400 (betas, expression from 300) or 20 (from 10)",
-    ),
-}
+NEAR = "expected a body file in the SMPL-X layout (.npz); arrays that were found: "
+FINITE = "found NaN or infinity, expected finite numbers"
+#: An array, what stands in its place (None: nothing), and what the message says.
+BROKEN: list[tuple[str, Any, str]] = [
+    ("f", None, f"no array 'f', {NEAR}J_regressor, ft"),
+    ("vt", None, f"no array 'vt', {NEAR}J_regressor, f"),
+    ("vt", np.full((9, 2), "a"), "[vt]: found dtype <U1, expected numbers"),
+    ("f", np.zeros((5, 3)), "[f]: found dtype float64, expected integers"),
+    ("vt", np.zeros((130, 3)), "[vt]: found shape (130, 3), expected (130, 2)"),
+    ("ft", np.zeros((121, 3), int), "[ft]: found shape (121, 3), expected (120, 3)"),
+    ("v_template", np.zeros((0, 3)), "[shapedirs]: found shape (90, 3, 20), expected (0, 3, *)"),
+    ("weights", np.ones((91, 55)) / 55, "[weights]: found shape (91, 55), expected (90, 55)"),
+    ("posedirs", np.ones((91, 3, 486)), "[posedirs]: found shape (91, 3, 486), expected (90, 3, 486)"),
+    ("shapedirs", np.zeros((90, 2, 20)), "[shapedirs]: found shape (90, 2, 20), expected (90, 3, *)"),
+    ("J_regressor", np.zeros((54, 90)), "[J_regressor]: found shape (54, 90), expected (55, 90)"),
+    ("kintree_table", np.zeros((3, 55), int), "[kintree_table]: found shape (3, 55), expected (2, 55)"),
+    ("hands_meanl", np.zeros(44), "[hands_meanl]: found shape (44,), expected (45)"),
+    ("hands_meanr", np.zeros(46), "[hands_meanr]: found shape (46,), expected (45)"),
+    ("hands_componentsl", np.zeros((6, 44)), "[hands_componentsl]: found shape (6, 44), expected (*, 45)"),
+    ("hands_componentsr", np.zeros((6, 46)), "[hands_componentsr]: found shape (6, 46), expected (*, 45)"),
+    ("J_regressor", np.full((55, 90), 1e39), f"[J_regressor]: {FINITE}"),
+    ("v_template", np.where(np.eye(90, 3, -1), np.nan, 0.0), f"[v_template]: {FINITE}"),
+    ("weights", np.where(np.eye(90, 55, 1), np.inf, 0.0), f"[weights]: {FINITE}"),
+    ("shapedirs", np.zeros((90, 3, 19)), "found 19 columns, expected 400 (betas, expression from 300) or 20 (from 10)"),
+    ("skin", np.array([1, 2, 3]), "two integers"),
+    ("skin", np.array([1.0, 2.0]), "two integers"),
+    ("skin", np.array([0, 2]), "1 to 90 vertices"),
+    ("skin", np.array([90, 10**6]), "1 to 90 vertices, 1 to"),
+    ("skin", np.array([1, 2]), "a face of the skin"),
+    ("skin", np.array([89, 1]), "a joint that depends"),
+]
 
 
-@pytest.mark.parametrize("case", SENTENCES)
-def test_a_broken_file_is_refused_in_one_sentence(tmp_path: Path, body_arrays: Arrays, case: str) -> None:
-    key, value, sentence = SENTENCES[case]
+@pytest.mark.parametrize(("key", "value", "sentence"), BROKEN)
+def test_a_broken_file_is_refused_in_one_sentence(
+    tmp_path: Path, body_arrays: Arrays, key: str, value: Any, sentence: str
+) -> None:
     arrays = {name: array for name, array in body_arrays.items() if name != key}
-    with pytest.raises(BadInputError) as raised:
+    with pytest.raises(BadInputError, match=re.escape(sentence)) as raised:
         loaded(tmp_path, arrays if value is None else arrays | {key: value})
-    assert sentence in str(raised.value)
+    assert "body.npz" in str(raised.value)
+
+
+@pytest.mark.parametrize("key", ["weights", "posedirs"])
+def test_pickled_arrays_are_not_read(tmp_path: Path, body_arrays: Arrays, key: str) -> None:
+    pickled: Any = body_arrays | {key: np.array([None, {}], dtype=object)}
+    np.savez(tmp_path / "body.npz", **pickled)
+    with pytest.raises(BadInputError, match=r"body.npz.*pickled"):
+        load_body(tmp_path / "body.npz")
 
 
 def changed(arrays: Arrays, key: str, index: tuple[int, ...], value: float) -> Arrays:
@@ -333,9 +272,9 @@ def test_indices_may_reach_the_last_vertex_and_no_further(tmp_path: Path, body_a
     signed = body_arrays | {key: body_arrays[key].astype(np.int64) for key in ("f", "ft")}
     for key, last, of in (("f", 89, "vertices"), ("ft", 129, "texture coordinates")):
         loaded(tmp_path, changed(changed(signed, key, (0, 0), last), key, (0, 1), 0))
-        with pytest.raises(BadInputError) as raised:
+        said = f"[{key}]: found indices from 0 to {last + 1}, expected 0 to {last}, the {of}"
+        with pytest.raises(BadInputError, match=re.escape(said)):
             loaded(tmp_path, changed(changed(signed, key, (0, 0), last + 1), key, (0, 1), 0))
-        assert f"[{key}]: found indices from 0 to {last + 1}, expected 0 to {last}, the {of}" in str(raised.value)
         with pytest.raises(BadInputError, match="indices from -1 to"):
             loaded(tmp_path, changed(signed, key, (0, 0), -1))
 
@@ -389,6 +328,7 @@ def test_coefficients_up_to_the_last_column(tmp_path: Path, body_arrays: Arrays)
     np.testing.assert_allclose(body.shape(2.0).vertices, body.shape([2.0]).vertices)
     for name, wrong, found in (
         ("betas", {"betas": np.ones(11)}, "an array of shape (11,)"),
+        ("betas", {"betas": [[1.0, 2.0]]}, "an array of shape (1, 2)"),
         ("expression", {"expression": np.ones(11)}, "an array of shape (11,)"),
         ("expression", {"expression": [np.inf]}, "NaN or infinity"),
     ):
@@ -430,9 +370,8 @@ WRONG_BLEND = {
 @pytest.mark.parametrize("case", WRONG_BLEND)
 def test_wrong_pose_blend_shapes_are_refused(tmp_path: Path, case: str) -> None:
     array, sentence = WRONG_BLEND[case]
-    with pytest.raises(BadInputError) as raised:
+    with pytest.raises(BadInputError, match=re.escape(sentence)):
         read_pose_blend(npz_with(tmp_path / "a.npz", array), (7, 3, 2))
-    assert sentence in str(raised.value)
 
 
 def test_pose_blend_shapes_have_a_largest_size_and_all_their_bytes(
@@ -476,9 +415,8 @@ def test_numbers_below_a_million_are_posed() -> None:
         ((pose,), "pose: found NaN, infinity or a huge number, expected joint angles below 1e6 rad"),
         ((np.zeros(165), [1.001e6, 0, 0]), "place of the body: found NaN, infinity or a huge number, expected metres"),
     ):
-        with pytest.raises(BadInputError) as raised:
+        with pytest.raises(BadInputError, match=re.escape(sentence)):
             skeleton.pose(*arguments)
-        assert sentence in str(raised.value)
 
 
 # --- skinning ---

@@ -34,17 +34,8 @@ from trilane.scene.crop import Rect, cheapest_within, error_px, least_w, stretch
 from trilane.scene.rotations import about
 from trilane.stages.cpu.pose import FINEST, ModelledBody, widened
 
-Arrays = dict[str, NDArray[Any]]
-
-
-@pytest.fixture
-def shaped(tmp_path: Path, body_arrays: Arrays) -> ShapedBody:
-    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
-    return load_body(tmp_path / "body.npz").shape()
-
 
 def test_largest_weights_are_kept_and_renormalised(shaped: ShapedBody) -> None:
-    """Largest first, rows sum to 1, ratios as they were."""
     weights = shaped.body.weights
     top = largest_weights(weights, 4)
     assert top.joints.shape == top.weights.shape == (len(weights), 4)
@@ -59,7 +50,6 @@ def test_largest_weights_are_kept_and_renormalised(shaped: ShapedBody) -> None:
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32 - 1), spread=st.floats(0.0, 4.0))
 def test_no_pose_breaks_the_bound(shaped: ShapedBody, seed: int, spread: float) -> None:
-    """Random poses of every size, half turns among them, move no vertex further than the bound says."""
     random = np.random.default_rng(seed)
     pose = random.normal(0.0, spread, (55, 3))
     flipped = random.random(55) < 0.3
@@ -72,7 +62,6 @@ def test_no_pose_breaks_the_bound(shaped: ShapedBody, seed: int, spread: float) 
 
 
 def test_bound_is_positive_where_weights_are_left_out(shaped: ShapedBody) -> None:
-    """The bound is above 0 for vertices that lose weights, and 0 for the others."""
     bound = weight_error_bound(shaped, 4)
     lost = (shaped.body.weights > 0).sum(axis=1) > 4
     assert (bound[lost] > 0).all()
@@ -162,9 +151,8 @@ def test_no_pose_and_no_view_breaks_the_bounds(blended: ShapedBody) -> None:
     check_bounds(blended, FEW, seed=1)
 
 
-def test_nor_do_those_of_the_default_body() -> None:
-    default = Path(__file__).resolve().parents[3] / "avatars" / "default" / "body.npz"
-    check_bounds(load_body(default).shape(), FEW // 10, seed=2)
+def test_nor_do_those_of_the_default_body(body: ShapedBody) -> None:
+    check_bounds(body, FEW // 10, seed=2)
 
 
 @pytest.mark.slow
@@ -178,7 +166,7 @@ def test_at_rest_only_rounding_is_left(blended: ShapedBody) -> None:
     assert DetailBounds(blended).metres(posed) == [ROUNDING_M] * (len(DETAILS) - 1) + [0.0]
 
 
-def test_a_bound_by_hand(tiny_shaped: ShapedBody) -> None:
+def test_a_bound_by_hand(shaped: ShapedBody) -> None:
     """One joint, the left elbow, is turned by a right angle; only vertices that lose or gain weight of it can move.
 
     sum over b has one term, |E_b| 2 sin(45 degrees) |p - c_b|, of the vertex that has most of it.
@@ -186,20 +174,20 @@ def test_a_bound_by_hand(tiny_shaped: ShapedBody) -> None:
     elbow = JOINT_INDEX["left_elbow"]
     pose = np.zeros((JOINTS, 3))
     pose[elbow] = 0.0, 0.0, math.pi / 2
-    posed = Skeleton(tiny_shaped.joints, tiny_shaped.body.parents).pose(pose)
-    below = [j for j in range(JOINTS) if _is_below(tiny_shaped, j, elbow)]
-    distance = np.linalg.norm(tiny_shaped.vertices - tiny_shaped.joints[elbow], axis=1)
-    for detail, bound in zip(DETAILS[:-1], DetailBounds(tiny_shaped).metres(posed), strict=False):
-        change = (detail.weights(tiny_shaped).astype(np.float64) - tiny_shaped.body.weights)[:, below].sum(axis=1)
+    posed = Skeleton(shaped.joints, shaped.body.parents).pose(pose)
+    below = [j for j in range(JOINTS) if _is_below(shaped, j, elbow)]
+    distance = np.linalg.norm(shaped.vertices - shaped.joints[elbow], axis=1)
+    for detail, bound in zip(DETAILS[:-1], DetailBounds(shaped).metres(posed), strict=False):
+        change = (detail.weights(shaped).astype(np.float64) - shaped.body.weights)[:, below].sum(axis=1)
         moved = np.abs(change) * 2 * math.sin(math.pi / 4) * distance
-        blend = _blend_by_hand(tiny_shaped, elbow) if not detail.pose_blend else np.zeros(len(moved))
+        blend = _blend_by_hand(shaped, elbow) if not detail.pose_blend else np.zeros(len(moved))
         assert bound >= (moved + blend).max() + ROUNDING_M - 1e-7
         assert (
             bound
             <= moved.max()
             + blend.max()
             + ROUNDING_M
-            + np.abs(change).max() * _blend_by_hand(tiny_shaped, elbow).max() * math.sqrt(2.0)
+            + np.abs(change).max() * _blend_by_hand(shaped, elbow).max() * math.sqrt(2.0)
             + 1e-9
         )
 
@@ -218,12 +206,6 @@ def _blend_by_hand(shaped: ShapedBody, joint: int) -> F64:
         return np.zeros(len(shaped.vertices))
     block = shaped.body.posedirs.reshape(-1, 3, JOINTS - 1, 9)[:, :, joint - 1]
     return np.asarray(2.0 * np.sqrt((block.astype(np.float64) ** 2).sum(axis=(1, 2))))
-
-
-@pytest.fixture
-def tiny_shaped(tmp_path: Path, body_arrays: dict[str, NDArray[Any]]) -> ShapedBody:
-    np.savez(tmp_path / "tiny.npz", allow_pickle=False, **body_arrays)
-    return load_body(tmp_path / "tiny.npz").shape()
 
 
 def test_hands_and_face_are_carried_by_wrist_and_head() -> None:
@@ -266,9 +248,9 @@ def test_pixels_by_hand() -> None:
     assert error_px(0.01, stretch, -3.0) == math.inf
 
 
-def test_the_least_w_by_hand(tiny_shaped: ShapedBody) -> None:
+def test_the_least_w_by_hand(shaped: ShapedBody) -> None:
     """W = 5 - z; with a reach of 0.25 m about the joint nearest to the camera, and 0.05 of blend shapes."""
-    posed = Skeleton(tiny_shaped.joints, tiny_shaped.body.parents).pose(np.zeros((JOINTS, 3)))
+    posed = Skeleton(shaped.joints, shaped.body.parents).pose(np.zeros((JOINTS, 3)))
     reach = np.full(JOINTS, 0.25)
     nearest = float(posed.joints[:, 2].max())
     assert least_w(posed, straight_clip(5.0), reach, 0.05) == pytest.approx(5.0 - nearest - 0.3)

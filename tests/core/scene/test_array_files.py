@@ -277,16 +277,11 @@ def walk() -> Motion:
     return walk_wave_turn()
 
 
-def saved_and_read(path: Path, array: np.ndarray) -> RawMotion:
-    np.save(path, array)
-    return load_npy(path)
-
-
 def test_limbs_point_where_the_places_say(tmp_path: Path, walk: Motion) -> None:
     """Places of a walk with waving and turning; the poses that are read put the limbs there again."""
     frames = slice(0, 600, 12)
     truth = places_of(walk.poses[frames], walk.translation[frames])
-    raw = saved_and_read(tmp_path / "a.npy", truth.astype(np.float32))
+    raw = read(save(tmp_path / "a.npy", truth.astype(np.float32)))
     assert raw.translation is not None
     again = places_of(raw.poses, raw.translation)
     wanted, found = limb_directions(truth), limb_directions(again)
@@ -304,17 +299,17 @@ def test_limbs_point_where_the_places_say(tmp_path: Path, walk: Motion) -> None:
 
 def test_flat_rows_and_more_joints_are_read_alike(tmp_path: Path, walk: Motion) -> None:
     truth = places_of(walk.poses[:100:20], walk.translation[:100:20])
-    raw = saved_and_read(tmp_path / "a.npy", truth)
+    raw = read(save(tmp_path / "a.npy", truth))
     hands = np.concatenate([truth, truth[:, 20:22] + 0.08], axis=1)
     for array in (truth.reshape(len(truth), 66), hands, hands.reshape(len(truth), 72)):
-        assert saved_and_read(tmp_path / "a.npy", array).poses == pytest.approx(raw.poses)
+        assert read(save(tmp_path / "a.npy", array)).poses == pytest.approx(raw.poses)
 
 
 def test_frames_with_damaged_places_are_left_out_later(tmp_path: Path, walk: Motion) -> None:
     truth = places_of(walk.poses[:200:20], walk.translation[:200:20])
     truth[3, 5] = np.nan
     truth[4, 5] += 2.0  # a shin of two metres
-    raw = saved_and_read(tmp_path / "a.npy", truth)
+    raw = read(save(tmp_path / "a.npy", truth))
     bad = np.isnan(raw.poses).all(axis=(1, 2))
     assert np.flatnonzero(bad).tolist() == [3, 4]
 
@@ -353,6 +348,6 @@ def test_a_pose_at_random_is_never_taken_for_places(seed: int, size: float, mirr
 ])  # fmt: skip
 def test_what_others_save_is_refused_with_a_way(tmp_path: Path, shape: tuple[int, ...], way: str) -> None:
     with pytest.raises(BadInputError) as raised:
-        saved_and_read(tmp_path / "a.npy", np.zeros(shape))
+        read(save(tmp_path / "a.npy", np.zeros(shape)))
     assert f"found shape {shape}, expected (T, 66), (T, 72), (T, 156) or (T, 165), axis-angle; " in str(raised.value)
     assert way in str(raised.value)

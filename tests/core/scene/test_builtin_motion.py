@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.avatars.bundle import bundle_folder
-from trilane.body.body import ShapedBody, load_body
+from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINT_INDEX, Skeleton
 from trilane.scene.motion import builtin
 from trilane.scene.motion.builtin import (
@@ -31,11 +30,6 @@ from trilane.scene.rotations import about, matrix_from_rotvec, rotvec_from_matri
 from trilane.scene.schema import AvatarSpec
 
 RATE = 60
-
-
-@pytest.fixture(scope="module")
-def body() -> ShapedBody:
-    return load_body(bundle_folder("default") / "body.npz").shape()
 
 
 @pytest.fixture(scope="module")

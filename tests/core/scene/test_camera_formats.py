@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from support.camera_files import (
@@ -177,9 +178,8 @@ def test_record3d_without_times_and_lenses_of_frames(tmp_path: Path) -> None:
         ("frameTimestamps", ["x"], "frameTimestamps: found something else than numbers"),
     ):
         path.write_text(json.dumps({**content, key: value}))
-        with pytest.raises(BadInputError) as raised:
+        with pytest.raises(BadInputError, match=re.escape(f"{path}: {sentence}")):
             load(path)
-        assert f"{path}: {sentence}" in str(raised.value)
 
 
 def test_kitti_times(tmp_path: Path) -> None:
@@ -367,9 +367,8 @@ def test_broken_text_models_are_refused(tmp_path: Path, case: str) -> None:
     cameras, images, sentence = BROKEN_TEXT[case]
     (tmp_path / "cameras.txt").write_text(cameras)
     (tmp_path / "images.txt").write_text(images)
-    with pytest.raises(BadInputError) as raised:
+    with pytest.raises(BadInputError, match=re.escape(sentence)):
         load(tmp_path)
-    assert sentence in str(raised.value)
 
 
 #: Name of a file -> its text, what is said.
@@ -424,43 +423,6 @@ def test_real_logs_are_what_they_are(shared_data: Path) -> None:
     assert "Z up" in tum.notes and any("1 gap, the longest 110 ms" in note for note in tum.notes)
     for camera in (arkit, tum):
         assert np.median(matrix_from_quat(camera.quats)[:, 1, 1]) > 0.6
-
-
-def damaged(draw: st.DataObject, content: bytes) -> bytes:
-    """`content` cut, or with some bytes changed."""
-    cut = content[: draw.draw(st.integers(0, len(content)))]
-    spots = draw.draw(st.lists(st.tuples(st.integers(0, max(len(cut) - 1, 0)), st.integers(0, 255)), max_size=6))
-    changed = bytearray(cut)
-    for at, byte in spots if changed else ():
-        changed[at] = byte
-    return bytes(changed)
-
-
-def check_damaged(folder: Path, draw: Any) -> None:
-    kind = draw.draw(st.sampled_from(sorted(WRITERS)))
-    path = WRITERS[kind](folder, TURNS, PLACES)
-    files = [path] if path.is_file() else sorted(file for file in path.rglob("*") if file.is_file())
-    victim = draw.draw(st.sampled_from(files))
-    victim.write_bytes(damaged(draw, victim.read_bytes()))
-    try:
-        camera = load(path)
-    except BadInputError as error:
-        assert str(folder) in str(error)
-    else:
-        assert np.isfinite(camera.places).all() and np.isfinite(camera.quats).all()
-
-
-@given(st.data())
-@settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_damaged_files_are_read_or_refused(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
-    check_damaged(tmp_path_factory.mktemp("any"), data)
-
-
-@pytest.mark.slow
-@given(st.data())
-@settings(max_examples=2000, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_many_damaged_files(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
-    check_damaged(tmp_path_factory.mktemp("any"), data)
 
 
 def test_columns_that_hold_no_quaternion_are_refused_with_those_that_may(tmp_path: Path) -> None:
@@ -612,9 +574,8 @@ def test_a_wrong_nerf_file_is_refused_in_one_sentence(tmp_path: Path, case: str)
     content, sentence = REFUSED_KEYS[case]
     path = tmp_path / "a.json"
     path.write_text(json.dumps(content))
-    with pytest.raises(BadInputError) as raised:
+    with pytest.raises(BadInputError, match=re.escape(f"{path}{sentence}")):
         load(path)
-    assert f"{path}{sentence}" in str(raised.value)
 
 
 def _pushed_in(rows: int = 40) -> tuple[np.ndarray, np.ndarray]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -456,9 +457,8 @@ def test_a_unit_of_column_names_that_the_scene_contradicts_is_refused(tmp_path: 
 )
 def test_units_of_column_names_that_are_unknown_or_differ_are_refused(tmp_path: Path, head: str, sentence: str) -> None:
     (tmp_path / "a.csv").write_text(three_poses(head))
-    with pytest.raises(BadInputError) as refused:
+    with pytest.raises(BadInputError, match=re.escape(sentence)):
         load(tmp_path / "a.csv")
-    assert sentence in str(refused.value)
 
 
 def test_units_of_a_table_of_matrices_count(tmp_path: Path) -> None:

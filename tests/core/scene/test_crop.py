@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,14 +11,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from trilane.arrays import F64, shape_buckets
-from trilane.body.body import ShapedBody, load_body
+from trilane.body.body import ShapedBody
 from trilane.body.joints import Skeleton, rodrigues
 from trilane.body.skinning import CpuSkinner
 from trilane.errors import BadInputError
 from trilane.scene.crop import SCREEN, Rect, choose_bucket, crop_projection
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 
-DEFAULT = Path(__file__).resolve().parents[3] / "avatars" / "default" / "body.npz"
 SLACK = 1e-9
 
 sides = st.floats(-1, 1).flatmap(lambda a: st.tuples(st.just(a), st.floats(-1, 1))).map(sorted)
@@ -95,14 +92,9 @@ def test_cropped_projection_is_an_exact_affine_map(rect: Rect, seed: int) -> Non
 # --- the mesh's rectangle ------------------------------------------------------------------------------------------
 
 
-@cache
-def default_body() -> ShapedBody:
-    return load_body(DEFAULT).shape()
-
-
-@cache
-def default_bounds() -> MeshBounds:
-    return MeshBounds(default_body())
+@pytest.fixture(scope="module")
+def bounds(body: ShapedBody) -> MeshBounds:
+    return MeshBounds(body)
 
 
 def perspective(fov: float, aspect: float, near: float, far: float, shift: tuple[float, float] = (0.0, 0.0)) -> F64:
@@ -177,26 +169,24 @@ def assert_holds(rect: Rect | None, seen: F64) -> None:
         assert (high <= np.array([rect.x1, rect.y1]) + 1e-6).all()
 
 
-def test_nothing_on_screen_falls_outside() -> None:
+def test_nothing_on_screen_falls_outside(body: ShapedBody, bounds: MeshBounds) -> None:
     """400 random poses, cameras and lenses: every visible point of the surface is in the rectangle."""
     random = np.random.default_rng(2)
-    shaped, bounds = default_body(), default_bounds()
-    skeleton, skinner = Skeleton(shaped.joints, shaped.body.parents), CpuSkinner(shaped)
+    skeleton, skinner = Skeleton(body.joints, body.body.parents), CpuSkinner(body)
     visible = 0
     for _ in range(400):
         posed, clip = skeleton.pose(random_pose(random)), random_clip(random)
         vertices = skinner.vertices(posed)
-        seen = visible_points(surface_points(vertices, shaped.body.faces, random), clip)
+        seen = visible_points(surface_points(vertices, body.body.faces, random), clip)
         assert_holds(bounds.rect(posed, clip), seen)
         assert_holds(bounds.rect(posed, clip, vertices.astype(np.float32)), seen)
         visible += bool(len(seen))
     assert visible > 200
 
 
-def test_rectangle_is_tight_on_whole_bodies() -> None:
+def test_rectangle_is_tight_on_whole_bodies(body: ShapedBody, bounds: MeshBounds) -> None:
     random = np.random.default_rng(3)
-    shaped, bounds = default_body(), default_bounds()
-    skeleton, skinner = Skeleton(shaped.joints, shaped.body.parents), CpuSkinner(shaped)
+    skeleton, skinner = Skeleton(body.joints, body.body.parents), CpuSkinner(body)
     view = np.eye(4)
     view[2, 3] = -5.0
     clip = perspective(np.radians(40), 4 / 3, 0.05, 100.0) @ view
@@ -211,11 +201,10 @@ def test_rectangle_is_tight_on_whole_bodies() -> None:
         np.testing.assert_allclose(quick, expected, atol=1e-4)
 
 
-def test_wasted_area_of_whole_bodies() -> None:
+def test_wasted_area_of_whole_bodies(body: ShapedBody, bounds: MeshBounds) -> None:
     """The tensor's area outside the mesh's own rectangle: at most 20 % in the median full-body view."""
     random = np.random.default_rng(4)
-    shaped, bounds = default_body(), default_bounds()
-    skeleton = Skeleton(shaped.joints, shaped.body.parents)
+    skeleton = Skeleton(body.joints, body.body.parents)
     wasted = []
     while len(wasted) < 200:
         view = np.eye(4)
@@ -229,10 +218,9 @@ def test_wasted_area_of_whole_bodies() -> None:
     assert np.median(wasted) <= 0.20
 
 
-def test_nothing_visible_gives_nothing() -> None:
+def test_nothing_visible_gives_nothing(body: ShapedBody, bounds: MeshBounds) -> None:
     """Behind the camera, beside the screen, beyond the far plane; and a camera inside the body sees it."""
-    shaped, bounds = default_body(), default_bounds()
-    posed = Skeleton(shaped.joints, shaped.body.parents).pose(np.zeros(165))
+    posed = Skeleton(body.joints, body.body.parents).pose(np.zeros(165))
     lens = perspective(0.8, 1.0, 0.05, 100.0)
     for place in ([0, 0, 3.0], [9.0, 0, -3.0], [0, -9.0, -3.0], [0, 0, -200.0]):
         view = np.eye(4)
@@ -243,15 +231,14 @@ def test_nothing_visible_gives_nothing() -> None:
     assert inside.width > 1.5
 
 
-def test_standoff_widens_the_rectangle() -> None:
+def test_standoff_widens_the_rectangle(body: ShapedBody) -> None:
     """Points that stand off the mesh by the distance, in any direction, are inside; none is inside by chance."""
     random = np.random.default_rng(5)
-    shaped = default_body()
-    near, far = MeshBounds(shaped), MeshBounds(shaped, standoff_m=0.05)
-    skeleton, skinner = Skeleton(shaped.joints, shaped.body.parents), CpuSkinner(shaped)
+    near, far = MeshBounds(body), MeshBounds(body, standoff_m=0.05)
+    skeleton, skinner = Skeleton(body.joints, body.body.parents), CpuSkinner(body)
     for _ in range(50):
         posed, clip = skeleton.pose(random_pose(random)), random_clip(random)
-        away = random.normal(0, 1, (len(shaped.vertices), 3))
+        away = random.normal(0, 1, (len(body.vertices), 3))
         away *= 0.05 / np.linalg.norm(away, axis=1, keepdims=True)
         assert_holds(far.rect(posed, clip), visible_points(skinner.vertices(posed) + away, clip))
         tight, wide = near.rect(posed, clip), far.rect(posed, clip)
@@ -261,10 +248,8 @@ def test_standoff_widens_the_rectangle() -> None:
             assert wide.height >= tight.height
 
 
-def test_pose_blend_shapes_and_fewer_weights(tmp_path: Path, body_arrays: dict[str, NDArray[Any]]) -> None:
+def test_pose_blend_shapes_and_fewer_weights(shaped: ShapedBody) -> None:
     """A body with pose blend shapes, drawn with 4 weights: the rectangle is that of what is drawn."""
-    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
-    shaped = load_body(tmp_path / "body.npz").shape()
     random = np.random.default_rng(6)
     bounds, skinner = MeshBounds(shaped, weight_count=4), CpuSkinner(shaped, 4)
     skeleton = Skeleton(shaped.joints, shaped.body.parents)

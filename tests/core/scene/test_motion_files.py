@@ -12,8 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from support.joint_chain import chained_places, degrees_between, limb_directions
 from trilane.errors import BadInputError
@@ -23,97 +21,20 @@ from trilane.scene.motion.motion import REST_PELVIS, SMPL_REST_PELVIS, T_POSE, M
 from trilane.scene.rotations import about, matrix_from_rotvec, rotvec_from_matrix
 from trilane.scene.schema import AvatarSpec, scene_from
 
-HALF = np.pi / 2
-
 
 def load(path: Path | str, **spec: Any) -> Motion:
     return load_motion(AvatarSpec(motion=str(path), **spec), Path("/"))
 
 
-def poses(frames: int = 4, up: str = "y") -> np.ndarray:
-    array = np.zeros((frames, 165))
-    array[:, 0] = HALF if up == "z" else 0.0
-    array[:, 48:51] = np.linspace(0, 0.3, frames)[:, None]
-    return array
-
-
-def save_npz(path: Path, **arrays: Any) -> Path:
-    np.savez(path, **arrays)
-    return path
-
-
-def amass(path: Path, width: int = 165, key: str = "mocap_frame_rate", **extra: Any) -> Path:
-    frames = 6
-    array = np.zeros((frames, width))
-    array[:, 0] = HALF
-    array[:, -3:] = 0.5
-    trans = np.column_stack([np.linspace(0, 1, frames), np.zeros(frames), np.full(frames, 0.9)])
-    return save_npz(path, **{"poses": array, "trans": trans, "betas": np.ones(16), key: np.array(60.0), **extra})
-
-
-def test_objects_truncated_and_huge_files_are_refused_unread(tmp_path: Path) -> None:
-    pickled, cut, huge, empty = (tmp_path / f"{name}.npy" for name in ("pickled", "cut", "huge", "empty"))
-    np.save(pickled, np.array([{}]), allow_pickle=True)
-    np.save(cut, poses(100))
-    cut.write_bytes(cut.read_bytes()[:500])
-    with huge.open("wb") as file:
-        np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (10**9, 165)})
-    empty.write_bytes(b"")
-    for path, found in (
-        (pickled, "found nothing, expected a motion"),
-        (cut, "truncated"),
-        (huge, "at most"),
-        (empty, "an empty file"),
-    ):
-        with pytest.raises(BadInputError, match=found):
-            load(path)
-
-
-def test_missing_folders_and_unknown_endings_are_refused(tmp_path: Path) -> None:
+def test_a_folder_and_an_npz_of_a_pickle_are_refused(tmp_path: Path) -> None:
     (tmp_path / "folder.npy").mkdir()
-    (tmp_path / "a.fbx").write_text("x")
-    for name, found in (("none.npy", "no such file"), ("folder.npy", "a folder"), ("a.fbx", "the ending '.fbx'")):
-        with pytest.raises(BadInputError, match=found):
-            load(tmp_path / name)
-    with pytest.raises(BadInputError, match="walk-wave-turn"):
-        load("builtin:dance")
-
-
-def test_an_npz_without_its_keys_or_damaged_is_refused(tmp_path: Path) -> None:
-    path = save_npz(tmp_path / "a.npz", poses=np.zeros((3, 165)))
-    with pytest.raises(BadInputError, match="no frame rate"):
-        load(path)
-    save_npz(path, trans=np.zeros((3, 3)))
-    with pytest.raises(BadInputError, match="found arrays trans, expected a motion: `poses`"):
-        load(path)
-    path.write_bytes(amass(tmp_path / "b.npz").read_bytes()[:900])
-    with pytest.raises(BadInputError, match=r"no readable \.npz"):
-        load(path)
+    with pytest.raises(BadInputError, match="a folder"):
+        load(tmp_path / "folder.npy")
+    path = tmp_path / "a.npz"
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("poses.npy", pickle.dumps({}))
     with pytest.raises(BadInputError, match=r"no readable \.npz"):
         load(path)
-
-
-@pytest.mark.parametrize("name", ["a.npy", "a.npz"])
-@given(st.lists(st.tuples(st.integers(0, 300), st.integers(0, 255)), min_size=1, max_size=6))
-@settings(max_examples=60)
-def test_damaged_arrays_are_read_or_refused(
-    tmp_path_factory: pytest.TempPathFactory, name: str, changes: list[tuple[int, int]]
-) -> None:
-    path = tmp_path_factory.mktemp("damaged") / name
-    if name == "a.npy":
-        np.save(path, poses())
-    else:
-        amass(path)
-    content = bytearray(path.read_bytes())
-    for place, value in changes:
-        content[place] = value
-    path.write_bytes(content)
-    try:
-        load(path)
-    except BadInputError as error:
-        assert name in str(error)
 
 
 def test_real_smplx_poses_stand_up(shared_data: Path) -> None:

@@ -11,8 +11,7 @@ import pytest
 
 from support.camera_files import OPTICAL, write_tum
 from trilane.arrays import F64
-from trilane.avatars.bundle import bundle_folder
-from trilane.body.body import ShapedBody, load_body
+from trilane.body.body import ShapedBody
 from trilane.body.joints import Skeleton
 from trilane.errors import BadInputError
 from trilane.scene.camera.files import load_camera
@@ -27,11 +26,6 @@ from trilane.scene.schema import AvatarSpec, CameraSpec, Scene
 from trilane.scene.staging import Staged, require_person, stage_scene, staged_from_arrays, staged_to_arrays
 
 OUTPUT = (480, 640)
-
-
-@pytest.fixture(scope="module")
-def body() -> ShapedBody:
-    return load_body(bundle_folder("default") / "body.npz").shape()
 
 
 def jump() -> Motion:

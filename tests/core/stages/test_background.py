@@ -38,15 +38,6 @@ def test_folder_is_shown_in_order_and_again(tmp_path: Path) -> None:
     assert background.at(0.4) is None
 
 
-BAD_FILES = {
-    "missing.mp4": None,
-    "empty.mp4": b"",
-    "text.mp4": b"hello",
-    "text.png": b"hello",
-    "cut.png": b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR",
-}
-
-
 @pytest.fixture(scope="module")
 def ramp(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two seconds of video at 30 frames a second, a key frame every 10; frame N has the grey value 40 + 3 N."""
@@ -80,20 +71,6 @@ def test_every_frame_of_a_video_is_shown_at_its_own_time(ramp: Path, numbers: Se
         assert picture is not None
         assert float(picture.mean()) == pytest.approx(40 + 3 * (number % 60), abs=2), number
     reader.close()
-
-
-@pytest.mark.parametrize("name", BAD_FILES)
-def test_bad_files_are_named(tmp_path: Path, name: str) -> None:
-    content = BAD_FILES[name]
-    if content is not None:
-        (tmp_path / name).write_bytes(content)
-    with pytest.raises(BadInputError, match=name.replace(".", r"\.")):
-        open_background(tmp_path / name, (8, 8), 30).close()
-
-
-def test_folder_without_pictures_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(BadInputError, match=r"\.png"):
-        open_background(tmp_path, (8, 8), 30)
 
 
 class Turned:

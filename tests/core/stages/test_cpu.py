@@ -10,7 +10,7 @@ import av
 import numpy as np
 import pytest
 
-from support.small_pipeline import assets_of, without_bytes
+from support.small_pipeline import assets_of, packet, without_bytes
 from trilane.arrays import shape_buckets
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.body.joints import Skeleton
@@ -22,12 +22,11 @@ from trilane.scene.planner import plan_tensor
 from trilane.scene.schema import AvatarSpec, CameraSpec, OutputSpec, Scene
 from trilane.scene.tensor_budget import TensorBudget
 from trilane.stages.avatar_assets import shaped_body, staged_of
-from trilane.stages.config import RunConfig, pose_dtype, posed_vertices, posed_vertices_bytes
+from trilane.stages.config import RunConfig, posed_vertices, posed_vertices_bytes
 from trilane.stages.cpu import pose
 from trilane.stages.cpu.mesh_bounds import MeshBounds
 from trilane.stages.cpu.pose import PoseStage
 from trilane.stages.cpu.present import Segment
-from trilane.transport.packets import Packet, SlotLayout, view_packet
 
 # --- crop ------------------------------------------------------------------------------------------------------------
 
@@ -101,11 +100,6 @@ def configured(bundle: Path, out: Path, vertices: int = 0, **scene: Any) -> RunC
     )
 
 
-def packet(avatars: int, payload: int = 0) -> Packet:
-    layout = SlotLayout(pose_dtype(avatars), payload)
-    return view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
-
-
 PAIR = (AvatarSpec(position=(-0.5, 0, 0)), AvatarSpec(position=(0.5, 0, 0.3), motion="builtin:idle"))
 
 
@@ -121,7 +115,7 @@ def test_a_packet_holds_what_motion_camera_and_layout_give(
     body, staged = shaped_body(assets, 0), staged_of(assets)
     total = len(body.vertices)
     config = first.model_copy(update={"posed_vertices": (total, total) if skinned else ()})
-    stage, slots = PoseStage(config, assets), [packet(2, posed_vertices_bytes(config.posed_vertices)) for _ in range(2)]
+    stage, slots = PoseStage(config, assets), [packet(posed_vertices_bytes(config.posed_vertices), 2) for _ in range(2)]
     stage.bind([], slots)
     figures = stage.run(40, None, 1)
     triangles = 2.0 * len(body.body.faces)
@@ -169,7 +163,7 @@ def test_a_planned_packet_is_what_the_planner_says_of_the_avatars_on_the_screen(
     config = configured(tiny_bundle, tmp_path, size="auto").model_copy(update=planned)
     assets = assets_of(config)
     body, staged = shaped_body(assets, 0), staged_of(assets)
-    stage, slot, held = PoseStage(config, assets), packet(1), None
+    stage, slot, held = PoseStage(config, assets), packet(0), None
     stage.bind([], [slot])
     bounds, skeleton = MeshBounds(body, standoff_m=CLOTHES_STANDOFF_M), Skeleton(body.joints, body.body.parents)
     projection = staged.camera.projection(0.0, (480, 640))
@@ -191,7 +185,7 @@ def test_a_planned_packet_is_what_the_planner_says_of_the_avatars_on_the_screen(
 def test_with_nobody_in_view_the_tensor_is_the_smallest(tiny_bundle: Path, tmp_path: Path) -> None:
     off, stays = (AvatarSpec(position=(0, 0, 40.0)),), CameraSpec(place="none")
     config = configured(tiny_bundle, tmp_path, avatars=off, camera=stays, size="256")
-    stage, slot = PoseStage(config, assets_of(config)), packet(1)
+    stage, slot = PoseStage(config, assets_of(config)), packet(0)
     stage._buckets = [(64, 64), (20, 100), (50, 50)]
     stage.bind([], [slot])
     stage.run(0, None, 0)
@@ -206,7 +200,7 @@ def test_what_is_not_finite_is_named(
 ) -> None:
     config = configured(tiny_bundle, tmp_path, avatars=PAIR)
     stage = PoseStage(config, assets_of(config))
-    stage.bind([], [packet(2)])
+    stage.bind([], [packet(0, 2)])
     if broken == "camera":
         monkeypatch.setattr(type(stage._camera), "sample", lambda *_: np.full((4, 4), np.inf))
     elif broken == "place":

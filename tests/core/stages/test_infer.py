@@ -15,6 +15,7 @@ import onnx
 import pytest
 from onnx import helper
 
+from support.small_pipeline import packet, packets
 from trilane import machine
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import constants_of, reshaped
@@ -25,7 +26,6 @@ from trilane.scene.schema import Scene
 from trilane.stages.config import NetworkCut, RunConfig, network_parts, pose_dtype
 from trilane.stages.dsp import infer, ort, runtime
 from trilane.stages.dsp.infer import InferStage
-from trilane.transport.packets import SlotLayout, view_packet
 
 
 @pytest.fixture
@@ -117,8 +117,7 @@ def test_a_cut_needs_room_for_the_shape_that_needs_most(network: Any, tmp_path: 
 
 
 def slot(payload: int, shape: tuple[int, int], visible: int = 1) -> Any:
-    layout = SlotLayout(pose_dtype(1), payload)
-    made = view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
+    made = packet(payload)
     made.header["tensor_shape"], made.header["avatars"]["visible"] = shape, visible
     return made
 
@@ -155,26 +154,21 @@ def test_three_parts_in_a_row_give_the_bytes_of_the_whole(tiny_bundle: Path) -> 
 CHANNELS = 5
 
 
-def slots(count, avatars, payload):
-    layout = SlotLayout(pose_dtype(avatars), payload)
-    return [view_packet(memoryview(bytearray(layout.slot_bytes)), layout) for _ in range(count)]
-
-
 def make(folder, avatars=1, size="64", runtime="ort"):
     scene = Scene.model_validate({"size": size, "avatars": [{}] * avatars})
     units = {"dsp": UnitSettings(cores=(0,), threads=1)}
     config = RunConfig(scene=scene, out_dir=folder, avatar_dirs=(folder,) * avatars, units=units, runtime=runtime)
     stage = InferStage(config, [load_bundle(folder).read_network()])
     pixels = config.max_tensor_pixels * avatars
-    inputs, outputs = slots(2, avatars, pixels * CHANNELS), slots(2, avatars, pixels * 4)
+    inputs, outputs = (packets(pose_dtype(avatars), 2, pixels * channels) for channels in (CHANNELS, 4))
     stage.bind(inputs, outputs)
     return stage, inputs, outputs
 
 
-def show(packet, shape, visible):
-    packet.header["tensor_shape"] = shape
-    packet.header["avatar_count"] = len(visible)
-    packet.header["avatars"]["visible"][:] = visible
+def show(slot, shape, visible):
+    slot.header["tensor_shape"] = shape
+    slot.header["avatar_count"] = len(visible)
+    slot.header["avatars"]["visible"][:] = visible
 
 
 def run_alone(folder, shape, tensor):
@@ -272,7 +266,7 @@ def test_each_network_paints_its_own_tensor(tiny_bundle, tmp_path, visible, infe
         networks=(0, 1, 0),
     )
     stage, shape = InferStage(config, networks), (64, 64)
-    (source,), (target,) = slots(1, 3, 64 * 64 * 16 * 2), slots(1, 3, 64 * 64 * 4 * 2)
+    source, target = packet(64 * 64 * 16 * 2, 3), packet(64 * 64 * 4 * 2, 3)
     stage.bind([source], [target])
     assert stage.sessions == 2
     tensors = [random_tensor(shape, number) for number in range(2)]

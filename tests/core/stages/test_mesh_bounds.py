@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from trilane.arrays import F64
-from trilane.body.body import ShapedBody, load_body
+from trilane.body.body import ShapedBody
 from trilane.body.joints import Posed, Skeleton
 from trilane.body.skinning import CpuSkinner, blend_reach
 from trilane.scene.crop import Rect
@@ -20,13 +19,6 @@ from trilane.stages.cpu import mesh_bounds
 from trilane.stages.cpu.mesh_bounds import ROUNDING_M, MeshBounds, Outermost
 
 LENS = np.array([(1.5, 0, 0.2, 0), (0, 2.0, -0.1, 0), (0, 0, -1.02, -0.202), (0, 0, -1, 0.0)])  # near 0.1, far 10
-
-
-@pytest.fixture
-def shaped(tmp_path: Path, body_arrays: dict[str, NDArray[Any]]) -> ShapedBody:
-    """A small body with pose blend shapes."""
-    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
-    return load_body(tmp_path / "body.npz").shape()
 
 
 def bent(shaped: ShapedBody, seed: int = 0, size: float = 0.5) -> Any:
@@ -149,13 +141,12 @@ SQUARE = np.array([[-0.01, -0.01, 0], [0.01, -0.01, 0], [0.01, 0.01, 0], [-0.01,
 
 
 @pytest.fixture
-def square(tmp_path: Path, body_arrays: dict[str, NDArray[Any]]) -> ShapedBody:
+def square(shaped: ShapedBody) -> ShapedBody:
     """A square of 2 cm at the origin on the root, without pose blend shapes; joints at the origin, left_hip 1 m up."""
-    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
     weights = np.zeros((4, 55), np.float32)
     weights[:, 0] = 1.0
     body = dataclasses.replace(
-        load_body(tmp_path / "body.npz"),
+        shaped.body,
         weights=weights,
         posedirs=None,
         faces=np.array([[0, 1, 2], [0, 2, 3]], np.int32),
@@ -310,10 +301,9 @@ def test_no_pose_brings_a_vertex_further_from_the_root_than_the_reach(shaped: Sh
     assert more.reach_m == pytest.approx(bounds.reach_m + 0.25)
 
 
-def test_the_reach_follows_the_bones_to_the_joints(tmp_path: Path, body_arrays: dict[str, NDArray[Any]]) -> None:
+def test_the_reach_follows_the_bones_to_the_joints(shaped: ShapedBody) -> None:
     """Without blend shapes, bone by bone."""
-    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays | {"posedirs": 0 * body_arrays["posedirs"]})
-    shaped = load_body(tmp_path / "body.npz").shape()
+    shaped = dataclasses.replace(shaped, body=dataclasses.replace(shaped.body, posedirs=None))
     parents, joints = shaped.body.parents, shaped.joints
     longest = 0.0
     for vertex, row in zip(shaped.vertices.astype(float), shaped.body.weights, strict=True):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from trilane import machine
-from trilane.body.body import load_body
+from trilane.body.body import ShapedBody
 from trilane.body.skinning import FrameSkinner
 from trilane.machine import Machine, last_level_bytes, moved_of_kept
 from trilane.pipeline.memory import BYTES, ByteCounter, add_bytes
@@ -104,10 +104,8 @@ def test_a_new_frame_is_read_by_digest_and_encoder_and_a_repeated_one_by_neither
     assert 0 < sum(encoded) < path.stat().st_size
 
 
-def test_what_skinning_keeps_is_all_that_it_reads_again(body_arrays: Any, tmp_path: Path) -> None:
+def test_what_skinning_keeps_is_all_that_it_reads_again(shaped: ShapedBody) -> None:
     """Rest positions of a block of 256 vertices, the weights and numbers of its joints, 90 vertices' blend shapes."""
-    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
-    shaped = load_body(tmp_path / "body.npz").shape()
     used = int((shaped.body.weights > 0).any(axis=0).sum())
     assert shaped.body.posedirs is not None and shaped.body.posedirs.dtype == np.float32
     assert FrameSkinner(shaped).constant_bytes == 256 * 12 + used * 256 * 4 + used * 8 + 90 * 3 * 486 * 4

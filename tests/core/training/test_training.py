@@ -15,7 +15,7 @@ pytest.importorskip("skimage")
 from trilane.scene.motion.builtin import BUILTIN  # noqa: E402
 from trilane.training import objective, step_loop  # noqa: E402
 from trilane.training.clothing import Layer  # noqa: E402
-from trilane.training.dataset import U16, ShapeGroup, batches, create_group, open_groups  # noqa: E402
+from trilane.training.dataset import ShapeGroup, batches  # noqa: E402
 from trilane.training.network import (  # noqa: E402
     ENCODERS,
     NORMS,
@@ -113,25 +113,6 @@ def test_losses_are_their_formulas(pictures):
 )
 def test_the_learning_rate_rises_and_falls_as_a_cosine(share, rate):
     assert step_loop.rate_share(share) == pytest.approx(rate)
-
-
-def test_the_average_keeps_its_share():
-    average, now = avatar(), avatar()
-    name = "network.mask.3.bias"
-    old = average.state_dict()[name].clone()
-    with torch.no_grad():
-        now.state_dict()[name] += 8.0
-    step_loop.follow(average, now, keep=0.75)
-    assert torch.allclose(average.state_dict()[name], old + 2.0)
-
-
-@pytest.mark.parametrize("frozen", [False, True])
-def test_frozen_norms_keep_their_statistics(frozen):
-    made = avatar().eval()
-    step_loop.set_mode(made, frozen)
-    norms = [module for module in made.modules() if isinstance(module, torch.nn.BatchNorm2d)]
-    assert norms and made.network.colour[0].training
-    assert all(norm.training is not frozen for norm in norms)
 
 
 def test_activation_noise_is_as_large_as_stated_and_only_where_a_relu_is_open():
@@ -267,31 +248,12 @@ def test_training_sees_a_person_as_grey_as_the_one_background_that_was():
     assert float(hidden["composite"]) == float(hidden["decibels"]) == 0
 
 
-SHAPE = (32, 64)
-
-
-@pytest.fixture
-def groups(tmp_path):
-    rng = np.random.default_rng(0)
-    group = create_group(tmp_path / "data", SHAPE, np.zeros(6, np.int8))
-    group.uv[:] = rng.integers(0, U16, group.uv.shape)
-    group.covered[:, 8:24, 16:48] = 1
-    group.rgba[:, 6:26, 14:50] = (200, 100, 50, 255)
-    return tmp_path / "data"
-
-
 def test_held_out_poses_are_not_trained_on():
     motion = BUILTIN["walk-wave-turn"]()
     held_out = np.array([motion.sample(t)[0] for t in np.linspace(0, motion.duration_s, 40)])
     trained = np.array([random_pose(np.random.default_rng((1, 1, number))) for number in range(400)])
     apart = np.abs(held_out[:, None, 1:22] - trained[None, :, 1:22]).max(axis=(2, 3))
     assert apart.min() > 0.1
-
-
-def test_batches_show_every_sample_once_an_epoch(groups):
-    stream = batches(open_groups(groups), 2, np.random.default_rng(0))
-    seen = np.concatenate([next(stream)[1] for _ in range(3)])
-    assert sorted(seen) == list(range(6))
 
 
 def test_points_reach_over_their_triangles():
