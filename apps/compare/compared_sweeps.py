@@ -28,7 +28,7 @@ from trilane.apps.compare.rows import FRAME_TIME, MS, Figure, rows_of
 from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, changes, read_told
 from trilane.apps.run.report import Report
 from trilane.apps.run.verdict import MOST_OTHERS
-from trilane.apps.sweep.store import TRIALS, read_trials
+from trilane.apps.sweep.store import TRIALS, TrialRecord, read_trials
 from trilane.errors import BadInputError
 
 MEAN: Final = Figure(FRAME_TIME, "", "", "mean", MS)
@@ -156,8 +156,8 @@ def compare_sweeps(base: str, other: str) -> SweepComparison:
         name, of_other = _name(of_base), second.get(key, {})
         repeats = [each for each, record in of_base.items() if _is_done(record) and _is_done(of_other.get(each))]
         if repeats:
-            sides = (_side(where, of, repeats) for where, of in ((base, of_base), (other, of_other)))
-            found.append((name, *sides, of_base[repeats[0]]["options"]))
+            options = of_base[repeats[0]].options
+            found.append((name, _side(base, of_base, repeats), _side(other, of_other, repeats), options))
         else:
             left["not_done" if of_other else "base_alone"].append(name)
     left["other_alone"] += [_name(of_other) for key, of_other in second.items() if key not in first]
@@ -168,11 +168,11 @@ def compare_sweeps(base: str, other: str) -> SweepComparison:
     return _compared(base, other, found, {reason: tuple(names) for reason, names in left.items()})
 
 
-def _name(repeats: Mapping[int, Mapping[str, Any]]) -> str:
-    return str(next(iter(repeats.values()))["id"])
+def _name(repeats: Mapping[int, TrialRecord]) -> str:
+    return next(iter(repeats.values())).id
 
 
-def _side(where: str, of: Mapping[int, Mapping[str, Any]], repeats: Sequence[int]) -> Side:
+def _side(where: str, of: Mapping[int, TrialRecord], repeats: Sequence[int]) -> Side:
     return Side(where, tuple(_trial(where, of[each]) for each in repeats))
 
 
@@ -214,38 +214,36 @@ def _pair(name: str, base: Side, other: Side) -> GatedPair:
     return GatedPair(name, base, other, rows, tuple(changes(base.runs[0].document, other.runs[0].document)))
 
 
-def _configurations(folder: Path) -> dict[str, dict[int, Mapping[str, Any]]]:
+def _configurations(folder: Path) -> dict[str, dict[int, TrialRecord]]:
     """Return the trials of the sweep in `folder`, as {configuration: {number of the repeat: record of the trial}}.
 
     A configuration is the command and the options as JSON text. The records are in the order in which the trials ended.
-    Raises BadInputError for a trial without command or options.
+    Raises BadInputError for a trial without a command.
     """
-    found: dict[str, dict[int, Mapping[str, Any]]] = {}
+    found: dict[str, dict[int, TrialRecord]] = {}
     for record in read_trials(folder).values():
-        words, options = record.get("command"), record.get("options")
-        if not isinstance(words, list) or len(words) < 2 or not isinstance(options, dict):
-            raise BadInputError(folder / TRIALS, f"trial {record['id']} without command or options", "a sweep's trials")
-        key = json.dumps([words[1:3] if words[1] == "bench" else words[1:2], options], sort_keys=True)
-        found.setdefault(key, {})[int(record.get("repeat", 1))] = record
+        words = record.command
+        if len(words) < 2:
+            raise BadInputError(folder / TRIALS, f"trial {record.id} without command or options", "a sweep's trials")
+        key = json.dumps([words[1:3] if words[1] == "bench" else words[1:2], record.options], sort_keys=True)
+        found.setdefault(key, {})[record.repeat] = record
     return found
 
 
-def _is_done(record: Mapping[str, Any] | None) -> bool:
-    return record is not None and record["status"] == "done"
+def _is_done(record: TrialRecord | None) -> bool:
+    return record is not None and record.status == "done"
 
 
-def _trial(sweep: str, record: Mapping[str, Any]) -> ComparedRun:
+def _trial(sweep: str, record: TrialRecord) -> ComparedRun:
     """Read the trial with the record `record`, with every frame if its run folder exists.
 
     `sweep`: folder of the sweep. `record`: line of the trial.
     Raises BadInputError if the trial is not a run or a prediction.
     """
-    name, folder = str(record["id"]), record.get("folder")
-    place = Path(sweep, str(folder)) if isinstance(folder, str) and Path(folder).name == folder else None
-    if place is not None and (place / "report.json").is_file():
-        return read_told(str(place))
-    result = record.get("result")
-    document = result if isinstance(result, dict) else {}
+    name, folder = record.id, record.folder
+    if folder and Path(folder).name == folder and (Path(sweep, folder) / "report.json").is_file():
+        return read_told(str(Path(sweep, folder)))
+    document = record.result or {}
     if "expected_error" in document and "frame_time_ms" in document:
         return ComparedRun(name, RunKind.PREDICTION, document)
     try:

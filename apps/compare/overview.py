@@ -21,7 +21,7 @@ from typing import Any
 
 from trilane.apps.compare.frontier import SAME_DB, frontier, knees
 from trilane.apps.run.report import MAX_REPORT_BYTES
-from trilane.apps.sweep.store import TRIALS, read_trials
+from trilane.apps.sweep.store import TRIALS, TrialRecord, read_trials
 from trilane.errors import BadInputError, MissingPartError
 from trilane.files import instead_of_file, require_file
 from trilane.hw_profiles.schema import SHARE_TEXT
@@ -126,7 +126,7 @@ def _document(path: Path) -> Mapping[str, Any]:
     return document
 
 
-def _names(trials: Sequence[Mapping[str, Any]]) -> list[str]:
+def _names(trials: Sequence[TrialRecord]) -> list[str]:
     """Return names for the trials of one sweep: the values of the options that differ, such as `256, openvino`.
 
     If several of these options have numbers, these options are written with their names. An option that is on or off is
@@ -134,20 +134,19 @@ def _names(trials: Sequence[Mapping[str, Any]]) -> list[str]:
     If their names are still the same, the id is added. A trial without any such option is named by its id.
     `trials`: last record of each trial.
     """
-    options = [dict(_settings(_dict(trial.get("options")))) for trial in trials]
+    options = [dict(_settings(trial.options)) for trial in trials]
     keys = [key for key in dict.fromkeys(chain(*options)) if len({each.get(key) for each in options}) > 1]
     numbers = [key for key in keys if all(_is_number(each.get(key, "")) for each in options)]
     with_key = set(numbers) if len(numbers) > 1 else set()
     parts = [[_named(key, each.get(key), key in with_key) for key in keys] for each in options]
     names = [", ".join(filter(None, each)) for each in parts]
-    repeats = [f"repeat {trial.get('repeat', 1)}" for trial in trials]
-    for own in (repeats, [_text(trial.get("id")) for trial in trials]):
+    for own in ([f"repeat {trial.repeat}" for trial in trials], [_text(trial.id) for trial in trials]):
         counts = Counter(names)
         names = [
             ", ".join(filter(None, (name, own[number]))) if counts[name] > 1 else name
             for number, name in enumerate(names)
         ]
-    return [name or _text(trial.get("id")) for name, trial in zip(names, trials, strict=True)]
+    return [name or _text(trial.id) for name, trial in zip(names, trials, strict=True)]
 
 
 def _named(key: str, value: str | None, has_key: bool) -> str:
@@ -167,33 +166,24 @@ def _is_number(text: str) -> bool:
         return False
 
 
-def _trial(folder: Path, trial: Mapping[str, Any], name: str) -> Entry:
-    result = trial.get("result")
-    document = dict(result) if isinstance(result, dict) else {}
-    document["made"] = {**_dict(document.get("made")), "command": trial.get("command")}
-    document.setdefault("clock", trial.get("clock", HOST_CLOCK))
-    document.setdefault("machine", trial.get("host"))
-    if trial.get("status") != "done":
-        error = trial.get("error")
-        ended = f"{trial.get('status')}, exit code {trial.get('exit_code')}"
-        document["failure"] = f"{ended}: {error}" if error else ended
-    video = _video(folder, trial.get("folder"))
-    entry = entry_of(name, document, video, _dict(trial.get("options")))
-    return replace(entry, trial=_text(trial.get("id")))
+def _trial(folder: Path, trial: TrialRecord, name: str) -> Entry:
+    document = {"clock": trial.clock, "machine": trial.host, **(trial.result or {})}
+    document["made"] = {**_mapping(document, "made"), "command": list(trial.command)}
+    if trial.status != "done":
+        ended = f"{trial.status}, exit code {trial.exit_code}"
+        document["failure"] = f"{ended}: {trial.error}" if trial.error else ended
+    entry = entry_of(name, document, _video(folder, trial.folder), trial.options)
+    return replace(entry, trial=_text(trial.id))
 
 
-def _dict(value: Any) -> dict[str, Any]:
-    return dict(value) if isinstance(value, dict) else {}
-
-
-def _video(folder: Path, name: Any) -> Path | None:
+def _video(folder: Path, name: str | None) -> Path | None:
     """Return the path of the video in a trial's run folder; the file may not exist.
 
-    None is returned if `name` is no text, or leads out of the sweep's folder.
+    None is returned without a run folder, or if its name leads out of the sweep's folder.
     `folder`: folder of the sweep.
     `name`: name of the run folder from the trial's record.
     """
-    if not isinstance(name, str):
+    if name is None:
         return None
     place = (folder / name).resolve()
     return place / VIDEO if place.is_relative_to(folder.resolve()) else None

@@ -301,6 +301,13 @@ class GoalMetric(NamedTuple):
     path: tuple[str, ...]
 
 
+def value_at(document: Any, path: Sequence[str]) -> Any:
+    """Return the value of `document` under the keys `path`, such as `frame_time_ms` and `mean`; None without it."""
+    for key in path:
+        document = document.get(key) if isinstance(document, dict) else None
+    return document
+
+
 METRICS = {
     "fps": GoalMetric("fps", True, ("fps",)),
     "frame": GoalMetric("ms", False, ("frame_time_ms", "mean")),
