@@ -25,7 +25,16 @@ from trilane.apps.compare.comparison import (
 from trilane.apps.compare.difference import ALPHA, LEAST_FRAMES, Difference, Finding, combined, rejected
 from trilane.apps.compare.gate import GatedPair
 from trilane.apps.compare.rows import FRAME_TIME, MS, Figure, rows_of
-from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, changes, read_told
+from trilane.apps.compare.sides import (
+    Change,
+    ComparedFigures,
+    ComparedRun,
+    RunKind,
+    Side,
+    changes,
+    compared_run,
+    read_told,
+)
 from trilane.apps.run.report import Report
 from trilane.apps.run.verdict import MOST_OTHERS
 from trilane.apps.sweep.store import TRIALS, TrialRecord, read_trials
@@ -198,8 +207,8 @@ def _compared(
         for (name, first, second, options), row, each in zip(found, rows, sides, strict=True)
     )
     shared = tuple(each for each in sides[0].changes if all(each in pair.changes for pair in sides))
-    documents = [told.document for _, *sides, _ in found for side in sides for told in side.runs]
-    return SweepComparison(base, other, pairs, combined(rows), left, shared, tuple(_notes(documents)))
+    figures = [run.figures for _, first, second, _ in found for run in (*first.runs, *second.runs)]
+    return SweepComparison(base, other, pairs, combined(rows), left, shared, tuple(_notes(figures)))
 
 
 def _pair(name: str, base: Side, other: Side) -> GatedPair:
@@ -211,7 +220,7 @@ def _pair(name: str, base: Side, other: Side) -> GatedPair:
     rows = rows_of(base, other)
     if MEAN not in rows:
         raise BadInputError(base.name, "trials without a frame time", "a sweep of `run` or `predict`")
-    return GatedPair(name, base, other, rows, tuple(changes(base.runs[0].document, other.runs[0].document)))
+    return GatedPair(name, base, other, rows, tuple(changes(base.runs[0], other.runs[0])))
 
 
 def _configurations(folder: Path) -> dict[str, dict[int, TrialRecord]]:
@@ -245,9 +254,9 @@ def _trial(sweep: str, record: TrialRecord) -> ComparedRun:
         return read_told(str(Path(sweep, folder)))
     document = record.result or {}
     if "expected_error" in document and "frame_time_ms" in document:
-        return ComparedRun(name, RunKind.PREDICTION, document)
+        return compared_run(name, RunKind.PREDICTION, document)
     try:
-        return ComparedRun(name, RunKind.REPORT, Report.model_validate(document).as_json())
+        return compared_run(name, RunKind.REPORT, Report.model_validate(document).as_json())
     except ValidationError:
         raise BadInputError(f"{sweep}: trial {name}", "no run", "a sweep of `run` or `predict`") from None
 
@@ -257,18 +266,18 @@ def _told(row: Difference) -> dict[str, Any]:
     return {name: getattr(row, name) for name in names}
 
 
-def _notes(documents: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+def _notes(figures: Sequence[ComparedFigures]) -> Iterator[str]:
     """Yield remarks on other programs that ran at the same time, and on too few frames.
 
-    `documents`: reports of all runs on both sides, as JSON.
+    `figures`: figures of all runs on both sides.
     """
-    shares = [share for document in documents if (share := document.get("other_programs") or 0.0) > MOST_OTHERS]
+    shares = [share for each in figures if (share := each.other_programs or 0.0) > MOST_OTHERS]
     if shares:
-        runs = f"{len(shares)} of {len(documents)} runs"
+        runs = f"{len(shares)} of {len(figures)} runs"
         yield (
             f"other programs had more than {100 * MOST_OTHERS:.0f} % of the cores in {runs}, "
             f"{100 * max(shares):.0f} % at most, which makes their intervals wider"
         )
-    presented = [document["frames"]["presented"] for document in documents if "frames" in document]
+    presented = [each.frames.presented for each in figures if each.frames]
     if presented and min(presented) <= LEAST_FRAMES:
         yield f"{min(presented)} frames at the least; to tell what differs, more than {LEAST_FRAMES} are needed"

@@ -21,6 +21,7 @@ from typing import Any, Final, NamedTuple
 from trilane.apps.compare.comparison import change_of, interval_of, name_of, spoilt
 from trilane.apps.compare.difference import ALPHA, Difference, rejected
 from trilane.apps.compare.rows import (
+    CHECKED,
     DROPPED,
     FRAME_TIME,
     LATENCY,
@@ -29,7 +30,7 @@ from trilane.apps.compare.rows import (
     WORK,
     Figure,
     Rows,
-    exact_rows,
+    check_rows,
     relief_of,
 )
 from trilane.apps.compare.run_frames import CPU, INSTRUCTIONS
@@ -42,7 +43,6 @@ MOST_RUNS: Final = 200
 PERCENT, DECIBELS = "%", "dB"
 #: A stage's CPU time and its time on the core count as equal if they differ by at most this share.
 SAME_TIME: Final = 0.05
-CHECKED: Final = "check"
 #: Measures that are judged with other programs' share taken out.
 WALL: Final = (FRAME_TIME, LATENCY)
 MOST_SAID: Final = 4
@@ -269,7 +269,7 @@ def judge(gates: Sequence[Gate], pairs: Sequence[GatedPair]) -> list[JudgedLimit
 
 def _weighed(gate: Gate, pair: GatedPair) -> Iterator[Weighed]:
     relief, metric = relief_of(pair.base, pair.other), gate.metric
-    rows = exact_rows(pair.base, pair.other, CHECKED, "dB") if metric.of[0][0] == CHECKED else pair.rows
+    rows = check_rows(pair.base, pair.other) if metric.of[0][0] == CHECKED else pair.rows
     is_quiet = not [*spoilt(_runs(pair))]
     works = {figure.of: row for figure, row in rows.items() if (figure.measure, figure.statistic) == (WORK, "typical")}
     for figure, row in rows.items():
@@ -358,7 +358,7 @@ def _judged(gate: Gate, pair: GatedPair, figures: tuple[Weighed, ...]) -> Judged
     worse = [each for each in figures if each.outcome is LimitOutcome.BROKEN]
     if worse:
         return JudgedLimit(gate, pair.name, LimitOutcome.BROKEN, f"{gate.metric.says}: {_list(worse)}", figures)
-    if not figures and gate.metric is METRICS["lost"] and all("frames" in run.document for run in _runs(pair)):
+    if not figures and gate.metric is METRICS["lost"] and all(run.figures.frames for run in _runs(pair)):
         return JudgedLimit(gate, pair.name, LimitOutcome.KEPT, "no run lost or dropped a frame", figures)
     if not figures:
         reason = ABSENT.get(gate.metric.of[0][0], "the two sides share no such figure")
@@ -383,7 +383,7 @@ def _missing(pair: GatedPair) -> list[str]:
 
     For such a stage, the change between the sides is unknown.
     """
-    stages = [{*run.document.get("stages", {})} for run in _runs(pair)]
+    stages = [{*run.figures.stages} for run in _runs(pair)]
     return sorted(set().union(*stages) - set[str]().union(*stages[:1]).intersection(*stages))
 
 
@@ -401,7 +401,7 @@ def _decisive(gate: Gate, pair: GatedPair, figures: Sequence[Weighed]) -> list[W
     """
     counted = [each for each in figures if each.figure.measure == INSTRUCTIONS]
     frames = [each for each in figures if each.figure.measure == FRAME_TIME]
-    stages = pair.base.runs[0].document["stages"]
+    stages = pair.base.runs[0].figures.stages
     is_counted = len(counted) == len(stages) > 0 and not pair.changes and gate.name == "slower"
     if is_counted:
         return [*counted, *(each for each in frames if not each.is_near)]

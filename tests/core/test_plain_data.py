@@ -43,6 +43,11 @@ CHANGING = {
 }
 #: Models that keep keys which they do not know: what other versions of Trilane have measured.
 OPEN = {
+    "apps.compare.sides.ComparedCounts",
+    "apps.compare.sides.ComparedFigures",
+    "apps.compare.sides.ComparedPart",
+    "apps.compare.sides.ComparedStage",
+    "apps.compare.sides.ComparedUnit",
     "apps.compare.sides.ImportedTime",
     "apps.sweep.store.TrialRecord",
     "avatars.manifest.AccuracyFigures",
