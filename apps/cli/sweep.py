@@ -13,6 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from datetime import timedelta
 from enum import StrEnum
 from functools import partial
@@ -124,7 +125,7 @@ def of_file(
     words: Sequence[str], as_list: bool, random: int | None, seed: int | None
 ) -> tuple[str, Definition, SweptCommand]:
     from trilane.apps.cli.sweep_options import SweptCommand
-    from trilane.apps.sweep.definition import Definition, read_sweep
+    from trilane.apps.sweep.definition import read_sweep
 
     path = Path(words[0])
     if len(words) > 1:
@@ -139,7 +140,7 @@ def of_file(
         name: [command.converted(name, value, f"{path}: axes") for value in values]
         for name, values in command.in_new_names(file.axes, f"{path}: axes").items()
     }
-    return path.stem, Definition(command.words, options, axes, file.kind, file.count, file.seed, file.repeats), command
+    return path.stem, replace(file, command=command.words, options=options, axes=axes), command
 
 
 def of_words(
@@ -212,7 +213,7 @@ def _run(
     Raises typer.Exit if the sweep is interrupted.
     """
     from trilane.apps.run.report_facts import made_facts
-    from trilane.apps.sweep.store import Store, run_sweep, summary
+    from trilane.apps.sweep.store import Store, run_sweep
 
     about = {"made": made_facts(("trilane", *sys.argv[1:])), "definition": described(definition)}
     with Store(folder, trials, about, resume=resume) as store:
@@ -224,7 +225,7 @@ def _run(
         except KeyboardInterrupt:
             _say_interrupted(trials, store)
             raise typer.Exit(INTERRUPTED) from None
-        ended = summary(trials, store, before)
+        ended = store.summary(before)
     clock = trials[0].kind.clock
     if as_json:
         print_json({"schema": 1, "clock": str(clock), "engine": str(engine), **ended.as_json()})
@@ -276,15 +277,6 @@ def _print_planned(trials: Sequence[Trial], as_json: bool) -> None:
         sys.stdout.write(f"{trial.id}  {trial.line}\n")
 
 
-def seconds_left(elapsed_s: float, ended: int, left: int) -> float:
-    """Return the expected remaining time in seconds, from the mean time of the ended trials.
-
-    `elapsed_s`: time since the begin, in seconds. `ended`: number of trials that ended in this time, at least 1.
-    `left`: number of trials that have not ended.
-    """
-    return elapsed_s / ended * left
-
-
 @contextmanager
 def progress(left: int, whole: int) -> Iterator[Callable[[TrialRecord], None]]:
     """Show the progress of a sweep on stderr. Yield a function to call with the record of each trial that ends.
@@ -302,7 +294,8 @@ def progress(left: int, whole: int) -> Iterator[Callable[[TrialRecord], None]]:
         def told(record: TrialRecord) -> None:
             nonlocal ended
             ended += 1
-            remaining = f"{_time(seconds_left(time.monotonic() - begin, ended, left - ended))} left"
+            seconds = (time.monotonic() - begin) / ended * (left - ended)
+            remaining = f"{timedelta(seconds=round(seconds))} left"
             done = whole - left + ended
             if not console.is_terminal:
                 console.print(f"{done}/{whole} {_line(record)}; {remaining}", soft_wrap=True, markup=False)
@@ -333,10 +326,6 @@ def words_text(options: Mapping[str, Any]) -> str:
     return " ".join(f"{name}={value}" for name, value in options.items())
 
 
-def _time(seconds: float) -> str:
-    return str(timedelta(seconds=round(seconds)))
-
-
 def print_summary(ended: SweepSummary, definition: Definition, clock: str) -> None:
     """Print a table with a row for each trial, a line of counts, and a line for each error of failed trials.
 
@@ -361,8 +350,7 @@ def print_summary(ended: SweepSummary, definition: Definition, clock: str) -> No
     stdout_console().print(f"{counted}; {clock} clock", markup=False)
     if again := [record for record in ended.trials if record.repeated]:
         unsure = sum(bool(record.unsure) for record in again)
-        disturbed = f"the machine was not quiet: runs done again: {len(again)}, UNSURE still: {unsure}"
-        print_line(disturbed)
+        print_line(f"the machine was not quiet: runs done again: {len(again)}, UNSURE still: {unsure}")
     errors = Counter((record.status, record.error) for record in ended.trials if record.error)
     for (status, error), count in errors.items():
         print_line(f"{count} {status}: {error}")

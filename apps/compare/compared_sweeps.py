@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -46,30 +46,35 @@ METHOD: Final = (
     f"of the trials that are said to differ does so by chance has a probability of at most {100 * ALPHA:.0f} % (Holm); "
     "over all: the geometric mean of the ratios"
 )
-#: A pair: name of its first trial in the base, base, other side, options.
-_Found = tuple[str, Side, Side, Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
 class TrialPair:
     """One configuration in both sweeps.
 
-    `name`: name of its first trial in the base.
+    `sides`: figures of both sides; the name is the name of the first trial in the base.
     `options`: options of the configuration, by name.
-    `runs`: number of runs on each side.
-    `frame_time`: difference of the mean frame times.
     `differs`: whether the frame times differ, by a test of all pairs together.
-    `sides`: figures of both sides, for the gates.
-    `bounds`: bounds of the runs on both sides.
     """
 
-    name: str
-    options: Mapping[str, Any]
-    runs: int
-    frame_time: Difference
-    differs: bool
     sides: GatedPair
-    bounds: Bounds
+    options: Mapping[str, Any]
+    differs: bool = False
+
+    @property
+    def runs(self) -> int:
+        """The number of runs on each side."""
+        return len(self.sides.base.runs)
+
+    @property
+    def frame_time(self) -> Difference:
+        """The difference of the mean frame times."""
+        return self.sides.rows[MEAN]
+
+    @property
+    def bounds(self) -> Bounds:
+        """The bounds of the runs on both sides."""
+        return bounds_of(self.sides.base, self.sides.other)
 
     @property
     def outcome(self) -> Finding:
@@ -133,10 +138,10 @@ class SweepComparison:
             "other": self.other,
             "verdict": self.verdict,
             "changes": [change._asdict() for change in self.changes],
-            "over_all": _told(self.over_all),
+            "over_all": self.over_all.as_json(),
             "trials": [
-                {"id": pair.name, "options": dict(pair.options), "runs": pair.runs}
-                | {**_told(pair.frame_time), "differs": pair.differs, "outcome": str(pair.outcome)}
+                {"id": pair.sides.name, "options": dict(pair.options), "runs": pair.runs}
+                | {**pair.frame_time.as_json(), "differs": pair.differs, "outcome": str(pair.outcome)}
                 | {"bound": pair.bounds.as_json()}
                 for pair in self.pairs
             ],
@@ -159,14 +164,14 @@ def compare_sweeps(base: str, other: str) -> SweepComparison:
     Raises BadInputError if the sweeps have no finished trial of the same configuration, or if trials are not runs.
     """
     first, second = (_configurations(Path(name)) for name in (base, other))
-    found: list[_Found] = []
+    found: list[TrialPair] = []
     left: dict[str, list[str]] = {"not_done": [], "base_alone": [], "other_alone": []}
     for key, of_base in first.items():
         name, of_other = _name(of_base), second.get(key, {})
         repeats = [each for each, record in of_base.items() if _is_done(record) and _is_done(of_other.get(each))]
         if repeats:
-            options = of_base[repeats[0]].options
-            found.append((name, _side(base, of_base, repeats), _side(other, of_other, repeats), options))
+            sides = _pair(name, _side(base, of_base, repeats), _side(other, of_other, repeats))
+            found.append(TrialPair(sides, of_base[repeats[0]].options))
         else:
             left["not_done" if of_other else "base_alone"].append(name)
     left["other_alone"] += [_name(of_other) for key, of_other in second.items() if key not in first]
@@ -174,7 +179,13 @@ def compare_sweeps(base: str, other: str) -> SweepComparison:
         missing = f"no trial that {base} has too, done in both"
         remedy = "give two sweeps of one command, with the same options in the same words"
         raise BadInputError(other, missing, "trials of equal configuration", remedy)
-    return _compared(base, other, found, {reason: tuple(names) for reason, names in left.items()})
+    rows = [pair.frame_time for pair in found]
+    fallen = iter(rejected([row.probability for row in rows if row.probability is not None]))
+    pairs = tuple(replace(pair, differs=pair.frame_time.probability is not None and next(fallen)) for pair in found)
+    shared = tuple(each for each in found[0].sides.changes if all(each in pair.sides.changes for pair in found))
+    figures = [run.figures for pair in found for side in (pair.sides.base, pair.sides.other) for run in side.runs]
+    left_out = {reason: tuple(names) for reason, names in left.items()}
+    return SweepComparison(base, other, pairs, combined(rows), left_out, shared, tuple(_notes(figures)))
 
 
 def _name(repeats: Mapping[int, TrialRecord]) -> str:
@@ -183,32 +194,6 @@ def _name(repeats: Mapping[int, TrialRecord]) -> str:
 
 def _side(where: str, of: Mapping[int, TrialRecord], repeats: Sequence[int]) -> Side:
     return Side(where, tuple(_trial(where, of[each]) for each in repeats))
-
-
-def _compared(
-    base: str,
-    other: str,
-    found: Sequence[_Found],
-    left: Mapping[str, tuple[str, ...]],
-) -> SweepComparison:
-    sides = [_pair(name, first, second) for name, first, second, _ in found]
-    rows = [each.rows[MEAN] for each in sides]
-    fallen = iter(rejected([row.probability for row in rows if row.probability is not None]))
-    pairs = tuple(
-        TrialPair(
-            name,
-            options,
-            len(first.runs),
-            row,
-            row.probability is not None and next(fallen),
-            each,
-            bounds_of(first, second),
-        )
-        for (name, first, second, options), row, each in zip(found, rows, sides, strict=True)
-    )
-    shared = tuple(each for each in sides[0].changes if all(each in pair.changes for pair in sides))
-    figures = [run.figures for _, first, second, _ in found for run in (*first.runs, *second.runs)]
-    return SweepComparison(base, other, pairs, combined(rows), left, shared, tuple(_notes(figures)))
 
 
 def _pair(name: str, base: Side, other: Side) -> GatedPair:
@@ -259,11 +244,6 @@ def _trial(sweep: str, record: TrialRecord) -> ComparedRun:
         return compared_run(name, RunKind.REPORT, Report.model_validate(document).as_json())
     except ValidationError:
         raise BadInputError(f"{sweep}: trial {name}", "no run", "a sweep of `run` or `predict`") from None
-
-
-def _told(row: Difference) -> dict[str, Any]:
-    names = ("base", "other", "change", "low", "high", "is_ratio", "probability")
-    return {name: getattr(row, name) for name in names}
 
 
 def _notes(figures: Sequence[ComparedFigures]) -> Iterator[str]:

@@ -154,14 +154,6 @@ class Comparison:
         return row.outcome(differs=figure in self.differing, margin=margin_of(figure, row))
 
 
-def compare(base: Side, others: Sequence[Side]) -> list[Comparison]:
-    """Return the comparison of each of the sides `others` with the side `base`, in order.
-
-    Raises BadInputError for a side that has no time in common with `base`.
-    """
-    return [_compared(base, other) for other in others]
-
-
 def document(comparisons: Sequence[Comparison]) -> dict[str, Any]:
     """Return the document of `trilane compare --json`.
 
@@ -179,7 +171,11 @@ def document(comparisons: Sequence[Comparison]) -> dict[str, Any]:
     }
 
 
-def _compared(base: Side, other: Side) -> Comparison:
+def compare(base: Side, other: Side) -> Comparison:
+    """Return the comparison of the side `other` with the side `base`.
+
+    Raises BadInputError if the sides have no time in common.
+    """
     rows = rows_of(base, other)
     if not rows:
         names = ", ".join([*base.runs[0].figures.stages][:8])
@@ -250,19 +246,8 @@ def _about(told: ComparedRun) -> Iterator[str]:
 
 
 def _row_document(figure: Figure, comparison: Comparison) -> dict[str, Any]:
-    row = comparison.rows[figure]
-    return {
-        **figure._asdict(),
-        "base": row.base,
-        "other": row.other,
-        "change": row.change,
-        "low": row.low,
-        "high": row.high,
-        "is_ratio": row.is_ratio,
-        "probability": row.probability,
-        "differs": figure in comparison.differing,
-        "outcome": str(comparison.outcome(figure)),
-    }
+    ends = {"differs": figure in comparison.differing, "outcome": str(comparison.outcome(figure))}
+    return {**figure._asdict(), **comparison.rows[figure].as_json(), **ends}
 
 
 def verdict(

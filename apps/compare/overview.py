@@ -426,7 +426,7 @@ def _time(value: Any) -> float | None:
     return number if number is not None and number > 0 else None
 
 
-def varied(entries: list[Entry]) -> list[str]:
+def varied(entries: Sequence[Entry]) -> list[str]:
     """Return the keys of the settings in which `entries` differ, in the order of their first appearance."""
     keys = dict.fromkeys(key for entry in entries for key in entry.settings)
     return [key for key in keys if len({entry.settings[key] for entry in entries if key in entry.settings}) > 1]
@@ -464,14 +464,12 @@ def told_choices(entries: Sequence[Entry]) -> Iterator[str]:
             )
 
 
-def columns(entries: Sequence[Entry]) -> list[str]:
-    """Return the names of the table's columns: `name`, the settings in which `entries` differ, `FIGURES`, `SOURCES`."""
-    return ["name", *varied(list(entries)), *FIGURES, *SOURCES]
-
-
 def table_rows(entries: Sequence[Entry]) -> list[dict[str, Any]]:
-    """Return a row for each entry: values by the names of the `columns`; None for a missing value."""
-    settings = varied(list(entries))
+    """Return a row for each entry: values by the names of the columns; None for a missing value.
+
+    The columns are `name`, the settings in which `entries` differ, `FIGURES` and `SOURCES`.
+    """
+    settings = varied(entries)
     return [
         {
             "name": entry.name,
@@ -490,9 +488,10 @@ def write_csv(target: Path, entries: Sequence[Entry]) -> None:
     Raises BadInputError if `target` cannot be written.
     """
     with write_atomically(target) as draft, draft.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, columns(entries))
+        rows = table_rows(entries)
+        writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
-        writer.writerows(table_rows(entries))
+        writer.writerows(rows)
 
 
 def write_parquet(target: Path, entries: Sequence[Entry]) -> None:

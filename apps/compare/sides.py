@@ -77,14 +77,8 @@ class RunKind(StrEnum):
 Statistics = dict[str, float | None]
 
 
-class ComparedPart(Record):
-    """A part of a document that a comparison reads. The fields have the names and meanings of keys of a report."""
-
-    model_config = ConfigDict(extra="ignore")
-
-
-class ComparedCounts(ComparedPart):
-    """Counts of a run's frames."""
+class ComparedCounts(Record, extra="ignore"):
+    """Counts of a run's frames, with the keys of a report, as in the classes below."""
 
     requested: int
     presented: int
@@ -92,7 +86,7 @@ class ComparedCounts(ComparedPart):
     dropped: dict[str, int] = Field(default={})
 
 
-class ComparedStage(ComparedPart):
+class ComparedStage(Record, extra="ignore"):
     """Unit and times of a stage."""
 
     unit: str
@@ -101,7 +95,7 @@ class ComparedStage(ComparedPart):
     cpu_ms: Statistics | None = None
 
 
-class ComparedUnit(ComparedPart):
+class ComparedUnit(Record, extra="ignore"):
     """Shares and cores of a unit."""
 
     busy: float
@@ -109,7 +103,7 @@ class ComparedUnit(ComparedPart):
     cores: tuple[int, ...] = ()
 
 
-class ComparedFigures(ComparedPart):
+class ComparedFigures(Record, extra="ignore"):
     """What a comparison reads of a report, a prediction or imported times, besides the settings.
 
     `deviation`: only of imported times: relative standard error of every figure; None if it is unknown.

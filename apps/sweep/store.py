@@ -19,7 +19,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from pydantic import ConfigDict, Field
+from pydantic import Field
 
 from trilane.apps.sweep.definition import Trial
 from trilane.errors import BadInputError, reason
@@ -35,13 +35,11 @@ TRIES = 3
 ROW = ("id", "command", "options", "repeat", "status", "exit_code", "error", "seconds", "repeated", "unsure")
 
 
-class TrialRecord(Record):
+class TrialRecord(Record, extra="ignore"):
     """A line of `trials.jsonl`; docs/sweeps.md describes its keys. Lines of other versions may have other keys.
 
     In answers, `status` may also be `planned`, for a trial that was not tried, or `pruned`, after a short run.
     """
-
-    model_config = ConfigDict(extra="ignore")
 
     schema_: int = Field(default=1, alias="schema")
     id: str
@@ -136,10 +134,39 @@ def read_trials(folder: Path) -> dict[str, TrialRecord]:
         raise BadInputError.of_os_error(path, error, "the trials of a sweep") from error
 
 
+@dataclass(frozen=True)
+class SweepSummary:
+    """How the trials of a sweep ended.
+
+    `folder`: folder of the sweep. `trials`: last record of each trial. `skipped`: number of trials that had ended
+    before this call of the sweep.
+    """
+
+    folder: Path
+    trials: tuple[TrialRecord, ...]
+    skipped: int
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """The numbers of trials: in all, by status, and skipped."""
+        found = Counter(record.status for record in self.trials)
+        by_status = {status: found[status] for status in ("done", "failed", "lost", "planned")}
+        return {"trials": len(self.trials), **by_status, "skipped": self.skipped}
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the keys `folder`, `counts` and `trials` of the output of `trilane sweep --json`."""
+        return {
+            "folder": str(self.folder),
+            "counts": self.counts,
+            "trials": [record.row() for record in self.trials],
+        }
+
+
 class Store:
     """The folder of a sweep, open for the one process that runs the sweep; a context manager.
 
     `folder`: absolute path of the folder. `done`: last records by the trial's name, from the folder and from `add`.
+    `lock`: file descriptor of the lock. A child process that inherits it holds the lock too, until its end.
 
     Entering makes the folder, or opens a folder with the same trials. Entering raises BadInputError if:
     - the folder cannot be written, its files are broken, or another process works in it;
@@ -157,7 +184,7 @@ class Store:
         self.folder = folder.absolute()
         self.done: dict[str, TrialRecord] = {}
         self._trials, self._about, self._resume = trials, about, resume
-        self._lock = self._file = -1
+        self.lock = self._file = -1
 
     def __enter__(self) -> Self:
         if self._resume and not (self.folder / SWEEP).is_file():
@@ -182,14 +209,14 @@ class Store:
         self._close()
 
     @property
-    def lock(self) -> int:
-        """The file descriptor of the lock. A child process that inherits it holds the lock too, until its end."""
-        return self._lock
-
-    @property
     def ended(self) -> set[str]:
         """The names of the trials that are final."""
         return {name for name, record in self.done.items() if record.is_ended}
+
+    def summary(self, before: set[str]) -> SweepSummary:
+        """Return how the trials ended. `before`: names of the trials that ended before this call of the sweep."""
+        found = tuple(self.done.get(trial.id) or planned(trial) for trial in self._trials)
+        return SweepSummary(self.folder, found, sum(trial.id in before for trial in self._trials))
 
     def add(self, record: TrialRecord) -> None:
         """Write a trial's record, and wait until the record is on the disk.
@@ -209,11 +236,11 @@ class Store:
         self.done[record.id] = record
 
     def _take_lock(self) -> None:
-        self._lock = os.open(self.folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        self.lock = os.open(self.folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         give_up_at = time.monotonic() + LOCK_S
         while True:
             try:
-                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 return
             except BlockingIOError:
                 if time.monotonic() > give_up_at:
@@ -256,10 +283,10 @@ class Store:
             raise BadInputError(self.folder, found, "the same files", "choose another --out")
 
     def _close(self) -> None:
-        for descriptor in (self._file, self._lock):
+        for descriptor in (self._file, self.lock):
             if descriptor >= 0:
                 os.close(descriptor)
-        self._file = self._lock = -1
+        self._file = self.lock = -1
 
 
 def input_digests(trials: Sequence[Trial]) -> dict[str, str]:
@@ -295,40 +322,3 @@ def _records(engine: Engine, trials: list[Trial]) -> Iterator[TrialRecord]:
     if trials:
         with closing(engine(trials)) as records:
             yield from records
-
-
-@dataclass(frozen=True)
-class SweepSummary:
-    """How the trials of a sweep ended.
-
-    `folder`: folder of the sweep. `trials`: last record of each trial. `skipped`: number of trials that had ended
-    before this call of the sweep.
-    """
-
-    folder: Path
-    trials: tuple[TrialRecord, ...]
-    skipped: int
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """The numbers of trials: in all, by status, and skipped."""
-        found = Counter(record.status for record in self.trials)
-        by_status = {status: found[status] for status in ("done", "failed", "lost", "planned")}
-        return {"trials": len(self.trials), **by_status, "skipped": self.skipped}
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the keys `folder`, `counts` and `trials` of the output of `trilane sweep --json`."""
-        return {
-            "folder": str(self.folder),
-            "counts": self.counts,
-            "trials": [record.row() for record in self.trials],
-        }
-
-
-def summary(trials: Sequence[Trial], store: Store, before: set[str]) -> SweepSummary:
-    """Return how the trials of a sweep ended.
-
-    `store`: open folder of the sweep. `before`: names of the trials that ended before this call of the sweep.
-    """
-    found = tuple(store.done.get(trial.id) or planned(trial) for trial in trials)
-    return SweepSummary(store.folder, found, sum(trial.id in before for trial in trials))

@@ -45,7 +45,6 @@ CHANGING = {
 OPEN = {
     "apps.compare.sides.ComparedCounts",
     "apps.compare.sides.ComparedFigures",
-    "apps.compare.sides.ComparedPart",
     "apps.compare.sides.ComparedStage",
     "apps.compare.sides.ComparedUnit",
     "apps.compare.sides.ImportedTime",

@@ -40,7 +40,7 @@ def side(*seeds: int, factors: Mapping[str, float] | None = None, counted: bool 
 
 
 def one(base: Side, other: Side) -> Comparison:
-    return compare(base, [other])[0]
+    return compare(base, other)
 
 
 def named(verdict: str) -> list[str]:

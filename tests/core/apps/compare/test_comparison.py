@@ -43,7 +43,7 @@ def reported(name: str = "run", **changes: Any) -> ComparedRun:
 
 
 def pair(base: ComparedRun, other: ComparedRun) -> Comparison:
-    return compare(Side(base.name, (base,)), [Side(other.name, (other,))])[0]
+    return compare(Side(base.name, (base,)), Side(other.name, (other,)))
 
 
 @pytest.fixture
@@ -165,7 +165,7 @@ def test_several_runs_a_side_stand_for_it() -> None:
         )
         for name, start, factor in (("a", 1, 1.0), ("b", 4, 1.0), ("c", 7, 1.05))
     ]
-    alike, longer = compare(sides[0], sides[1:])
+    alike, longer = (compare(sides[0], side) for side in sides[1:])
     assert alike.verdict == NO_DIFFERENCE
     assert "infer takes " in longer.verdict
     one = pair(sides[0].runs[0], sides[2].runs[0])
@@ -315,7 +315,7 @@ def test_drops_and_errors_are_named() -> None:
 def test_a_report_without_a_journal_has_summaries(make: Make) -> None:
     base, other = make("a"), make("b", policy="sequential", seed=2)
     (base / NAME).unlink()
-    found = compare(read_side(str(base)), [read_side(str(other / "report.json"))])[0]
+    found = compare(read_side(str(base)), read_side(str(other / "report.json")))
     assert "frame time +" in found.verdict and "is starved" in found.verdict
     assert sum("only summaries are compared" in note for note in found.notes) == 2
     assert found.rows[Figure("frame time", "", "", "p99", "ms")].probability is None
@@ -366,7 +366,7 @@ def test_a_journal_that_is_cut_off_is_compared_until_there_or_refused(make: Make
     base, other = make("a"), make("b", seed=2)
     whole = (other / NAME).read_bytes()
     (other / NAME).write_bytes(whole[: len(whole) * 3 // 4])
-    found = compare(read_side(str(base)), [read_side(str(other))])[0]
+    found = compare(read_side(str(base)), read_side(str(other)))
     assert any("its journal ends before the run did" in note for note in found.notes)
     (other / NAME).write_bytes(whole[:2000])
     with pytest.raises(BadInputError, match=r"b/journal\.msgpack: found fewer than two presented frames"):
@@ -425,7 +425,7 @@ def test_of_a_thousand_files_that_are_not_there_one_is_named() -> None:
 def test_a_side_of_several_runs_shows_what_its_reports_say() -> None:
     runs = [told(simulated(seed, frames=60, factors={"infer": seed / 2.0}), f"r{seed}") for seed in range(1, 5)]
     ab, cd = Side("a,b", tuple(runs[:2])), Side("c,d", tuple(runs[2:]))
-    there, back = compare(ab, [cd])[0].rows, compare(cd, [ab])[0].rows
+    there, back = compare(ab, cd).rows, compare(cd, ab).rows
     figure = Figure("frame time", "", "", "mean", "ms")
     means = [run.figures.frame_time_ms["mean"] or 0.0 for run in runs]
     assert there[figure].base == pytest.approx((means[0] + means[1]) / 2, rel=1e-6)
@@ -461,7 +461,7 @@ def test_a_run_that_was_killed_is_compared_by_its_journal(
     folder = killed(tmp_path / "runs" / f"gone.{NOBODY}.partial", slow, {**facts, "config": config}, keep=0.8)
     for name in (str(folder), "gone", "runs/gone", str(folder / NAME)):
         other = read_side(name)
-        found = compare(read_side(str(base)), [other])[0]
+        found = compare(read_side(str(base)), other)
         assert [change.key for change in found.changes] == ["config.pace_ns.pose"]
         assert "infer takes " in found.verdict
         assert any("it did not end by itself and has no report" in note for note in found.notes)
@@ -474,7 +474,7 @@ def test_a_run_that_was_killed_is_compared_by_its_journal(
     assert done.remark == "it has no report: compared by its journal"
     assert done.figures.frame_time_ms["mean"] == pytest.approx(slow.report["frame_time_ms"]["mean"])
     (base / NAME).unlink()
-    assert "only summaries" in compare(read_side(str(base)), [read_side("gone")])[0].notes[0]
+    assert "only summaries" in compare(read_side(str(base)), read_side("gone")).notes[0]
 
 
 def test_what_a_journal_says_of_a_run_is_what_its_report_says(tmp_path: Path) -> None:

@@ -60,7 +60,7 @@ def outcome(base: ComparedRun, other: ComparedRun, *limits: str) -> LimitOutcome
 
 
 def pair(base: ComparedRun, other: ComparedRun) -> GatedPair:
-    found = compare(Side(base.name, (base,)), [Side(other.name, (other,))])[0]
+    found = compare(Side(base.name, (base,)), Side(other.name, (other,)))
     return GatedPair(other.name, found.base, found.other, found.rows, found.changes)
 
 
@@ -152,7 +152,7 @@ def test_the_error_of_the_frames_has_a_limit_in_decibels() -> None:
     assert "--check" in reason(base, run(3), "psnr=0.5dB")
     sides = [Side(name, tuple(run(seed, **checked(db, 30.0)) for seed, db in enumerate(values, 1)))
              for name, values in (("a", (35.0, 35.1, 35.2)), ("b", (34.0, 34.1, 34.2)))]  # fmt: skip
-    found = compare(sides[0], [sides[1]])[0]
+    found = compare(sides[0], sides[1])
     several = judge([read_gate("psnr=0.5dB")], [GatedPair("b", *sides, found.rows, found.changes)])[0]
     assert several.outcome is LimitOutcome.BROKEN
     row = several.figures[0].row
@@ -366,7 +366,7 @@ def pairs(load: float, change: float, number: int, *, counted: bool, runs: int =
             Side(name, tuple(run(next(seeds), factors, counted=counted, others=load) for _ in range(runs)))
             for name, factors in (("base", {}), ("other", {stage: change}))
         ]
-        found = compare(made[0], [made[1]])[0]
+        found = compare(made[0], made[1])
         yield stage, GatedPair("other", *made, found.rows, found.changes)
 
 
@@ -427,7 +427,7 @@ def of_four(name: str, first_seed: int, slow: str = "") -> Side:
 def test_few_jobs_that_take_much_longer_are_not_passed_though_the_typical_job_is_as_before(stage: str) -> None:
     """The mean doubles while the middle half does not change, and neither stage bounds the frame time."""
     for other, expected in ((of_four("slow", 9, stage), LimitOutcome.BROKEN), (of_four("same", 20), LimitOutcome.KEPT)):
-        found = compare(of_four("base", 0), [other])[0]
+        found = compare(of_four("base", 0), other)
         pairs = [GatedPair(other.name, found.base, found.other, found.rows, found.changes)]
         judged = judge([read_gate("slower=12%")], pairs)[0]
         assert judged.outcome is expected

@@ -22,7 +22,6 @@ from trilane.apps.sweep.store import (
     planned,
     read_trials,
     run_sweep,
-    summary,
     whole_lines,
 )
 from trilane.errors import BadInputError
@@ -137,7 +136,7 @@ def test_only_lost_trials_are_tried_again(tmp_path: Path) -> None:
         assert len(told) == 3
         run_sweep(TRIALS_3, store, engine, told.append)
         assert asked[3:] == [[FIRST]] * 3  # asked for once more, what was lost is tried again; the failed one is not
-        found = summary(TRIALS_3, store, {THIRD.id})
+        found = store.summary({THIRD.id})
     assert found.counts == {"trials": 3, "done": 1, "failed": 1, "lost": 1, "planned": 0, "skipped": 1}
 
 
