@@ -184,8 +184,7 @@ def _say(judged: Sequence[JudgedLimit]) -> None:
     """Print a line for each limit on stderr: its outcome and the reason. With several runs, the line names the run."""
     several = len({each.name for each in judged}) > 1
     for each in judged:
-        said = without_controls(f"{each.name}: {each.said}" if several else each.said)
-        say(said)
+        say(without_controls(f"{each.name}: {each.said}" if several else each.said))
 
 
 def _leave(judged: Sequence[JudgedLimit]) -> None:

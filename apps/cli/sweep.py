@@ -263,8 +263,7 @@ def described(definition: Definition) -> dict[str, Any]:
 def _say_interrupted(trials: Sequence[Trial], store: Store) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the message below is left to do
     ended = store.ended.intersection(trial.id for trial in trials)
-    text = f"interrupted: {len(ended)} of {len(trials)} trials are done; --resume goes on ({store.folder})"
-    say(text)
+    say(f"interrupted: {len(ended)} of {len(trials)} trials are done; --resume goes on ({store.folder})")
 
 
 def _print_planned(trials: Sequence[Trial], as_json: bool) -> None:

@@ -238,8 +238,7 @@ def _tune(
             with progress(steps, steps) as told, _engine(engine, store, space.trials) as (engine_of, together):
                 tune(search, do, budget, together, short)
         except KeyboardInterrupt:
-            said = f"interrupted: {len(search.tried)} of {budget} configurations are tried; --resume goes on ({folder})"
-            say(said)
+            say(f"interrupted: {len(search.tried)} of {budget} configurations are tried; --resume goes on ({folder})")
             raise typer.Exit(INTERRUPTED) from None
         return answer(search, store.done)
 

@@ -137,7 +137,11 @@ class Comparison:
             "unsure": list(self.unsure),
             "bound": self.bounds.as_json(),
             "changes": [change._asdict() for change in self.changes],
-            "rows": [_row_document(figure, self) for figure in self.rows],
+            "rows": [
+                {**figure._asdict(), **row.as_json(), "differs": figure in self.differing}
+                | {"outcome": str(self.outcome(figure))}
+                for figure, row in self.rows.items()
+            ],
             "notes": list(self.notes),
         }
 
@@ -243,11 +247,6 @@ def _about(told: ComparedRun) -> Iterator[str]:
         yield f"compared by its last {MOST_FRAMES} frames"
     if presented <= LEAST_FRAMES:
         yield f"{presented} frames; to tell what differs, more than {LEAST_FRAMES} are needed"
-
-
-def _row_document(figure: Figure, comparison: Comparison) -> dict[str, Any]:
-    ends = {"differs": figure in comparison.differing, "outcome": str(comparison.outcome(figure))}
-    return {**figure._asdict(), **comparison.rows[figure].as_json(), **ends}
 
 
 def verdict(

@@ -263,7 +263,8 @@ def judge(gates: Sequence[Gate], pairs: Sequence[GatedPair]) -> list[JudgedLimit
     found = []
     for gate, pair, figures in asked:
         settled = tuple(_settled(each, id(each) in surely, len(every), pair) for each in figures)
-        found.append(_judged(gate, pair, settled))
+        outcome, reason, runs = _judged(gate, pair, settled)
+        found.append(JudgedLimit(gate, pair.name, outcome, reason, settled, runs))
     return found
 
 
@@ -354,28 +355,26 @@ def runs_needed(each: Weighed, sizes: tuple[int, int], tests: int) -> float | No
     return inf
 
 
-def _judged(gate: Gate, pair: GatedPair, figures: tuple[Weighed, ...]) -> JudgedLimit:
-    worse = [each for each in figures if each.outcome is LimitOutcome.BROKEN]
-    if worse:
-        return JudgedLimit(gate, pair.name, LimitOutcome.BROKEN, f"{gate.metric.says}: {_list(worse)}", figures)
+def _judged(gate: Gate, pair: GatedPair, figures: tuple[Weighed, ...]) -> tuple[LimitOutcome, str, float | None]:
+    """Return outcome, reason and number of runs of a `JudgedLimit`."""
+    if worse := [each for each in figures if each.outcome is LimitOutcome.BROKEN]:
+        return LimitOutcome.BROKEN, f"{gate.metric.says}: {_list(worse)}", None
     if not figures and gate.metric is METRICS["lost"] and all(run.figures.frames for run in _runs(pair)):
-        return JudgedLimit(gate, pair.name, LimitOutcome.KEPT, "no run lost or dropped a frame", figures)
+        return LimitOutcome.KEPT, "no run lost or dropped a frame", None
     if not figures:
-        reason = ABSENT.get(gate.metric.of[0][0], "the two sides share no such figure")
-        return JudgedLimit(gate, pair.name, LimitOutcome.UNKNOWN, reason, figures)
+        return LimitOutcome.UNKNOWN, ABSENT.get(gate.metric.of[0][0], "the two sides share no such figure"), None
     if gate.metric.of[0][0] != CHECKED and (missing := _missing(pair)):
-        return JudgedLimit(gate, pair.name, LimitOutcome.UNKNOWN, f"not on both sides: {', '.join(missing)}", figures)
+        return LimitOutcome.UNKNOWN, f"not on both sides: {', '.join(missing)}", None
     unsure = [*spoilt(_runs(pair))]
     decisive = _decisive(gate, pair, figures)
     unknown = [each for each in decisive if each.outcome is LimitOutcome.UNKNOWN]
+    if not unknown and unsure and gate.metric.is_timed:
+        return LimitOutcome.UNKNOWN, f"{'; '.join(unsure)}; repeat it", None
     if not unknown:
-        if unsure and gate.metric.is_timed:
-            return JudgedLimit(gate, pair.name, LimitOutcome.UNKNOWN, f"{'; '.join(unsure)}; repeat it", figures)
-        return JudgedLimit(gate, pair.name, LimitOutcome.KEPT, _list(decisive), figures)
+        return LimitOutcome.KEPT, _list(decisive), None
     counts = [each.runs for each in unknown]
     runs = None if None in counts else max(count for count in counts if count is not None)
-    reason = f"{_list(unknown)}; {_remedy(unknown, runs, unsure)}"
-    return JudgedLimit(gate, pair.name, LimitOutcome.UNKNOWN, reason, figures, runs)
+    return LimitOutcome.UNKNOWN, f"{_list(unknown)}; {_remedy(unknown, runs, unsure)}", runs
 
 
 def _missing(pair: GatedPair) -> list[str]:
@@ -383,8 +382,8 @@ def _missing(pair: GatedPair) -> list[str]:
 
     For such a stage, the change between the sides is unknown.
     """
-    stages = [{*run.figures.stages} for run in _runs(pair)]
-    return sorted(set().union(*stages) - set[str]().union(*stages[:1]).intersection(*stages))
+    first, *rest = ({*run.figures.stages} for run in _runs(pair))
+    return sorted(first.union(*rest) - first.intersection(*rest))
 
 
 def _runs(pair: GatedPair) -> tuple[ComparedRun, ...]:

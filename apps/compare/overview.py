@@ -42,18 +42,8 @@ HOW_DRAWN = (
 WITHOUT_KEY = ("name", "background", "output.width", "output.height", "camera.source", "avatars[0].motion")
 #: Keys of a document's `config` that are no settings, or that the row has under other names.
 NOT_SETTINGS = (
-    "avatar_dirs",
-    "networks",
-    "shapes",
-    "changes",
-    "own_pixels",
-    "size_curves",
-    "works",
-    "posed_vertices",
-    "pace_ns",
-    "units",
-    "cuts",
-    "record",
+    *("avatar_dirs", "networks", "shapes", "changes", "own_pixels", "size_curves"),
+    *("works", "posed_vertices", "pace_ns", "units", "cuts", "record"),
 )
 REPORT, VIDEO = "report.json", "video.mp4"
 EXPECTED = "a run folder, a sweep's folder, a prediction that was saved with --json, or a folder of these"

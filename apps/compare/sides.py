@@ -45,15 +45,8 @@ OF_A_PREDICTION: Final = ("expected_error", "network", "frame_time_ms", "units",
 FACTS: Final = ("config", "machine", "made", "accuracy")
 #: Parts of a report that say how the run was made.
 PARTS: Final = (
-    "clock",
-    "policy",
-    "edge",
-    "config",
-    "stages",
-    "caps.performance_profile",
-    "machine",
-    "made",
-    "idle_cores",
+    *("clock", "policy", "edge", "config", "stages"),
+    *("caps.performance_profile", "machine", "made", "idle_cores"),
 )
 #: Keys that a report has both at its top and in `config`, and that a prediction has only in `config`.
 TWICE: Final = ("policy", "edge")
@@ -471,7 +464,8 @@ def imported(document: Mapping[str, Any], path: Path) -> dict[str, Any]:
     names = [row.name for row in rows]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise BadInputError(f"{path}: {MEASUREMENTS}", f"{twice!r} twice", "each name once")
-    frames = _frames(rows)
+    walls = [row for row in rows if row.kind == WALL]
+    frames = walls[0] if len(walls) == 1 else None  # the frame time
     return {
         "clock": HOST_CLOCK,
         "stages": {
@@ -499,15 +493,6 @@ def _told_apart(rows: Sequence[ImportedTime]) -> list[ImportedTime]:
     counts = Counter(row.name for row in rows)
     longer = [row.model_copy(update={"name": f"{row.name} ({row.kind})"}) for row in rows]
     return [long if counts[row.name] > 1 else row for row, long in zip(rows, longer, strict=True)]
-
-
-def _frames(rows: Sequence[ImportedTime]) -> ImportedTime | None:
-    """Return the measurement of `rows` that is used as the frame time: the wall time.
-
-    None is returned if `rows` have no wall time or several.
-    """
-    found = [row for row in rows if row.kind == WALL]
-    return found[0] if len(found) == 1 else None
 
 
 def _imported_statistics(row: ImportedTime) -> dict[str, float]:

@@ -140,15 +140,9 @@ def figures_of(record: TrialRecord, names: Sequence[str] = ()) -> dict[str, floa
     paths = {name: METRICS[name].path if name in METRICS else tuple(name.split(".")) for name in (*METRICS, *names)}
     found = {name: _at(document, path) for name, path in paths.items() if path}
     found["psnr"] = entry_of("", document).psnr_db
-    return {name: value for name, value in found.items() if value is not None and not _is_no_time(name, value)}
-
-
-def _is_no_time(name: str, value: float) -> bool:
-    """Return whether the figure `name` is a time, but `value` is 0 or less, because the run has no times.
-
-    Such a 0 would win every comparison.
-    """
-    return name in METRICS and METRICS[name].unit == "ms" and value <= 0
+    # A run without times may have the time 0, which would win every comparison.
+    times = {name for name, metric in METRICS.items() if metric.unit == "ms"}
+    return {name: value for name, value in found.items() if value is not None and (value > 0 or name not in times)}
 
 
 def _at(document: Any, path: Sequence[str]) -> float | None:
