@@ -139,9 +139,14 @@ def _of_runs(base: str, others: list[str], html: Path | None, show_all: bool, ga
     from trilane.apps.compare.gate import GatedPair, as_json, judge
     from trilane.apps.compare.sides import read_side
 
-    comparisons = compared(read_side(base), [read_side(other) for other in others])
+    first, sides = read_side(base), [read_side(other) for other in others]
+    comparisons = [compared(first, side) for side in sides]
     if html is not None:
-        _write_page(html, comparisons)
+        from trilane.apps.compare.pages import comparison_page
+        from trilane.writing import write_bytes
+
+        write_bytes(html, comparison_page(comparisons).encode(), "choose another --html")
+        say(f"page: {html}")
     judged = judge(
         gates, [GatedPair(each.other.name, each.base, each.other, each.rows, each.changes) for each in comparisons]
     )
@@ -179,8 +184,7 @@ def _say(judged: Sequence[JudgedLimit]) -> None:
     """Print a line for each limit on stderr: its outcome and the reason. With several runs, the line names the run."""
     several = len({each.name for each in judged}) > 1
     for each in judged:
-        said = without_controls(f"{each.name}: {each.said}" if several else each.said)
-        say(said)
+        say(without_controls(f"{each.name}: {each.said}" if several else each.said))
 
 
 def _leave(judged: Sequence[JudgedLimit]) -> None:
@@ -201,14 +205,6 @@ def _are_sweeps(names: list[str]) -> bool:
         other = next(name for name in names if name not in sweeps)
         raise BadInputError(other, f"no sweep, beside {sweeps[0]}, which is one", "two sweeps, or runs alone")
     return bool(sweeps)
-
-
-def _write_page(path: Path, comparisons: list[Comparison]) -> None:
-    from trilane.apps.compare.pages import comparison_page
-    from trilane.writing import write_bytes
-
-    write_bytes(path, comparison_page(comparisons).encode(), "choose another --html")
-    say(f"page: {path}")
 
 
 #: Measures that are shown even if they do not differ, with a statistic in ALWAYS_STATISTICS.
@@ -289,7 +285,7 @@ def _trial_table(pairs: Sequence[TrialPair]) -> Table:
     rows = []
     for pair in pairs:
         row = pair.frame_time
-        values = [setting(pair.options.get(name, pair.name)) for name in names]
+        values = [setting(pair.options.get(name, pair.sides.name)) for name in names]
         figures = (f"{row.base:.4g}", f"{row.other:.4g}", change_of(row, MS), interval_of(row, MS))
         rows.append((*values, *figures, str(pair.outcome)))
     return _table((*names, "base, ms", "other, ms", "change", "95 % interval", "outcome"), rows)

@@ -13,6 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import replace
 from datetime import timedelta
 from enum import StrEnum
 from functools import partial
@@ -28,7 +29,7 @@ from trilane.errors import BadInputError
 if TYPE_CHECKING:
     from trilane.apps.cli.sweep_options import SweptCommand
     from trilane.apps.sweep.definition import Definition, Trial
-    from trilane.apps.sweep.store import Engine, Store
+    from trilane.apps.sweep.store import Engine, Store, SweepSummary, TrialRecord
 
 app = Commands()
 EPILOG = """\b
@@ -124,7 +125,7 @@ def of_file(
     words: Sequence[str], as_list: bool, random: int | None, seed: int | None
 ) -> tuple[str, Definition, SweptCommand]:
     from trilane.apps.cli.sweep_options import SweptCommand
-    from trilane.apps.sweep.definition import Definition, read_sweep
+    from trilane.apps.sweep.definition import read_sweep
 
     path = Path(words[0])
     if len(words) > 1:
@@ -139,7 +140,7 @@ def of_file(
         name: [command.converted(name, value, f"{path}: axes") for value in values]
         for name, values in command.in_new_names(file.axes, f"{path}: axes").items()
     }
-    return path.stem, Definition(command.words, options, axes, file.kind, file.count, file.seed, file.repeats), command
+    return path.stem, replace(file, command=command.words, options=options, axes=axes), command
 
 
 def of_words(
@@ -212,11 +213,11 @@ def _run(
     Raises typer.Exit if the sweep is interrupted.
     """
     from trilane.apps.run.report_facts import made_facts
-    from trilane.apps.sweep.store import Store, is_ended, run_sweep, summary
+    from trilane.apps.sweep.store import Store, run_sweep
 
     about = {"made": made_facts(("trilane", *sys.argv[1:])), "definition": described(definition)}
     with Store(folder, trials, about, resume=resume) as store:
-        before = {name for name, record in store.done.items() if is_ended(record)}
+        before = store.ended
         left = len(trials) - len(before)
         try:
             with progress(left, len(trials)) as told, engine_for(engine, store) as engine_of:
@@ -224,14 +225,14 @@ def _run(
         except KeyboardInterrupt:
             _say_interrupted(trials, store)
             raise typer.Exit(INTERRUPTED) from None
-        ended, records = summary(trials, store, before), store.done
-    document = {"schema": 1, "clock": str(trials[0].kind.clock), "engine": str(engine), **ended}
+        ended = store.summary(before)
+    clock = trials[0].kind.clock
     if as_json:
-        print_json(document)
+        print_json({"schema": 1, "clock": str(clock), "engine": str(engine), **ended.as_json()})
     else:
-        print_summary(document, definition, records)
+        print_summary(ended, definition, clock)
     say(f"sweep folder: {folder}")
-    return bool(ended["counts"]["failed"] or ended["counts"]["lost"])
+    return bool(ended.counts["failed"] or ended.counts["lost"])
 
 
 @contextmanager
@@ -260,35 +261,23 @@ def described(definition: Definition) -> dict[str, Any]:
 
 
 def _say_interrupted(trials: Sequence[Trial], store: Store) -> None:
-    from trilane.apps.sweep.store import is_ended
-
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the message below is left to do
-    ended = sum(is_ended(store.done.get(trial.id)) for trial in trials)
-    text = f"interrupted: {ended} of {len(trials)} trials are done; --resume goes on ({store.folder})"
-    say(text)
+    ended = store.ended.intersection(trial.id for trial in trials)
+    say(f"interrupted: {len(ended)} of {len(trials)} trials are done; --resume goes on ({store.folder})")
 
 
 def _print_planned(trials: Sequence[Trial], as_json: bool) -> None:
-    from trilane.apps.sweep.store import row_of
+    from trilane.apps.sweep.store import planned
 
     if as_json:
-        print_json({"schema": 1, "trials": [row_of(trial, None) for trial in trials]})
+        print_json({"schema": 1, "trials": [planned(trial).row() for trial in trials]})
         return
     for trial in trials:
         sys.stdout.write(f"{trial.id}  {trial.line}\n")
 
 
-def seconds_left(elapsed_s: float, ended: int, left: int) -> float:
-    """Return the expected remaining time in seconds, from the mean time of the ended trials.
-
-    `elapsed_s`: time since the begin, in seconds. `ended`: number of trials that ended in this time, at least 1.
-    `left`: number of trials that have not ended.
-    """
-    return elapsed_s / ended * left
-
-
 @contextmanager
-def progress(left: int, whole: int) -> Iterator[Callable[[Mapping[str, Any]], None]]:
+def progress(left: int, whole: int) -> Iterator[Callable[[TrialRecord], None]]:
     """Show the progress of a sweep on stderr. Yield a function to call with the record of each trial that ends.
 
     `left`: number of trials that have not ended yet. `whole`: number of all trials.
@@ -301,70 +290,67 @@ def progress(left: int, whole: int) -> Iterator[Callable[[Mapping[str, Any]], No
         task = bar.add_task("trials", total=whole, completed=whole - left, left="")
         begin, ended = time.monotonic(), 0
 
-        def told(record: Mapping[str, Any]) -> None:
+        def told(record: TrialRecord) -> None:
             nonlocal ended
             ended += 1
-            remaining = f"{_time(seconds_left(time.monotonic() - begin, ended, left - ended))} left"
+            seconds = (time.monotonic() - begin) / ended * (left - ended)
+            remaining = f"{timedelta(seconds=round(seconds))} left"
             done = whole - left + ended
             if not console.is_terminal:
                 console.print(f"{done}/{whole} {_line(record)}; {remaining}", soft_wrap=True, markup=False)
-            elif record["status"] != "done":
+            elif record.status != "done":
                 console.print(_line(record), soft_wrap=True, markup=False)
             bar.update(task, completed=done, left=remaining)
 
         yield told
 
 
-def _line(record: Mapping[str, Any]) -> str:
-    took = "" if record["seconds"] is None else f" in {record['seconds']:.1f} s"
-    why = f": {record['error']}" if record["error"] else ""
-    return f"{record['status']} {words_text(record['options'])}{took}{why}{_disturbed(record)}"
+def _line(record: TrialRecord) -> str:
+    took = "" if record.seconds is None else f" in {record.seconds:.1f} s"
+    why = f": {record.error}" if record.error else ""
+    return f"{record.status} {words_text(record.options)}{took}{why}{_disturbed(record)}"
 
 
-def _disturbed(record: Mapping[str, Any]) -> str:
+def _disturbed(record: TrialRecord) -> str:
     """Return a text that says how often a trial was repeated, and one reason why its result is still unsure.
 
     The text is empty if the trial was not repeated and its result is sure.
     """
-    times = record.get("repeated", 0)
+    times = record.repeated
     again = f"; done again {times} {'time' if times == 1 else 'times'}, as the machine was not quiet" if times else ""
-    return again + "".join(f"; UNSURE: {reason}" for reason in record.get("unsure", [])[:1])
+    return again + "".join(f"; UNSURE: {reason}" for reason in record.unsure[:1])
 
 
 def words_text(options: Mapping[str, Any]) -> str:
     return " ".join(f"{name}={value}" for name, value in options.items())
 
 
-def _time(seconds: float) -> str:
-    return str(timedelta(seconds=round(seconds)))
-
-
-def print_summary(document: Mapping[str, Any], definition: Definition, records: Mapping[str, Any]) -> None:
+def print_summary(ended: SweepSummary, definition: Definition, clock: str) -> None:
     """Print a table with a row for each trial, a line of counts, and a line for each error of failed trials.
 
-    `document`: document of `--json`. `definition`: definition of the sweep, with the axes. `records`: records of
-    trials.jsonl, by the trial's id.
+    `definition`: definition of the sweep, with the axes. `clock`: clock of its trials.
     """
     from rich.table import Table
 
+    from trilane.apps.sweep.definition import value_at
+
     axes = list(definition.axes)
     repeats = ["repeat"] if definition.repeats > 1 else []
-    results = {row["id"]: _answer((records.get(row["id"]) or {}).get("result") or {}) for row in document["trials"]}
-    shown = FIGURES | (ERRORS if any(result.get("check") for result in results.values()) else {})
+    results = [_answer(record.result or {}) for record in ended.trials]
+    shown = FIGURES | (ERRORS if any(result.get("check") for result in results) else {})
     table = Table(*axes, *repeats, "status", "seconds", *shown)
-    for row in document["trials"]:
-        cells = [row["options"][name] for name in axes] + [row[name] for name in repeats]
-        figures = [_figure(results[row["id"]], path) for path in shown.values()]
-        table.add_row(*(text(each) for each in [*cells, marked(row["status"], row), row["seconds"], *figures]))
+    for record, result in zip(ended.trials, results, strict=True):
+        cells = [record.options[name] for name in axes] + [record.repeat for _ in repeats]
+        figures = [value_at(result, path) for path in shown.values()]
+        table.add_row(*(text(each) for each in [*cells, marked(record.status, record), record.seconds, *figures]))
     stdout_console().print(table)
-    counts = document["counts"]
+    counts = ended.counts
     counted = ", ".join(f"{counts[key]} {key}" for key in ("trials", "done", "failed", "lost", "skipped"))
-    stdout_console().print(f"{counted}; {document['clock']} clock", markup=False)
-    if again := [row for row in document["trials"] if row.get("repeated")]:
-        unsure = sum(bool(row["unsure"]) for row in again)
-        disturbed = f"the machine was not quiet: runs done again: {len(again)}, UNSURE still: {unsure}"
-        print_line(disturbed)
-    errors = Counter((row["status"], row["error"]) for row in document["trials"] if row["error"])
+    stdout_console().print(f"{counted}; {clock} clock", markup=False)
+    if again := [record for record in ended.trials if record.repeated]:
+        unsure = sum(bool(record.unsure) for record in again)
+        print_line(f"the machine was not quiet: runs done again: {len(again)}, UNSURE still: {unsure}")
+    errors = Counter((record.status, record.error) for record in ended.trials if record.error)
     for (status, error), count in errors.items():
         print_line(f"{count} {status}: {error}")
 
@@ -378,19 +364,9 @@ def _answer(result: Mapping[str, Any]) -> Mapping[str, Any]:
     return pipelines[-1] if pipelines and "what_if" in pipelines[-1] else result
 
 
-def _figure(result: Mapping[str, Any], path: tuple[str, ...]) -> Any:
-    found: Any = result
-    for key in path:
-        found = found.get(key) if isinstance(found, dict) else None
-    return found
-
-
-def marked(word: str, row: Mapping[str, Any]) -> str:
-    """Return `word`, followed by UNSURE if the machine was not quiet during a trial.
-
-    `row`: document of the trial, whose key `unsure` has the reasons.
-    """
-    return f"{word}, UNSURE" if row.get("unsure") else word
+def marked(word: str, record: TrialRecord) -> str:
+    """Return `word`, followed by UNSURE if the machine was not quiet during the trial of `record`."""
+    return f"{word}, UNSURE" if record.unsure else word
 
 
 def text(value: Any) -> str:

@@ -15,7 +15,7 @@ from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -44,8 +44,8 @@ from trilane.units import HOST, either
 
 if TYPE_CHECKING:
     from trilane.apps.sweep.definition import Definition, Trial
-    from trilane.apps.sweep.store import Engine, Record, Store
-    from trilane.apps.sweep.tuner import Aim, Search, Space
+    from trilane.apps.sweep.store import Engine, Store, TrialRecord
+    from trilane.apps.sweep.tuner import Aim, Answer, Search, Space
 
 app = Commands()
 EPILOG = """\b
@@ -131,14 +131,16 @@ def tune(
     else:
         require_checks(space.trials)
     folder = out or default_folder(f"tune-{name}", space.trials)
-    document = _tune(search, folder, definition, engine, min(trials, len(space.trials)), short, resume)
-    document["seed"] = seed
+    found = _tune(search, folder, definition, engine, min(trials, len(space.trials)), short, resume)
+    clock, keeps = space.trials[0].kind.clock, [str(each) for each in aim.keeps]
     if as_json:
-        print_json(document)
+        head = {"schema": 1, "clock": str(clock), "engine": str(engine), "folder": str(folder.absolute())}
+        print_json({**head, "goal": list(goals), "keep": keeps, **found.as_json(), "seed": seed})
     else:
-        _print(document, list(definition.axes))
+        _print_answer(found, keeps, list(definition.axes))
+        _print_rest(found, list(definition.axes), clock)
     say(f"sweep folder: {folder}")
-    raise typer.Exit(NOTHING_KEEPS if document["best"] is None else 0)
+    raise typer.Exit(NOTHING_KEEPS if found.best is None else 0)
 
 
 def _goals(words: Sequence[str]) -> tuple[tuple[str, ...], list[str]]:
@@ -210,8 +212,8 @@ def _tune(
     budget: int,
     short: int | None,
     resume: bool,
-) -> dict[str, Any]:
-    """Search for the best configuration, keep the trials in `folder`, and return the document that `--json` prints.
+) -> Answer:
+    """Search for the best configuration, keep the trials in `folder`, and return the answer.
 
     `search`: goals, limits and configurations. `definition`: sweep that the folder belongs to. `engine`: machines that
     run the trials. `budget`: number of configurations to try. `short`: frames of the short run before each trial; None
@@ -228,7 +230,7 @@ def _tune(
     steps = budget * (1 if short is None else 2)
     with Store(folder, space.trials, about, resume=resume) as store:
 
-        def do(trials: Sequence[Trial]) -> Mapping[str, Record]:
+        def do(trials: Sequence[Trial]) -> Mapping[str, TrialRecord]:
             run_sweep(trials, store, engine_of, told)
             return {trial.id: store.done[trial.id] for trial in trials}
 
@@ -236,19 +238,9 @@ def _tune(
             with progress(steps, steps) as told, _engine(engine, store, space.trials) as (engine_of, together):
                 tune(search, do, budget, together, short)
         except KeyboardInterrupt:
-            said = f"interrupted: {len(search.tried)} of {budget} configurations are tried; --resume goes on ({folder})"
-            say(said)
+            say(f"interrupted: {len(search.tried)} of {budget} configurations are tried; --resume goes on ({folder})")
             raise typer.Exit(INTERRUPTED) from None
-        known = {trial.id: store.done[trial.id] for trial in space.trials if trial.id in store.done}
-    return {
-        "schema": 1,
-        "clock": str(space.trials[0].kind.clock),
-        "engine": str(engine),
-        "folder": str(store.folder),
-        "goal": list(search.aim.goals),
-        "keep": [str(each) for each in search.aim.keeps],
-        **answer(search, known),
-    }
+        return answer(search, store.done)
 
 
 @contextmanager
@@ -290,50 +282,47 @@ def _called(words: list[str]) -> tuple[int, str, str]:
     return code or 0, out.getvalue(), messages.getvalue()
 
 
-def _print(document: Mapping[str, Any], axes: Sequence[str]) -> None:
-    """Print the best configuration and its command, the frontier, and the numbers of failed and untried configurations.
+def _print_answer(found: Answer, keeps: Sequence[str], axes: Sequence[str]) -> None:
+    """Print the best configuration, or else the nearest one, and its command.
 
-    `document`: result of `_tune`. `axes`: names of the axes.
+    `keeps`: limits as texts. `axes`: names of the axes.
     """
-    _print_answer(document, axes)
-    if document["frontier"]:
-        _print_frontier(document, axes)
-    left, rows = document["not_tried"], document["trials"]
-    untried = "".join(f"; no trial with {name} {', '.join(map(str, each))}" for name, each in left["values"].items())
-    print_line(
-        f"{len(rows)} of {left['of']} configurations tried, {left['count']} not{untried}; {document['clock']} clock"
-    )
-    for status in ("failed", "lost", "pruned"):
-        these = [row for row in rows if row["status"] == status]
-        errors = "; ".join(dict.fromkeys(row["error"] for row in these if row["error"]))
-        if these:
-            print_line(f"{len(these)} {status}" + (f": {errors}" if errors else ""))
-
-
-def _print_answer(document: Mapping[str, Any], axes: Sequence[str]) -> None:
-    shown, head = document["best"], "best"
+    shown, head = found.best, "best"
     if shown is None:
-        shown = document["nearest"]
+        shown = found.nearest
         if shown is None:
             print_line("no trial has the figures that are asked for")
             return
-        print_line(f"no configuration that was tried keeps {', '.join(document['keep'])}")
-        head = f"nearest, misses {', '.join(shown['misses'])}"
-    print_line(f"{head}: {words_text({name: shown['options'][name] for name in axes})}: {_figures(shown['metrics'])}")
-    print_line(shlex.join(shown["command"]))
-    for reason in shown["unsure"]:
+        print_line(f"no configuration that was tried keeps {', '.join(keeps)}")
+        head = f"nearest, misses {', '.join(shown.misses)}"
+    options = {name: shown.record.options[name] for name in axes}
+    print_line(f"{head}: {words_text(options)}: {_figures(shown.metrics)}")
+    print_line(shlex.join(shown.command))
+    for reason in shown.record.unsure:
         print_line(f"UNSURE: {reason}")
 
 
-def _print_frontier(document: Mapping[str, Any], axes: Sequence[str]) -> None:
+def _print_rest(found: Answer, axes: Sequence[str], clock: str) -> None:
+    """Print the frontier, and the numbers of failed and untried configurations.
+
+    `axes`: names of the axes. `clock`: clock of the trials.
+    """
     from rich.table import Table
 
-    names = document["weighed"]
-    table = Table(*axes, *map(_headed, names), "keeps", title="frontier")
-    for row in document["frontier"]:
-        cells = [row["options"][name] for name in axes] + [row["metrics"][name] for name in names]
-        table.add_row(*map(text, cells), marked("yes" if row["keeps"] else "no", row))
-    stdout_console().print(table)
+    if found.frontier:
+        table = Table(*axes, *map(_headed, found.weighed), "keeps", title="frontier")
+        for trial in found.frontier:
+            cells = [trial.record.options[name] for name in axes] + [trial.metrics[name] for name in found.weighed]
+            table.add_row(*map(text, cells), marked("yes" if trial.keeps else "no", trial.record))
+        stdout_console().print(table)
+    untried = "".join(f"; no trial with {name} {', '.join(map(str, each))}" for name, each in found.not_tried.items())
+    tried = f"{len(found.trials)} of {found.size} configurations tried"
+    print_line(f"{tried}, {found.left} not{untried}; {clock} clock")
+    for status in ("failed", "lost", "pruned"):
+        these = [trial.record for trial in found.trials if trial.record.status == status]
+        errors = "; ".join(dict.fromkeys(record.error for record in these if record.error))
+        if these:
+            print_line(f"{len(these)} {status}" + (f": {errors}" if errors else ""))
 
 
 def _unit(name: str) -> str:

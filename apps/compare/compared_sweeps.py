@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,10 +25,19 @@ from trilane.apps.compare.comparison import (
 from trilane.apps.compare.difference import ALPHA, LEAST_FRAMES, Difference, Finding, combined, rejected
 from trilane.apps.compare.gate import GatedPair
 from trilane.apps.compare.rows import FRAME_TIME, MS, Figure, rows_of
-from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, changes, read_told
+from trilane.apps.compare.sides import (
+    Change,
+    ComparedFigures,
+    ComparedRun,
+    RunKind,
+    Side,
+    changes,
+    compared_run,
+    read_told,
+)
 from trilane.apps.run.report import Report
 from trilane.apps.run.verdict import MOST_OTHERS
-from trilane.apps.sweep.store import TRIALS, read_trials
+from trilane.apps.sweep.store import TRIALS, TrialRecord, read_trials
 from trilane.errors import BadInputError
 
 MEAN: Final = Figure(FRAME_TIME, "", "", "mean", MS)
@@ -37,30 +46,35 @@ METHOD: Final = (
     f"of the trials that are said to differ does so by chance has a probability of at most {100 * ALPHA:.0f} % (Holm); "
     "over all: the geometric mean of the ratios"
 )
-#: A pair: name of its first trial in the base, base, other side, options.
-_Found = tuple[str, Side, Side, Mapping[str, Any]]
 
 
 @dataclass(frozen=True)
 class TrialPair:
     """One configuration in both sweeps.
 
-    `name`: name of its first trial in the base.
+    `sides`: figures of both sides; the name is the name of the first trial in the base.
     `options`: options of the configuration, by name.
-    `runs`: number of runs on each side.
-    `frame_time`: difference of the mean frame times.
     `differs`: whether the frame times differ, by a test of all pairs together.
-    `sides`: figures of both sides, for the gates.
-    `bounds`: bounds of the runs on both sides.
     """
 
-    name: str
-    options: Mapping[str, Any]
-    runs: int
-    frame_time: Difference
-    differs: bool
     sides: GatedPair
-    bounds: Bounds
+    options: Mapping[str, Any]
+    differs: bool = False
+
+    @property
+    def runs(self) -> int:
+        """The number of runs on each side."""
+        return len(self.sides.base.runs)
+
+    @property
+    def frame_time(self) -> Difference:
+        """The difference of the mean frame times."""
+        return self.sides.rows[MEAN]
+
+    @property
+    def bounds(self) -> Bounds:
+        """The bounds of the runs on both sides."""
+        return bounds_of(self.sides.base, self.sides.other)
 
     @property
     def outcome(self) -> Finding:
@@ -124,10 +138,10 @@ class SweepComparison:
             "other": self.other,
             "verdict": self.verdict,
             "changes": [change._asdict() for change in self.changes],
-            "over_all": _told(self.over_all),
+            "over_all": self.over_all.as_json(),
             "trials": [
-                {"id": pair.name, "options": dict(pair.options), "runs": pair.runs}
-                | {**_told(pair.frame_time), "differs": pair.differs, "outcome": str(pair.outcome)}
+                {"id": pair.sides.name, "options": dict(pair.options), "runs": pair.runs}
+                | {**pair.frame_time.as_json(), "differs": pair.differs, "outcome": str(pair.outcome)}
                 | {"bound": pair.bounds.as_json()}
                 for pair in self.pairs
             ],
@@ -150,14 +164,14 @@ def compare_sweeps(base: str, other: str) -> SweepComparison:
     Raises BadInputError if the sweeps have no finished trial of the same configuration, or if trials are not runs.
     """
     first, second = (_configurations(Path(name)) for name in (base, other))
-    found: list[_Found] = []
+    found: list[TrialPair] = []
     left: dict[str, list[str]] = {"not_done": [], "base_alone": [], "other_alone": []}
     for key, of_base in first.items():
         name, of_other = _name(of_base), second.get(key, {})
         repeats = [each for each, record in of_base.items() if _is_done(record) and _is_done(of_other.get(each))]
         if repeats:
-            sides = (_side(where, of, repeats) for where, of in ((base, of_base), (other, of_other)))
-            found.append((name, *sides, of_base[repeats[0]]["options"]))
+            sides = _pair(name, _side(base, of_base, repeats), _side(other, of_other, repeats))
+            found.append(TrialPair(sides, of_base[repeats[0]].options))
         else:
             left["not_done" if of_other else "base_alone"].append(name)
     left["other_alone"] += [_name(of_other) for key, of_other in second.items() if key not in first]
@@ -165,41 +179,21 @@ def compare_sweeps(base: str, other: str) -> SweepComparison:
         missing = f"no trial that {base} has too, done in both"
         remedy = "give two sweeps of one command, with the same options in the same words"
         raise BadInputError(other, missing, "trials of equal configuration", remedy)
-    return _compared(base, other, found, {reason: tuple(names) for reason, names in left.items()})
-
-
-def _name(repeats: Mapping[int, Mapping[str, Any]]) -> str:
-    return str(next(iter(repeats.values()))["id"])
-
-
-def _side(where: str, of: Mapping[int, Mapping[str, Any]], repeats: Sequence[int]) -> Side:
-    return Side(where, tuple(_trial(where, of[each]) for each in repeats))
-
-
-def _compared(
-    base: str,
-    other: str,
-    found: Sequence[_Found],
-    left: Mapping[str, tuple[str, ...]],
-) -> SweepComparison:
-    sides = [_pair(name, first, second) for name, first, second, _ in found]
-    rows = [each.rows[MEAN] for each in sides]
+    rows = [pair.frame_time for pair in found]
     fallen = iter(rejected([row.probability for row in rows if row.probability is not None]))
-    pairs = tuple(
-        TrialPair(
-            name,
-            options,
-            len(first.runs),
-            row,
-            row.probability is not None and next(fallen),
-            each,
-            bounds_of(first, second),
-        )
-        for (name, first, second, options), row, each in zip(found, rows, sides, strict=True)
-    )
-    shared = tuple(each for each in sides[0].changes if all(each in pair.changes for pair in sides))
-    documents = [told.document for _, *sides, _ in found for side in sides for told in side.runs]
-    return SweepComparison(base, other, pairs, combined(rows), left, shared, tuple(_notes(documents)))
+    pairs = tuple(replace(pair, differs=pair.frame_time.probability is not None and next(fallen)) for pair in found)
+    shared = tuple(each for each in found[0].sides.changes if all(each in pair.sides.changes for pair in found))
+    figures = [run.figures for pair in found for side in (pair.sides.base, pair.sides.other) for run in side.runs]
+    left_out = {reason: tuple(names) for reason, names in left.items()}
+    return SweepComparison(base, other, pairs, combined(rows), left_out, shared, tuple(_notes(figures)))
+
+
+def _name(repeats: Mapping[int, TrialRecord]) -> str:
+    return next(iter(repeats.values())).id
+
+
+def _side(where: str, of: Mapping[int, TrialRecord], repeats: Sequence[int]) -> Side:
+    return Side(where, tuple(_trial(where, of[each]) for each in repeats))
 
 
 def _pair(name: str, base: Side, other: Side) -> GatedPair:
@@ -211,66 +205,59 @@ def _pair(name: str, base: Side, other: Side) -> GatedPair:
     rows = rows_of(base, other)
     if MEAN not in rows:
         raise BadInputError(base.name, "trials without a frame time", "a sweep of `run` or `predict`")
-    return GatedPair(name, base, other, rows, tuple(changes(base.runs[0].document, other.runs[0].document)))
+    return GatedPair(name, base, other, rows, tuple(changes(base.runs[0], other.runs[0])))
 
 
-def _configurations(folder: Path) -> dict[str, dict[int, Mapping[str, Any]]]:
+def _configurations(folder: Path) -> dict[str, dict[int, TrialRecord]]:
     """Return the trials of the sweep in `folder`, as {configuration: {number of the repeat: record of the trial}}.
 
     A configuration is the command and the options as JSON text. The records are in the order in which the trials ended.
-    Raises BadInputError for a trial without command or options.
+    Raises BadInputError for a trial without a command.
     """
-    found: dict[str, dict[int, Mapping[str, Any]]] = {}
+    found: dict[str, dict[int, TrialRecord]] = {}
     for record in read_trials(folder).values():
-        words, options = record.get("command"), record.get("options")
-        if not isinstance(words, list) or len(words) < 2 or not isinstance(options, dict):
-            raise BadInputError(folder / TRIALS, f"trial {record['id']} without command or options", "a sweep's trials")
-        key = json.dumps([words[1:3] if words[1] == "bench" else words[1:2], options], sort_keys=True)
-        found.setdefault(key, {})[int(record.get("repeat", 1))] = record
+        words = record.command
+        if len(words) < 2:
+            raise BadInputError(folder / TRIALS, f"trial {record.id} without command or options", "a sweep's trials")
+        key = json.dumps([words[1:3] if words[1] == "bench" else words[1:2], record.options], sort_keys=True)
+        found.setdefault(key, {})[record.repeat] = record
     return found
 
 
-def _is_done(record: Mapping[str, Any] | None) -> bool:
-    return record is not None and record["status"] == "done"
+def _is_done(record: TrialRecord | None) -> bool:
+    return record is not None and record.status == "done"
 
 
-def _trial(sweep: str, record: Mapping[str, Any]) -> ComparedRun:
+def _trial(sweep: str, record: TrialRecord) -> ComparedRun:
     """Read the trial with the record `record`, with every frame if its run folder exists.
 
     `sweep`: folder of the sweep. `record`: line of the trial.
     Raises BadInputError if the trial is not a run or a prediction.
     """
-    name, folder = str(record["id"]), record.get("folder")
-    place = Path(sweep, str(folder)) if isinstance(folder, str) and Path(folder).name == folder else None
-    if place is not None and (place / "report.json").is_file():
-        return read_told(str(place))
-    result = record.get("result")
-    document = result if isinstance(result, dict) else {}
+    name, folder = record.id, record.folder
+    if folder and Path(folder).name == folder and (Path(sweep, folder) / "report.json").is_file():
+        return read_told(str(Path(sweep, folder)))
+    document = record.result or {}
     if "expected_error" in document and "frame_time_ms" in document:
-        return ComparedRun(name, RunKind.PREDICTION, document)
+        return compared_run(name, RunKind.PREDICTION, document)
     try:
-        return ComparedRun(name, RunKind.REPORT, Report.model_validate(document).as_json())
+        return compared_run(name, RunKind.REPORT, Report.model_validate(document).as_json())
     except ValidationError:
         raise BadInputError(f"{sweep}: trial {name}", "no run", "a sweep of `run` or `predict`") from None
 
 
-def _told(row: Difference) -> dict[str, Any]:
-    names = ("base", "other", "change", "low", "high", "is_ratio", "probability")
-    return {name: getattr(row, name) for name in names}
-
-
-def _notes(documents: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+def _notes(figures: Sequence[ComparedFigures]) -> Iterator[str]:
     """Yield remarks on other programs that ran at the same time, and on too few frames.
 
-    `documents`: reports of all runs on both sides, as JSON.
+    `figures`: figures of all runs on both sides.
     """
-    shares = [share for document in documents if (share := document.get("other_programs") or 0.0) > MOST_OTHERS]
+    shares = [share for each in figures if (share := each.other_programs or 0.0) > MOST_OTHERS]
     if shares:
-        runs = f"{len(shares)} of {len(documents)} runs"
+        runs = f"{len(shares)} of {len(figures)} runs"
         yield (
             f"other programs had more than {100 * MOST_OTHERS:.0f} % of the cores in {runs}, "
             f"{100 * max(shares):.0f} % at most, which makes their intervals wider"
         )
-    presented = [document["frames"]["presented"] for document in documents if "frames" in document]
+    presented = [each.frames.presented for each in figures if each.frames]
     if presented and min(presented) <= LEAST_FRAMES:
         yield f"{min(presented)} frames at the least; to tell what differs, more than {LEAST_FRAMES} are needed"

@@ -22,6 +22,7 @@ from trilane.apps.compare.rows import (
     IDLE,
     LATENCY,
     LOST,
+    PACE,
     SERVICE,
     SHARE,
     WORK,
@@ -35,8 +36,8 @@ from trilane.apps.compare.rows import (
 from trilane.apps.compare.run_frames import INSTRUCTION_TIME, INSTRUCTIONS
 from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, changes
 from trilane.apps.explain.reasons import bound_text
-from trilane.apps.run.verdict import trust_of
 from trilane.errors import BadInputError
+from trilane.pipeline.run_metrics import Bound, PathShare
 from trilane.scheduler.ledger import CAUSES
 from trilane.scheduler.policy import POLICIES
 
@@ -64,23 +65,23 @@ IN_THOUSANDS: Final = 10_000
 
 
 class Bounds(NamedTuple):
-    """The bounds of the runs on both sides, as the key `bound` of report.json; None for a run with an unknown bound.
+    """The bounds of the runs on both sides; None for a run with an unknown bound.
 
     `base`, `other`: bounds on each side, in the order of the runs.
     `outcome`: finding whether the bounding unit changed. A change is certain only if no bound has rivals. If a report
     lacks the key `rivals`, its bound is certain if the unit has more than half of the path.
     """
 
-    base: tuple[Mapping[str, Any] | None, ...]
-    other: tuple[Mapping[str, Any] | None, ...]
+    base: tuple[Bound | None, ...]
+    other: tuple[Bound | None, ...]
 
     @property
     def outcome(self) -> Finding:
-        every = [bound["unit"] if bound else None for bound in (*self.base, *self.other)]
+        every = [bound.unit if bound else None for bound in (*self.base, *self.other)]
         units = [unit for unit in every if unit is not None]
         if len(units) < len(every):
             return Finding.UNKNOWN
-        base, other = ({unit["name"] for unit in side} for side in (units[: len(self.base)], units[len(self.base) :]))
+        base, other = ({unit.name for unit in side} for side in (units[: len(self.base)], units[len(self.base) :]))
         if len(base | other) == 1:
             return Finding.SAME
         is_sure = all(_is_sure(unit) for unit in units)
@@ -88,17 +89,17 @@ class Bounds(NamedTuple):
 
     def as_json(self) -> dict[str, Any]:
         """Return the key `bound` for an entry of `comparisons` in the JSON or, for two sweeps, of `trials`."""
-        return {**self._asdict(), "outcome": str(self.outcome)}
+        sides = {name: [bound and bound.as_json() for bound in side] for name, side in self._asdict().items()}
+        return {**sides, "outcome": str(self.outcome)}
 
 
 def bounds_of(base: Side, other: Side) -> Bounds:
     """Return the bounds in the reports of the sides `base` and `other`."""
-    return Bounds(*(tuple(told.document.get("bound") for told in side.runs) for side in (base, other)))
+    return Bounds(*(tuple(told.figures.bound for told in side.runs) for side in (base, other)))
 
 
-def _is_sure(unit: Mapping[str, Any]) -> bool:
-    rivals = unit.get("rivals")
-    return (unit["share_low"] or 0.0) > 0.5 if rivals is None else not rivals
+def _is_sure(unit: PathShare) -> bool:
+    return (unit.share_low or 0.0) > 0.5 if unit.rivals is None else not unit.rivals
 
 
 @dataclass(frozen=True)
@@ -136,7 +137,11 @@ class Comparison:
             "unsure": list(self.unsure),
             "bound": self.bounds.as_json(),
             "changes": [change._asdict() for change in self.changes],
-            "rows": [_row_document(figure, self) for figure in self.rows],
+            "rows": [
+                {**figure._asdict(), **row.as_json(), "differs": figure in self.differing}
+                | {"outcome": str(self.outcome(figure))}
+                for figure, row in self.rows.items()
+            ],
             "notes": list(self.notes),
         }
 
@@ -151,14 +156,6 @@ class Comparison:
         """Return the finding about `figure`, a key of `rows`."""
         row = self.rows[figure]
         return row.outcome(differs=figure in self.differing, margin=margin_of(figure, row))
-
-
-def compare(base: Side, others: Sequence[Side]) -> list[Comparison]:
-    """Return the comparison of each of the sides `others` with the side `base`, in order.
-
-    Raises BadInputError for a side that has no time in common with `base`.
-    """
-    return [_compared(base, other) for other in others]
 
 
 def document(comparisons: Sequence[Comparison]) -> dict[str, Any]:
@@ -178,17 +175,21 @@ def document(comparisons: Sequence[Comparison]) -> dict[str, Any]:
     }
 
 
-def _compared(base: Side, other: Side) -> Comparison:
+def compare(base: Side, other: Side) -> Comparison:
+    """Return the comparison of the side `other` with the side `base`.
+
+    Raises BadInputError if the sides have no time in common.
+    """
     rows = rows_of(base, other)
     if not rows:
-        names = ", ".join([*base.runs[0].document["stages"]][:8])
+        names = ", ".join([*base.runs[0].figures.stages][:8])
         raise BadInputError(other.name, f"no time that {base.name} has too", f"a measurement with a name of: {names}")
     first = named(rows)
     differing = _differing(rows, first)
     if differing:
         differing += _differing(rows, [figure for figure in rows if figure not in first])
-    changed = tuple(changes(base.runs[0].document, other.runs[0].document))
-    said = verdict(rows, first, differing, changed, _stages(base.runs[0].document))
+    changed = tuple(changes(base.runs[0], other.runs[0]))
+    said = verdict(rows, first, differing, changed, _stages(base.runs[0]))
     return Comparison(base, other, rows, differing, changed, said, bounds_of(base, other), tuple(_notes(base, other)))
 
 
@@ -204,27 +205,27 @@ def _differing(rows: Rows, figures: Sequence[Figure]) -> tuple[Figure, ...]:
     return tuple(figure for figure, probability in tested.items() if fallen.get(figure, probability < ALPHA))
 
 
-def _stages(report: Mapping[str, Any]) -> dict[str, list[str]]:
-    """Return the names of the stages of each unit, by the unit's name. `report`: report as JSON."""
+def _stages(run: ComparedRun) -> dict[str, list[str]]:
+    """Return the names of the stages of each unit, by the unit's name."""
     found: dict[str, list[str]] = {}
-    for name, row in report["stages"].items():
-        found.setdefault(row["unit"], []).append(name)
+    for name, stage in run.figures.stages.items():
+        found.setdefault(stage.unit, []).append(name)
     return found
 
 
 def _notes(base: Side, other: Side) -> list[str]:
     runs = {told.name: told for told in (*base.runs, *other.runs)}
-    notes = remarks({name: told.document for name, told in runs.items()})
+    notes = remarks(runs.values())
     if len(base.runs) > 1:
         notes.append(SEVERAL)
     return notes + [f"{name}: {text}" for name, told in runs.items() for text in _about(told)]
 
 
 def spoilt(runs: Sequence[ComparedRun]) -> Iterator[str]:
-    """Yield a sentence for each of `runs` that cannot be trusted. Predictions and imported times are not judged."""
+    """Yield a sentence for each of `runs` that cannot be trusted."""
     for told in runs:
-        if told.kind in (RunKind.RUN, RunKind.REPORT) and not (trust := trust_of(told.document)).trusted:
-            yield f"{told.name} is {trust.said}"
+        if not told.trust.trusted:
+            yield f"{told.name} is {told.trust.said}"
 
 
 def _about(told: ComparedRun) -> Iterator[str]:
@@ -235,9 +236,9 @@ def _about(told: ComparedRun) -> Iterator[str]:
         yield "imported times, so only what has a name on both sides is compared; nobody knows what else ran"
     if told.kind is RunKind.PREDICTION:
         yield "computed by a model, with the error that it expects of itself"
-    if told.frames is None:
+    if told.frames is None or told.figures.frames is None:
         return
-    presented = told.document["frames"]["presented"]
+    presented = told.figures.frames.presented
     if told.remark:
         yield told.remark
     elif not told.frames.is_whole:
@@ -246,22 +247,6 @@ def _about(told: ComparedRun) -> Iterator[str]:
         yield f"compared by its last {MOST_FRAMES} frames"
     if presented <= LEAST_FRAMES:
         yield f"{presented} frames; to tell what differs, more than {LEAST_FRAMES} are needed"
-
-
-def _row_document(figure: Figure, comparison: Comparison) -> dict[str, Any]:
-    row = comparison.rows[figure]
-    return {
-        **figure._asdict(),
-        "base": row.base,
-        "other": row.other,
-        "change": row.change,
-        "low": row.low,
-        "high": row.high,
-        "is_ratio": row.is_ratio,
-        "probability": row.probability,
-        "differs": figure in comparison.differing,
-        "outcome": str(comparison.outcome(figure)),
-    }
 
 
 def verdict(
@@ -367,9 +352,7 @@ def _works(found: Rows, rows: Rows, changes: Sequence[Change]) -> Iterator[str]:
     for figure, row in found.items():
         if figure.measure == measure and figure.of not in counted:
             by_stage.setdefault(figure.of, (figure, row))
-    held = {
-        change.key.removeprefix("config.pace_ns.") for change in changes if change.key.startswith("config.pace_ns.")
-    }
+    held = {change.key.removeprefix(PACE) for change in changes if change.key.startswith(PACE)}
     ordered = sorted(by_stage.values(), key=lambda each: -abs(each[1].other - each[1].base))
     for figure, row in ordered[:MOST_NAMED]:
         at = "" if figure.statistic in ("typical", "mean") else f" at {figure.statistic}"
@@ -520,14 +503,14 @@ def bounds_text(bounds: Bounds) -> str:
     return f"bound{changed}: {bound_of_runs(bounds.other)}; was {bound_of_runs(bounds.base)}{unsure}"
 
 
-def bound_of_runs(bounds: Sequence[Mapping[str, Any] | None]) -> str:
+def bound_of_runs(bounds: Sequence[Bound | None]) -> str:
     """Return the bound of a single run in words. For several runs, return how many runs each unit bounded.
 
-    `bounds`: bound of each run, as in report.json; None if it is unknown.
+    `bounds`: bound of each run; None if it is unknown.
     """
     if len(bounds) == 1:
-        return bound_text(bounds[0]) if bounds[0] else "not known"
-    names = Counter(bound["unit"]["name"] if bound else "not known" for bound in bounds)
+        return bound_text(bounds[0].as_json()) if bounds[0] else "not known"
+    names = Counter(bound.unit.name if bound else "not known" for bound in bounds)
     return ", ".join(f"{name} in {count} of {len(bounds)} runs" for name, count in names.most_common())
 
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from itertools import pairwise
 from math import ceil, expm1, inf, log, log1p, sqrt
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -111,6 +111,11 @@ class Difference(NamedTuple):
     deviation: float | None = None
     freedom: float = inf
     explained: float = 0.0
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the keys of a difference in the output of `trilane compare --json`."""
+        names = ("base", "other", "change", "low", "high", "is_ratio", "probability")
+        return {name: getattr(self, name) for name in names}
 
     @property
     def effect(self) -> float:

@@ -21,6 +21,7 @@ from typing import Any, Final, NamedTuple
 from trilane.apps.compare.comparison import change_of, interval_of, name_of, spoilt
 from trilane.apps.compare.difference import ALPHA, Difference, rejected
 from trilane.apps.compare.rows import (
+    CHECKED,
     DROPPED,
     FRAME_TIME,
     LATENCY,
@@ -29,7 +30,7 @@ from trilane.apps.compare.rows import (
     WORK,
     Figure,
     Rows,
-    exact_rows,
+    check_rows,
     relief_of,
 )
 from trilane.apps.compare.run_frames import CPU, INSTRUCTIONS
@@ -42,7 +43,6 @@ MOST_RUNS: Final = 200
 PERCENT, DECIBELS = "%", "dB"
 #: A stage's CPU time and its time on the core count as equal if they differ by at most this share.
 SAME_TIME: Final = 0.05
-CHECKED: Final = "check"
 #: Measures that are judged with other programs' share taken out.
 WALL: Final = (FRAME_TIME, LATENCY)
 MOST_SAID: Final = 4
@@ -263,13 +263,14 @@ def judge(gates: Sequence[Gate], pairs: Sequence[GatedPair]) -> list[JudgedLimit
     found = []
     for gate, pair, figures in asked:
         settled = tuple(_settled(each, id(each) in surely, len(every), pair) for each in figures)
-        found.append(_judged(gate, pair, settled))
+        outcome, reason, runs = _judged(gate, pair, settled)
+        found.append(JudgedLimit(gate, pair.name, outcome, reason, settled, runs))
     return found
 
 
 def _weighed(gate: Gate, pair: GatedPair) -> Iterator[Weighed]:
     relief, metric = relief_of(pair.base, pair.other), gate.metric
-    rows = exact_rows(pair.base, pair.other, CHECKED, "dB") if metric.of[0][0] == CHECKED else pair.rows
+    rows = check_rows(pair.base, pair.other) if metric.of[0][0] == CHECKED else pair.rows
     is_quiet = not [*spoilt(_runs(pair))]
     works = {figure.of: row for figure, row in rows.items() if (figure.measure, figure.statistic) == (WORK, "typical")}
     for figure, row in rows.items():
@@ -354,28 +355,26 @@ def runs_needed(each: Weighed, sizes: tuple[int, int], tests: int) -> float | No
     return inf
 
 
-def _judged(gate: Gate, pair: GatedPair, figures: tuple[Weighed, ...]) -> JudgedLimit:
-    worse = [each for each in figures if each.outcome is LimitOutcome.BROKEN]
-    if worse:
-        return JudgedLimit(gate, pair.name, LimitOutcome.BROKEN, f"{gate.metric.says}: {_list(worse)}", figures)
-    if not figures and gate.metric is METRICS["lost"] and all("frames" in run.document for run in _runs(pair)):
-        return JudgedLimit(gate, pair.name, LimitOutcome.KEPT, "no run lost or dropped a frame", figures)
+def _judged(gate: Gate, pair: GatedPair, figures: tuple[Weighed, ...]) -> tuple[LimitOutcome, str, float | None]:
+    """Return outcome, reason and number of runs of a `JudgedLimit`."""
+    if worse := [each for each in figures if each.outcome is LimitOutcome.BROKEN]:
+        return LimitOutcome.BROKEN, f"{gate.metric.says}: {_list(worse)}", None
+    if not figures and gate.metric is METRICS["lost"] and all(run.figures.frames for run in _runs(pair)):
+        return LimitOutcome.KEPT, "no run lost or dropped a frame", None
     if not figures:
-        reason = ABSENT.get(gate.metric.of[0][0], "the two sides share no such figure")
-        return JudgedLimit(gate, pair.name, LimitOutcome.UNKNOWN, reason, figures)
+        return LimitOutcome.UNKNOWN, ABSENT.get(gate.metric.of[0][0], "the two sides share no such figure"), None
     if gate.metric.of[0][0] != CHECKED and (missing := _missing(pair)):
-        return JudgedLimit(gate, pair.name, LimitOutcome.UNKNOWN, f"not on both sides: {', '.join(missing)}", figures)
+        return LimitOutcome.UNKNOWN, f"not on both sides: {', '.join(missing)}", None
     unsure = [*spoilt(_runs(pair))]
     decisive = _decisive(gate, pair, figures)
     unknown = [each for each in decisive if each.outcome is LimitOutcome.UNKNOWN]
+    if not unknown and unsure and gate.metric.is_timed:
+        return LimitOutcome.UNKNOWN, f"{'; '.join(unsure)}; repeat it", None
     if not unknown:
-        if unsure and gate.metric.is_timed:
-            return JudgedLimit(gate, pair.name, LimitOutcome.UNKNOWN, f"{'; '.join(unsure)}; repeat it", figures)
-        return JudgedLimit(gate, pair.name, LimitOutcome.KEPT, _list(decisive), figures)
+        return LimitOutcome.KEPT, _list(decisive), None
     counts = [each.runs for each in unknown]
     runs = None if None in counts else max(count for count in counts if count is not None)
-    reason = f"{_list(unknown)}; {_remedy(unknown, runs, unsure)}"
-    return JudgedLimit(gate, pair.name, LimitOutcome.UNKNOWN, reason, figures, runs)
+    return LimitOutcome.UNKNOWN, f"{_list(unknown)}; {_remedy(unknown, runs, unsure)}", runs
 
 
 def _missing(pair: GatedPair) -> list[str]:
@@ -383,8 +382,8 @@ def _missing(pair: GatedPair) -> list[str]:
 
     For such a stage, the change between the sides is unknown.
     """
-    stages = [{*run.document.get("stages", {})} for run in _runs(pair)]
-    return sorted(set().union(*stages) - set[str]().union(*stages[:1]).intersection(*stages))
+    first, *rest = ({*run.figures.stages} for run in _runs(pair))
+    return sorted(first.union(*rest) - first.intersection(*rest))
 
 
 def _runs(pair: GatedPair) -> tuple[ComparedRun, ...]:
@@ -401,7 +400,7 @@ def _decisive(gate: Gate, pair: GatedPair, figures: Sequence[Weighed]) -> list[W
     """
     counted = [each for each in figures if each.figure.measure == INSTRUCTIONS]
     frames = [each for each in figures if each.figure.measure == FRAME_TIME]
-    stages = pair.base.runs[0].document["stages"]
+    stages = pair.base.runs[0].figures.stages
     is_counted = len(counted) == len(stages) > 0 and not pair.changes and gate.name == "slower"
     if is_counted:
         return [*counted, *(each for each in frames if not each.is_near)]

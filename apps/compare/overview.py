@@ -21,7 +21,7 @@ from typing import Any
 
 from trilane.apps.compare.frontier import SAME_DB, frontier, knees
 from trilane.apps.run.report import MAX_REPORT_BYTES
-from trilane.apps.sweep.store import TRIALS, read_trials
+from trilane.apps.sweep.store import TRIALS, TrialRecord, read_trials
 from trilane.errors import BadInputError, MissingPartError
 from trilane.files import instead_of_file, require_file
 from trilane.hw_profiles.schema import SHARE_TEXT
@@ -42,18 +42,8 @@ HOW_DRAWN = (
 WITHOUT_KEY = ("name", "background", "output.width", "output.height", "camera.source", "avatars[0].motion")
 #: Keys of a document's `config` that are no settings, or that the row has under other names.
 NOT_SETTINGS = (
-    "avatar_dirs",
-    "networks",
-    "shapes",
-    "changes",
-    "own_pixels",
-    "size_curves",
-    "works",
-    "posed_vertices",
-    "pace_ns",
-    "units",
-    "cuts",
-    "record",
+    *("avatar_dirs", "networks", "shapes", "changes", "own_pixels", "size_curves"),
+    *("works", "posed_vertices", "pace_ns", "units", "cuts", "record"),
 )
 REPORT, VIDEO = "report.json", "video.mp4"
 EXPECTED = "a run folder, a sweep's folder, a prediction that was saved with --json, or a folder of these"
@@ -126,7 +116,7 @@ def _document(path: Path) -> Mapping[str, Any]:
     return document
 
 
-def _names(trials: Sequence[Mapping[str, Any]]) -> list[str]:
+def _names(trials: Sequence[TrialRecord]) -> list[str]:
     """Return names for the trials of one sweep: the values of the options that differ, such as `256, openvino`.
 
     If several of these options have numbers, these options are written with their names. An option that is on or off is
@@ -134,20 +124,19 @@ def _names(trials: Sequence[Mapping[str, Any]]) -> list[str]:
     If their names are still the same, the id is added. A trial without any such option is named by its id.
     `trials`: last record of each trial.
     """
-    options = [dict(_settings(_dict(trial.get("options")))) for trial in trials]
+    options = [dict(_settings(trial.options)) for trial in trials]
     keys = [key for key in dict.fromkeys(chain(*options)) if len({each.get(key) for each in options}) > 1]
     numbers = [key for key in keys if all(_is_number(each.get(key, "")) for each in options)]
     with_key = set(numbers) if len(numbers) > 1 else set()
     parts = [[_named(key, each.get(key), key in with_key) for key in keys] for each in options]
     names = [", ".join(filter(None, each)) for each in parts]
-    repeats = [f"repeat {trial.get('repeat', 1)}" for trial in trials]
-    for own in (repeats, [_text(trial.get("id")) for trial in trials]):
+    for own in ([f"repeat {trial.repeat}" for trial in trials], [_text(trial.id) for trial in trials]):
         counts = Counter(names)
         names = [
             ", ".join(filter(None, (name, own[number]))) if counts[name] > 1 else name
             for number, name in enumerate(names)
         ]
-    return [name or _text(trial.get("id")) for name, trial in zip(names, trials, strict=True)]
+    return [name or _text(trial.id) for name, trial in zip(names, trials, strict=True)]
 
 
 def _named(key: str, value: str | None, has_key: bool) -> str:
@@ -167,33 +156,24 @@ def _is_number(text: str) -> bool:
         return False
 
 
-def _trial(folder: Path, trial: Mapping[str, Any], name: str) -> Entry:
-    result = trial.get("result")
-    document = dict(result) if isinstance(result, dict) else {}
-    document["made"] = {**_dict(document.get("made")), "command": trial.get("command")}
-    document.setdefault("clock", trial.get("clock", HOST_CLOCK))
-    document.setdefault("machine", trial.get("host"))
-    if trial.get("status") != "done":
-        error = trial.get("error")
-        ended = f"{trial.get('status')}, exit code {trial.get('exit_code')}"
-        document["failure"] = f"{ended}: {error}" if error else ended
-    video = _video(folder, trial.get("folder"))
-    entry = entry_of(name, document, video, _dict(trial.get("options")))
-    return replace(entry, trial=_text(trial.get("id")))
+def _trial(folder: Path, trial: TrialRecord, name: str) -> Entry:
+    document = {"clock": trial.clock, "machine": trial.host, **(trial.result or {})}
+    document["made"] = {**_mapping(document, "made"), "command": list(trial.command)}
+    if trial.status != "done":
+        ended = f"{trial.status}, exit code {trial.exit_code}"
+        document["failure"] = f"{ended}: {trial.error}" if trial.error else ended
+    entry = entry_of(name, document, _video(folder, trial.folder), trial.options)
+    return replace(entry, trial=_text(trial.id))
 
 
-def _dict(value: Any) -> dict[str, Any]:
-    return dict(value) if isinstance(value, dict) else {}
-
-
-def _video(folder: Path, name: Any) -> Path | None:
+def _video(folder: Path, name: str | None) -> Path | None:
     """Return the path of the video in a trial's run folder; the file may not exist.
 
-    None is returned if `name` is no text, or leads out of the sweep's folder.
+    None is returned without a run folder, or if its name leads out of the sweep's folder.
     `folder`: folder of the sweep.
     `name`: name of the run folder from the trial's record.
     """
-    if not isinstance(name, str):
+    if name is None:
         return None
     place = (folder / name).resolve()
     return place / VIDEO if place.is_relative_to(folder.resolve()) else None
@@ -436,7 +416,7 @@ def _time(value: Any) -> float | None:
     return number if number is not None and number > 0 else None
 
 
-def varied(entries: list[Entry]) -> list[str]:
+def varied(entries: Sequence[Entry]) -> list[str]:
     """Return the keys of the settings in which `entries` differ, in the order of their first appearance."""
     keys = dict.fromkeys(key for entry in entries for key in entry.settings)
     return [key for key in keys if len({entry.settings[key] for entry in entries if key in entry.settings}) > 1]
@@ -474,14 +454,12 @@ def told_choices(entries: Sequence[Entry]) -> Iterator[str]:
             )
 
 
-def columns(entries: Sequence[Entry]) -> list[str]:
-    """Return the names of the table's columns: `name`, the settings in which `entries` differ, `FIGURES`, `SOURCES`."""
-    return ["name", *varied(list(entries)), *FIGURES, *SOURCES]
-
-
 def table_rows(entries: Sequence[Entry]) -> list[dict[str, Any]]:
-    """Return a row for each entry: values by the names of the `columns`; None for a missing value."""
-    settings = varied(list(entries))
+    """Return a row for each entry: values by the names of the columns; None for a missing value.
+
+    The columns are `name`, the settings in which `entries` differ, `FIGURES` and `SOURCES`.
+    """
+    settings = varied(entries)
     return [
         {
             "name": entry.name,
@@ -500,9 +478,10 @@ def write_csv(target: Path, entries: Sequence[Entry]) -> None:
     Raises BadInputError if `target` cannot be written.
     """
     with write_atomically(target) as draft, draft.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, columns(entries))
+        rows = table_rows(entries)
+        writer = csv.DictWriter(file, list(rows[0]))
         writer.writeheader()
-        writer.writerows(table_rows(entries))
+        writer.writerows(rows)
 
 
 def write_parquet(target: Path, entries: Sequence[Entry]) -> None:

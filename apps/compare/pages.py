@@ -35,7 +35,7 @@ from trilane.apps.compare.comparison import (
 )
 from trilane.apps.compare.difference import Difference
 from trilane.apps.compare.frontier import SAME_DB, frontier, knees
-from trilane.apps.compare.overview import Entry, columns, table_rows, told_choices
+from trilane.apps.compare.overview import Entry, table_rows, told_choices
 from trilane.apps.compare.rows import Figure
 from trilane.hw_profiles.schema import SHARE_TEXT
 
@@ -136,13 +136,14 @@ def _told(group: tuple[str, ...]) -> str:
 
 
 def _table(title: str, entries: Sequence[Entry]) -> str:
-    names = columns(entries)
+    found = table_rows(entries)
+    names = list(found[0])
     head = "".join(
         f'<th scope="col"><button type="button">{escape(UNITS.get(name, name))}</button></th>' for name in names
     )
     rows = "\n".join(
         f"<tr{' class=on' if row['on_frontier'] else ''}>{''.join(_cell(name, row[name]) for name in names)}</tr>"
-        for row in table_rows(entries)
+        for row in found
     )
     return (
         '<p><label>Filter <input id="filter" type="search" placeholder="words, all of which a row has"></label> '
@@ -262,7 +263,8 @@ def scatter(dots: Sequence[Dot], x_title: str, y_title: str) -> str:
     if not dots:
         return ""
     xs = [value for dot in dots for value in (dot.x, dot.low, dot.high) if value is not None]
-    across, up = _Axis(min(xs), max(xs), LEFT, WIDTH - RIGHT), _Axis(*_reach(dots), HEIGHT - BOTTOM, TOP)
+    ys = [dot.y for dot in dots]
+    across, up = _Axis(min(xs), max(xs), LEFT, WIDTH - RIGHT), _Axis(min(ys), max(ys), HEIGHT - BOTTOM, TOP)
     parts = [
         *_grid(across, up),
         *_steps(dots, across, up),
@@ -301,10 +303,6 @@ class _Axis:
         step *= next(factor for factor in (1, 2, 5, 10) if (self._high - self._low) / (factor * step) <= TICKS)
         first = math.ceil(self._low / step)
         return [number * step for number in range(first, math.floor(self._high / step) + 1)]
-
-
-def _reach(dots: Sequence[Dot]) -> tuple[float, float]:
-    return min(dot.y for dot in dots), max(dot.y for dot in dots)
 
 
 def _grid(across: _Axis, up: _Axis) -> Iterator[str]:

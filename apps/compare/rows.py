@@ -28,7 +28,7 @@ from trilane.apps.compare.difference import (
     unsure,
 )
 from trilane.apps.compare.run_frames import CPU, INSTRUCTION_TIME, INSTRUCTIONS, Key
-from trilane.apps.compare.sides import ComparedRun, RunKind, Side, changes
+from trilane.apps.compare.sides import ComparedFigures, ComparedRun, RunKind, Side, Statistics, changes
 from trilane.apps.run.verdict import MOST_OTHERS
 from trilane.hw_profiles.schema import SIGMAS
 from trilane.scheduler.stats import student_quantile
@@ -37,7 +37,7 @@ from trilane.units import HOST_CLOCK
 FRAME_TIME, LATENCY, WORK, SERVICE, WAIT, BUSY, IDLE = (
     "frame time", "latency", "work", "service", "wait", "busy", "idle",
 )  # fmt: skip
-LOST, DROPPED, ERROR = "lost", "dropped", "error"
+LOST, DROPPED, ERROR, CHECKED = "lost", "dropped", "error", "check"
 MS, NS, SHARE, BYTES = "ms", "ns", "share", "bytes"
 #: Measure -> its statistics, for runs with a journal.
 MEASURES: Final = {
@@ -77,7 +77,9 @@ TAILS: Final = {"p90": 1.5, "p99": 4.0}
 WAIT_FLOOR_MS: Final = 0.05  # deviation of any wait: the time of a message varies by so much
 #: Settings that do not change the speed of a core.
 SAME_CORES: Final = ("policy", "edge", "made.", "config.pace_ns", "config.scene", "idle_cores")
-Documents = Sequence[Mapping[str, Any]]
+#: Begin of the keys of settings that hold the jobs of a stage to a time.
+PACE: Final = "config.pace_ns."
+Runs = Sequence[ComparedRun]
 
 
 class Figure(NamedTuple):
@@ -145,7 +147,7 @@ def _noise(base: Side, other: Side) -> Noise:
             change = _difference(base, other, key, "typical", Chance())
             if change.is_ratio:
                 effects[key.of] = change.effect
-    return noise_between([told.document for told in base.runs], [told.document for told in other.runs], effects)
+    return noise_between(base.runs, other.runs, effects)
 
 
 def _shared(base: Side, other: Side) -> list[Key]:
@@ -189,7 +191,7 @@ def _of_summaries(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figur
     `base`, `other`: runs of each side.
     `noise`: noise between the runs of the two sides.
     """
-    sides = [[_summaries(told.document) for told in side.runs] for side in (base, other)]
+    sides = [[_summaries(told.figures) for told in side.runs] for side in (base, other)]
     within = _relative_variance(base, other)
     for figure in sides[0][0]:
         if any(figure not in run for side in sides for run in side):
@@ -214,9 +216,7 @@ def _relative_variance(base: Side, other: Side) -> float | None:
     if any other document has no interval.
     """
     runs = [*base.runs, *other.runs]
-    if all(
-        told.kind == RunKind.PREDICTION and told.document["machine"] == runs[0].document["machine"] for told in runs
-    ):
+    if all(told.kind == RunKind.PREDICTION and told.figures.machine == runs[0].figures.machine for told in runs):
         return 0.0
     found = [[_deviation_of(told) for told in side.runs] for side in (base, other)]
     if any(value is None for side in found for value in side):
@@ -226,37 +226,34 @@ def _relative_variance(base: Side, other: Side) -> float | None:
 
 def _deviation_of(told: ComparedRun) -> float | None:
     if told.kind is RunKind.TIMES:
-        deviation: float | None = told.document["deviation"]
-        return deviation
-    times = told.document["frame_time_ms"]
-    low, high, quantile = (
-        (times["low"], times["high"], SIGMAS)
-        if told.kind is RunKind.PREDICTION
-        else (times.get("mean_low"), times.get("mean_high"), student_quantile(inf))
-    )
-    if low is None or high is None or not times["mean"]:
-        return 0.0 if told.document["clock"] == "virtual" else None
-    return float((high - low) / (2 * quantile * times["mean"]))
+        return told.figures.deviation
+    times = told.figures.frame_time_ms
+    is_computed = told.kind is RunKind.PREDICTION
+    names, quantile = (("low", "high"), SIGMAS) if is_computed else (("mean_low", "mean_high"), student_quantile(inf))
+    low, high = map(times.get, names)
+    if low is None or high is None or not (mean := times.get("mean")):
+        return 0.0 if told.figures.clock == "virtual" else None
+    return (high - low) / (2 * quantile * mean)
 
 
-def _summaries(document: Mapping[str, Any]) -> dict[Figure, float]:
+def _summaries(figures: ComparedFigures) -> dict[Figure, float]:
     found: dict[Figure, float] = {}
-    for measure, times in ((FRAME_TIME, document["frame_time_ms"]), (LATENCY, document["latency_ms"])):
+    for measure, times in ((FRAME_TIME, figures.frame_time_ms), (LATENCY, figures.latency_ms)):
         found.update(_statistics(measure, "", times, MEASURES[measure]))
-    for stage, row in document["stages"].items():
-        found.update(_statistics(CPU, stage, row.get("cpu_ms") or {}, ("mean",)))
-        found.update(_statistics(SERVICE, stage, row.get("service_ms", {}), MEASURES[SERVICE]))
-        found.update(_statistics(WAIT, stage, row.get("wait_ms", {}), MEASURES[WAIT]))
-    for unit, row in document["units"].items():
-        found[Figure(BUSY, unit, "", SHARE, SHARE)] = row["busy"]
-        for cause, share in row["idle"].items():
+    for name, stage in figures.stages.items():
+        found.update(_statistics(CPU, name, stage.cpu_ms or {}, ("mean",)))
+        found.update(_statistics(SERVICE, name, stage.service_ms, MEASURES[SERVICE]))
+        found.update(_statistics(WAIT, name, stage.wait_ms, MEASURES[WAIT]))
+    for name, unit in figures.units.items():
+        found[Figure(BUSY, name, "", SHARE, SHARE)] = unit.busy
+        for cause, share in unit.idle.items():
             if share is not None:
-                found[Figure(IDLE, unit, cause, SHARE, SHARE)] = share
+                found[Figure(IDLE, name, cause, SHARE, SHARE)] = share
     return found
 
 
-def _statistics(measure: str, of: str, times: Mapping[str, Any], names: Sequence[str]) -> dict[Figure, float]:
-    return {Figure(measure, of, "", name, MS): float(times[name]) for name in names if times.get(name) is not None}
+def _statistics(measure: str, of: str, times: Statistics, names: Sequence[str]) -> dict[Figure, float]:
+    return {Figure(measure, of, "", name, MS): ms for name in names if (ms := times.get(name)) is not None}
 
 
 def _of_counts(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figure, Difference]]:
@@ -266,13 +263,14 @@ def _of_counts(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figure, 
     `base`, `other`: runs of each side.
     `noise`: noise between the runs of the two sides.
     """
-    if any("frames" not in told.document for told in (*base.runs, *other.runs)):
+    sides = [[told.figures.frames for told in side.runs if told.figures.frames] for side in (base, other)]
+    if sum(map(len, sides)) < len(base.runs) + len(other.runs):
         return
-    sides = [[told.document["frames"] for told in side.runs] for side in (base, other)]
     for measure, causes in ((LOST, "lost_by_cause"), (DROPPED, DROPPED)):
-        for cause in dict.fromkeys(cause for side in sides for frames in side for cause in frames.get(causes, {})):
-            counts = [[frames.get(causes, {}).get(cause, 0) for frames in side] for side in sides]
-            asked = [[frames["requested"] or 1 for frames in side] for side in sides]
+        by_cause = [[getattr(frames, causes) for frames in side] for side in sides]
+        for cause in dict.fromkeys(cause for side in by_cause for found in side for cause in found):
+            counts = [[found.get(cause, 0) for found in side] for side in by_cause]
+            asked = [[frames.requested or 1 for frames in side] for side in sides]
             values = [np.divide(*both) for both in zip(counts, asked, strict=True)]
             pooled = sum(map(sum, counts)) / sum(map(sum, asked))
             within = pooled * max(1 - pooled, 0.0) * sum(1 / sum(each) for each in asked)
@@ -285,23 +283,21 @@ def _of_errors(base: Side, other: Side) -> Iterator[tuple[Figure, Difference]]:
 
     The accuracy was measured once and does not scatter, so every change counts.
     """
-    first, second = (dict(_numbers("", side.runs[0].document.get("accuracy", {}))) for side in (base, other))
+    first, second = (dict(_numbers("", side.runs[0].figures.accuracy)) for side in (base, other))
     for name, value in first.items():
         if name in second:
             unit = "dB" if "psnr" in name else ""
             yield Figure(ERROR, name, "", "", unit), judged(value, second[name], 0.0, is_ratio=False)
 
 
-def exact_rows(base: Side, other: Side, key: str, unit: str) -> Rows:
-    """Return the differences of the float values under one key of the reports, without scatter within a run.
+def check_rows(base: Side, other: Side) -> Rows:
+    """Return the differences of the float values under `check` of the reports, without scatter within a run.
 
     The result is empty if a report lacks the key. It is also empty if the reports differ in integers, lists and texts
     under the key, such as the checked frames.
     `base`, `other`: runs of each side.
-    `key`: key of the reports.
-    `unit`: unit of the values.
     """
-    sides = [[told.document.get(key) or {} for told in side.runs] for side in (base, other)]
+    sides = [[told.figures.check or {} for told in side.runs] for side in (base, other)]
     every = [found for side in sides for found in side]
     about = (str, list, tuple, int)
     alike = {str(sorted((name, value) for name, value in each.items() if isinstance(value, about))) for each in every}
@@ -316,7 +312,7 @@ def exact_rows(base: Side, other: Side, key: str, unit: str) -> Rows:
             row = judged(values[0][0], values[1][0], 0.0, is_ratio=False)
         else:
             row = settled(values, [np.array(side) for side in values], 0.0, Chance(freedom=0), is_ratio=False)
-        rows[Figure(key, "", "", name, unit)] = row
+        rows[Figure(CHECKED, "", "", name, "dB")] = row
     return rows
 
 
@@ -389,14 +385,14 @@ class Noise(NamedTuple):
         return Chance(relative, absolute, FREEDOM, explained) if self.is_real else Chance()
 
 
-def noise_between(base: Documents, other: Documents, effects: Mapping[str, float]) -> Noise:
+def noise_between(base: Runs, other: Runs, effects: Mapping[str, float]) -> Noise:
     """Return the noise between the runs of two sides.
 
-    `base`, `other`: reports of the runs of each side, as JSON.
+    `base`, `other`: runs of each side.
     `effects`: logarithm of the ratio of the typical times on the core, other side to base, by stage.
     """
     runs = [*base, *other]
-    if all(run["clock"] != HOST_CLOCK for run in runs):
+    if all(run.figures.clock != HOST_CLOCK for run in runs):
         return Noise(is_real=False)
     first, second = (_others(side) for side in (base, other))
     more, wall = abs(fmean(second) - fmean(first)), abs(_wall(first, second))
@@ -413,12 +409,12 @@ def relief_of(base: Side, other: Side) -> float:
     less time there. It is 0 if a side has no run on the host clock.
     `base`, `other`: runs of each side.
     """
-    sides = [[told.document for told in side.runs if told.document["clock"] == HOST_CLOCK] for side in (base, other)]
+    sides = [[told for told in side.runs if told.figures.clock == HOST_CLOCK] for side in (base, other)]
     return _wall(*map(_others, sides)) if all(sides) else 0.0
 
 
-def _others(reports: Documents) -> list[float]:
-    return [report.get("other_programs") or 0.0 for report in reports]
+def _others(runs: Runs) -> list[float]:
+    return [run.figures.other_programs or 0.0 for run in runs]
 
 
 def _wall(base: Sequence[float], other: Sequence[float]) -> float:
@@ -433,46 +429,44 @@ def _left(others: float) -> float:
     return log1p(-min(others, 1 - LEAST_LEFT))
 
 
-def _held(report: Mapping[str, Any]) -> frozenset[str]:
-    return frozenset(stage for stage, ns in report["config"].get("pace_ns", {}).items() if ns)
+def _held(run: ComparedRun) -> frozenset[str]:
+    return frozenset(key.removeprefix(PACE) for key, ns in run.settings.items() if key.startswith(PACE) and ns)
 
 
-def _slower_cores(base: Mapping[str, Any], other: Mapping[str, Any], effects: Mapping[str, float]) -> dict[str, float]:
+def _slower_cores(base: ComparedRun, other: ComparedRun, effects: Mapping[str, float]) -> dict[str, float]:
     """Return, by stage, the change that the speed of the stage's cores explains, as a logarithm.
 
     If all stages on the same cores changed in one direction, it is the smallest of their changes. Possible causes are
     the clock, the temperature, or another machine on the same hardware. For a single stage on its cores, and for
     changes in both directions, it is 0. If a setting changed that may change the speed of the cores, the result is
     empty.
-    `base`, `other`: reports of the first run of each side, as JSON.
+    `base`, `other`: first run of each side.
     `effects`: as in `noise_between`.
     """
     if any(not change.key.startswith(SAME_CORES) for change in changes(base, other)):
         return {}
     found = {}
-    for stages in _stages_by_cores(base):
+    for stages in _stages_by_cores(base.figures):
         ratios = [effects[stage] for stage in stages if stage in effects]
         alike = len(ratios) > 1 and (min(ratios) > 0 or max(ratios) < 0)
         found.update(dict.fromkeys(stages, min(map(abs, ratios)) if alike else 0.0))
     return found
 
 
-def _stages_by_cores(report: Mapping[str, Any]) -> Iterable[list[str]]:
+def _stages_by_cores(figures: ComparedFigures) -> Iterable[list[str]]:
     found: dict[tuple[int, ...], list[str]] = {}
-    for stage, row in report["stages"].items():
-        found.setdefault(tuple(report["units"].get(row["unit"], {}).get("cores", ())), []).append(stage)
+    for name, stage in figures.stages.items():
+        unit = figures.units.get(stage.unit)
+        found.setdefault(unit.cores if unit else (), []).append(name)
     return found.values()
 
 
-def remarks(reports: Mapping[str, Mapping[str, Any]]) -> list[str]:
-    """Return sentences about runs for which the share of other programs is unknown or large.
-
-    `reports`: report of each run as JSON, by the run's name.
-    """
+def remarks(runs: Iterable[ComparedRun]) -> list[str]:
+    """Return sentences about `runs` for which the share of other programs is unknown or large."""
     said = []
-    for name, report in reports.items():
-        others = report.get("other_programs")
-        if report["clock"] == HOST_CLOCK and others is None:
+    for run in runs:
+        name, others = run.name, run.figures.other_programs
+        if run.figures.clock == HOST_CLOCK and others is None:
             said.append(f"{name}: what other programs had of its cores is not known; they are taken to have had none")
         elif others is not None and others > MOST_OTHERS:
             longer = 1 / max(1 - others, LEAST_LEFT) - 1

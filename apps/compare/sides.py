@@ -1,8 +1,7 @@
 """The runs to compare, read from disk: run folders, reports, predictions and imported times, with their settings.
 
 Rule: an error names what cannot be compared. A run folder with a journal has every frame; a report alone, or a
-prediction, has summaries. A run that was killed has no report. Its journal gives the keys that a comparison reads, and
-`NOT_KNOWN` names the missing keys.
+prediction, has summaries. A run that was killed has no report. Its journal gives the keys that a comparison reads.
 
 An imported time is compared with the imported time, or the stage of a run, that has the same name. If a file has
 exactly one wall time, this is used as the frame time. The state of the machine is not known. Therefore two imported
@@ -27,13 +26,14 @@ from pydantic_core import from_json, to_json
 from trilane.apps.compare.difference import COMPARED, STATISTICS
 from trilane.apps.compare.run_frames import Key, RunFrames, read_frames
 from trilane.apps.run.report import MAX_REPORT_BYTES, read_report
+from trilane.apps.run.verdict import Trust, trust_of
 from trilane.apps.watch.followed_run import FollowedRun, RunState, folder_of
 from trilane.errors import BadInputError
 from trilane.files import require_file
 from trilane.pipeline.journal import NAME as JOURNAL
 from trilane.pipeline.journal import read_journal
 from trilane.pipeline.reckoning import places_of, reckoned
-from trilane.pipeline.run_metrics import metrics_in
+from trilane.pipeline.run_metrics import Bound, Record, metrics_in
 from trilane.units import HOST_CLOCK
 
 EXPECTED: Final = (
@@ -45,20 +45,11 @@ OF_A_PREDICTION: Final = ("expected_error", "network", "frame_time_ms", "units",
 FACTS: Final = ("config", "machine", "made", "accuracy")
 #: Parts of a report that say how the run was made.
 PARTS: Final = (
-    "clock",
-    "policy",
-    "edge",
-    "config",
-    "stages",
-    "caps.performance_profile",
-    "machine",
-    "made",
-    "idle_cores",
+    *("clock", "policy", "edge", "config", "stages"),
+    *("caps.performance_profile", "machine", "made", "idle_cores"),
 )
 #: Keys that a report has both at its top and in `config`, and that a prediction has only in `config`.
 TWICE: Final = ("policy", "edge")
-#: Key of a document with its unknown `PARTS`. Changes of these are not listed.
-NOT_KNOWN: Final = "not_known"
 #: Keys that differ between any two runs.
 ALWAYS_DIFFERENT: Final = ("made.at", "made.command")
 
@@ -75,22 +66,105 @@ class RunKind(StrEnum):
     TIMES = "times"
 
 
+#: Statistics of times in ms, by name; None if unknown.
+Statistics = dict[str, float | None]
+
+
+class ComparedCounts(Record, extra="ignore"):
+    """Counts of a run's frames, with the keys of a report, as in the classes below."""
+
+    requested: int
+    presented: int
+    lost_by_cause: dict[str, int] = Field(default={})
+    dropped: dict[str, int] = Field(default={})
+
+
+class ComparedStage(Record, extra="ignore"):
+    """Unit and times of a stage."""
+
+    unit: str
+    service_ms: Statistics = Field(default={})
+    wait_ms: Statistics = Field(default={})
+    cpu_ms: Statistics | None = None
+
+
+class ComparedUnit(Record, extra="ignore"):
+    """Shares and cores of a unit."""
+
+    busy: float
+    idle: dict[str, float | None]
+    cores: tuple[int, ...] = ()
+
+
+class ComparedFigures(Record, extra="ignore"):
+    """What a comparison reads of a report, a prediction or imported times, besides the settings.
+
+    `deviation`: only of imported times: relative standard error of every figure; None if it is unknown.
+    """
+
+    clock: str
+    machine: dict[str, Any]
+    frames: ComparedCounts | None = None
+    frame_time_ms: Statistics
+    latency_ms: Statistics
+    stages: dict[str, ComparedStage]
+    units: dict[str, ComparedUnit]
+    bound: Bound | None = None
+    other_programs: float | None = None
+    accuracy: dict[str, Any] = Field(default={})
+    check: dict[str, Any] | None = None
+    deviation: float | None = None
+
+
 @dataclass(frozen=True)
 class ComparedRun:
     """One run of a side.
 
     `name`: name as the user gave it.
     `kind`: kind of its data.
-    `document`: JSON with the keys of a report.
+    `figures`: figures of the run.
+    `settings`: settings and facts of the machine, by dotted key, without keys that always differ.
+    `unknown`: those of `PARTS` that nobody knows.
+    `trust`: whether the times can be trusted. Predictions and imported times are not judged.
     `frames`: frames from the journal; None for a run without a journal.
     `remark`: remark for the user on a run without a report, "" for a run with a report.
     """
 
     name: str
     kind: RunKind
-    document: Mapping[str, Any]
+    figures: ComparedFigures
+    settings: Mapping[str, Any]
+    unknown: tuple[str, ...]
+    trust: Trust
     frames: RunFrames | None = None
     remark: str = ""
+
+
+def compared_run(
+    name: str,
+    kind: RunKind,
+    document: Mapping[str, Any],
+    frames: RunFrames | None = None,
+    remark: str = "",
+    unknown: tuple[str, ...] = (),
+) -> ComparedRun:
+    """Return the run of a `document`, which is JSON with the keys of a report. Parameters: see `ComparedRun`.
+
+    Raises BadInputError for a document without the keys that a comparison reads.
+    """
+    try:
+        figures = ComparedFigures.model_validate(document)
+    except ValidationError as error:
+        raise _refused(f"{name}: ", error, EXPECTED) from None
+    is_judged = kind in (RunKind.RUN, RunKind.REPORT)
+    trust = trust_of(document) if is_judged else Trust(True, ())
+    return ComparedRun(name, kind, figures, _settings(document), unknown, trust, frames, remark)
+
+
+def _refused(where: str, error: ValidationError, expected: str) -> BadInputError:
+    first = error.errors()[0]
+    key = ".".join(str(part) for part in first["loc"])
+    return BadInputError(f"{where}{key}".rstrip(".: "), first["msg"].lower(), expected)
 
 
 @dataclass(frozen=True)
@@ -139,13 +213,13 @@ def read_told(name: str) -> ComparedRun:
 def _of_file(name: str, path: Path) -> ComparedRun:
     found = _document(path)
     if isinstance(found.get(MEASUREMENTS), list):
-        return ComparedRun(name, RunKind.TIMES, {**imported(found, path), NOT_KNOWN: PARTS})
+        return compared_run(name, RunKind.TIMES, imported(found, path), unknown=PARTS)
     if all(key in found for key in OF_A_PREDICTION):
-        return ComparedRun(name, RunKind.PREDICTION, found)
+        return compared_run(name, RunKind.PREDICTION, found)
     if "networks" in found or "rows" in found:
         remedy = "the application with a network is predicted with --application"
         raise BadInputError(path, "predictions of bare networks or of a table", EXPECTED, remedy)
-    return ComparedRun(name, RunKind.REPORT, read_report(path).as_json())
+    return compared_run(name, RunKind.REPORT, read_report(path).as_json())
 
 
 def _is_there(text: str) -> bool:
@@ -164,11 +238,12 @@ def _of_folder(name: str, path: Path) -> ComparedRun:
             raise BadInputError(path, f"{len(saved)} documents ({found})", "one prediction", "name its file")
         return _of_file(name, saved[0])
     if not os.path.lexists(journal):
-        return ComparedRun(name, RunKind.REPORT, read_report(path).as_json())
+        return compared_run(name, RunKind.REPORT, read_report(path).as_json())
     if os.path.lexists(path / "report.json"):
-        return ComparedRun(name, RunKind.RUN, read_report(path).as_json(), read_frames(journal))
+        return compared_run(name, RunKind.RUN, read_report(path).as_json(), read_frames(journal))
     frames = read_frames(journal)
-    return ComparedRun(name, RunKind.RUN, _journal_document(frames, journal), frames, _without_report(path, frames))
+    document, unknown = _journal_document(frames, journal)
+    return compared_run(name, RunKind.RUN, document, frames, _without_report(path, frames), unknown)
 
 
 def _without_report(path: Path, frames: RunFrames) -> str:
@@ -193,8 +268,8 @@ def _document(path: Path) -> Mapping[str, Any]:
     return {str(key): value for key, value in document.items()}
 
 
-def _journal_document(frames: RunFrames, path: Path) -> dict[str, Any]:
-    """Return those keys of a report that a comparison reads, from a run's journal alone.
+def _journal_document(frames: RunFrames, path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
+    """Return those keys of a report that a comparison reads, from a run's journal alone, and the unknown `PARTS`.
 
     Settings come from the first record, and figures from the frames. If the run has ended, its last record gives all
     other keys. Otherwise, only the bound and the efficiencies so far are known.
@@ -229,7 +304,7 @@ def _journal_document(frames: RunFrames, path: Path) -> dict[str, Any]:
     }
     if "edge" in found["config"]:
         found.setdefault("edge", found["config"]["edge"])
-    return {**found, NOT_KNOWN: tuple(part for part in PARTS if part not in (facts if part in FACTS else found))}
+    return found, tuple(part for part in PARTS if part not in (facts if part in FACTS else found))
 
 
 def _at_the_end(frames: RunFrames, path: Path) -> dict[str, Any]:
@@ -286,14 +361,11 @@ class Change(NamedTuple):
     other: Any
 
 
-def changes(base: Mapping[str, Any], other: Mapping[str, Any]) -> list[Change]:
-    """Return the settings and facts of the machine that differ between two runs.
-
-    `base`, `other`: reports as JSON.
-    """
-    first, second = _settings(base), _settings(other)
+def changes(base: ComparedRun, other: ComparedRun) -> list[Change]:
+    """Return the settings and facts of the machine that differ between two runs."""
+    first, second = base.settings, other.settings
     found = dict.fromkeys([*first, *second])
-    known = [part for part in PARTS if part not in (*base.get(NOT_KNOWN, ()), *other.get(NOT_KNOWN, ()))]
+    known = [part for part in PARTS if part not in (*base.unknown, *other.unknown)]
     keys = [key for part in known for key in found if key == part or key.startswith(f"{part}.")]
     return [Change(key, first.get(key), second.get(key)) for key in keys if first.get(key) != second.get(key)]
 
@@ -389,7 +461,8 @@ def imported(document: Mapping[str, Any], path: Path) -> dict[str, Any]:
     names = [row.name for row in rows]
     if twice := next((name for name in names if names.count(name) > 1), None):
         raise BadInputError(f"{path}: {MEASUREMENTS}", f"{twice!r} twice", "each name once")
-    frames = _frames(rows)
+    walls = [row for row in rows if row.kind == WALL]
+    frames = walls[0] if len(walls) == 1 else None  # the frame time
     return {
         "clock": HOST_CLOCK,
         "stages": {
@@ -409,9 +482,7 @@ def _imported_time(row: Any, where: str) -> ImportedTime:
     try:
         return ImportedTime.model_validate(row)
     except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise BadInputError(f"{where}.{key}".rstrip("."), first["msg"].lower(), EXPECTED_TIMES) from None
+        raise _refused(f"{where}.", error, EXPECTED_TIMES) from None
 
 
 def _told_apart(rows: Sequence[ImportedTime]) -> list[ImportedTime]:
@@ -419,15 +490,6 @@ def _told_apart(rows: Sequence[ImportedTime]) -> list[ImportedTime]:
     counts = Counter(row.name for row in rows)
     longer = [row.model_copy(update={"name": f"{row.name} ({row.kind})"}) for row in rows]
     return [long if counts[row.name] > 1 else row for row, long in zip(rows, longer, strict=True)]
-
-
-def _frames(rows: Sequence[ImportedTime]) -> ImportedTime | None:
-    """Return the measurement of `rows` that is used as the frame time: the wall time.
-
-    None is returned if `rows` have no wall time or several.
-    """
-    found = [row for row in rows if row.kind == WALL]
-    return found[0] if len(found) == 1 else None
 
 
 def _imported_statistics(row: ImportedTime) -> dict[str, float]:

@@ -71,16 +71,6 @@ class Definition:
     repeats: int = 1
 
 
-def _kind_named(where: str, word: str) -> SweepKind:
-    """Return the kind that `word` names. Raises BadInputError for any other word.
-
-    `where`: file and key for the message of the error.
-    """
-    if word not in [*SweepKind]:
-        raise BadInputError(where, repr(word), f"one of {', '.join(SweepKind)}", did_you_mean(word, SweepKind))
-    return SweepKind(word)
-
-
 def trials_of(definition: Definition, words: Callable[[Options], Sequence[str]]) -> list[Trial]:
     """Return the trials of a sweep in their order. The last axis changes fastest.
 
@@ -236,24 +226,8 @@ def canonical(command: tuple[str, ...], options: Options, repeat: int = 1) -> st
     return json.dumps(named, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
 
 
-@dataclass(frozen=True)
-class SweepFile:
-    """The content of a sweep file (docs/sweeps.md). The values of options are not checked.
-
-    The fields have the same meaning as in `Definition`.
-    """
-
-    command: tuple[str, ...]
-    kind: SweepKind = SweepKind.GRID
-    count: int | None = None
-    seed: int = 0
-    repeats: int = 1
-    options: dict[str, Any] = field(default_factory=dict)
-    axes: dict[str, list[Any]] = field(default_factory=dict)
-
-
-def read_sweep(path: Path) -> SweepFile:
-    """Read the sweep file `path`, and return its content.
+def read_sweep(path: Path) -> Definition:
+    """Read the sweep file `path`, and return its content (docs/sweeps.md). The values of options are not checked.
 
     Raises BadInputError if it cannot be read or is no sweep file.
     """
@@ -270,11 +244,15 @@ def read_sweep(path: Path) -> SweepFile:
     for name, values in data.get("axes", {}).items():
         if not isinstance(values, list):
             raise BadInputError(f"{path}: axes.{name}", repr(values), "a list", "a single value goes under [options]")
-    kind = _kind_named(f"{path}: kind", data.get("kind", SweepKind.GRID))
+    kind = data.get("kind", SweepKind.GRID)
+    if kind not in [*SweepKind]:
+        expected = f"one of {', '.join(SweepKind)}"
+        raise BadInputError(f"{path}: kind", repr(kind), expected, did_you_mean(kind, SweepKind))
+    kind = SweepKind(kind)
     for key in ("count", "seed"):
         if key in data and kind is not SweepKind.RANDOM:
             raise BadInputError(f"{path}: {key}", f"{key} of a {kind}", "kind = 'random' beside it")
-    return SweepFile(**{**data, "kind": kind, "command": tuple(data["command"].split())})
+    return Definition(**{**data, "kind": kind, "command": tuple(data["command"].split())})
 
 
 def _check_key(path: Path, key: str, value: object) -> None:
@@ -299,6 +277,13 @@ class GoalMetric(NamedTuple):
     unit: str
     more_is_better: bool
     path: tuple[str, ...]
+
+
+def value_at(document: Any, path: Sequence[str]) -> Any:
+    """Return the value of `document` under the keys `path`, such as `frame_time_ms` and `mean`; None without it."""
+    for key in path:
+        document = document.get(key) if isinstance(document, dict) else None
+    return document
 
 
 METRICS = {

@@ -33,7 +33,7 @@ import psutil
 from trilane import machine
 from trilane.apps.run.verdict import Trust, trust_of
 from trilane.apps.sweep.definition import Trial, TrialClock
-from trilane.apps.sweep.store import SWEEP, Engine, Record
+from trilane.apps.sweep.store import SWEEP, Engine, TrialRecord, planned
 from trilane.errors import BadInputError, MissingPartError
 from trilane.stages.machine_facts import machine_facts
 
@@ -135,8 +135,8 @@ def _end(processes: list[subprocess.Popen[bytes]]) -> None:
             process.wait()
 
 
-def perform(trial: Trial, place: TrialPlace, children: Children) -> Record:
-    """Do `trial`, and return its line of `trials.jsonl` (docs/sweeps.md has the keys).
+def perform(trial: Trial, place: TrialPlace, children: Children) -> TrialRecord:
+    """Do `trial`, and return its record.
 
     A run that the machine disturbed is repeated up to `REPEATS` times, and the least disturbed run is kept. Files of a
     lost trial are removed. `place`: folders of the trial. `children`: object that starts the trial's process.
@@ -150,29 +150,29 @@ def perform(trial: Trial, place: TrialPlace, children: Children) -> Record:
             if own.is_dir():
                 own.rename(kept)
             again, repeated = _once(trial, own, place, children), repeated + 1
-            if again["status"] == "done" and disturbance(again) < disturbance(ended):
+            if again.status == "done" and disturbance(again) < disturbance(ended):
                 ended = again
                 shutil.rmtree(kept, ignore_errors=True)
             elif kept.is_dir():
                 shutil.rmtree(own, ignore_errors=True)
                 kept.rename(own)
-            if again["status"] == "lost":
+            if again.status == "lost":
                 break
         trust = trust_in(ended)
         has_folder = place.folder is not None and own.is_dir()
-    return {
-        **about(trial),
-        **ended,
-        "repeated": repeated,
-        "unsure": [] if trust.trusted else list(trust.reasons),
-        "began_at": began_at,
-        "seconds": round(time.monotonic() - start, 3),
-        "host": host_facts(),
-        "folder": trial.id if has_folder else None,
-    }
+    return ended.model_copy(
+        update={
+            "repeated": repeated,
+            "unsure": () if trust.trusted else trust.reasons,
+            "began_at": began_at,
+            "seconds": round(time.monotonic() - start, 3),
+            "host": host_facts(),
+            "folder": trial.id if has_folder else None,
+        }
+    )
 
 
-def _once(trial: Trial, own: Path, place: TrialPlace, children: Children) -> Record:
+def _once(trial: Trial, own: Path, place: TrialPlace, children: Children) -> TrialRecord:
     """Do `trial` once, and return the result of `ended_as`. Remove its run folder before, and after a lost trial.
 
     `own`: run folder of the trial. `place`, `children`: as in `perform`.
@@ -181,74 +181,47 @@ def _once(trial: Trial, own: Path, place: TrialPlace, children: Children) -> Rec
     with tempfile.TemporaryFile() as stdout, tempfile.TemporaryFile() as stderr:
         code = children.run(_command(trial, own, place.program), stdout, stderr, place)
         out, messages = (_text(file) for file in (stdout, stderr))
-    ended = ended_as(code, out, messages)
-    if ended["status"] == "lost":
+    ended = ended_as(trial, code, out, messages)
+    if ended.status == "lost":
         _remove(own)
     return ended
 
 
-def trust_in(ended: Record) -> Trust:
-    """Return whether the times of a trial can be trusted, with reasons. `ended`: result of `ended_as`.
+def trust_in(ended: TrialRecord) -> Trust:
+    """Return whether the times of a trial can be trusted, with reasons.
 
     A trial counts as trusted if it is not done, or if its result lacks the share of other programs.
     """
-    result = ended["result"] or {}
-    is_judged = ended["status"] == "done" and "other_programs" in result
+    result = ended.result or {}
+    is_judged = ended.status == "done" and "other_programs" in result
     return trust_of(result) if is_judged else Trust(True, ())
 
 
-def disturbance(ended: Record) -> tuple[bool, float]:
+def disturbance(ended: TrialRecord) -> tuple[bool, float]:
     """Return (not trusted, share of other programs), a sort key that puts less disturbed trials first.
 
-    If the share is not known, it counts as 1. `ended`: result of `ended_as`.
+    If the share is not known, it counts as 1.
     """
-    others = (ended["result"] or {}).get("other_programs")
+    others = (ended.result or {}).get("other_programs")
     return not trust_in(ended).trusted, 1.0 if others is None else others
 
 
-def about(trial: Trial) -> Record:
-    """Return the facts of a trial that are known before it is done, as keys of its record."""
-    return {
-        "schema": 1,
-        "id": trial.id,
-        "command": ["trilane", *trial.arguments],
-        "options": dict(trial.options),
-        "repeat": trial.repeat,
-        "clock": str(trial.kind.clock),
-    }
-
-
-def ended_as(code: int, out: str, messages: str) -> Record:
-    """Return how a trial's process ended.
-
-    Keys: `status`: `done`, `failed` or `lost`. `exit_code`: exit code. `error`: message of a trial that is not done;
-    None for a done trial. `result`: JSON document of the trial; None for a lost trial or without a document.
+def ended_as(trial: Trial, code: int, out: str, messages: str) -> TrialRecord:
+    """Return a record that says how the process of `trial` ended.
 
     `code`: exit code; a negative code is the number of a signal. `out`, `messages`: text of its stdout and stderr.
     """
-    result = _document(out)
+    result, status = _document(out), "failed"
     lines = [line for line in messages.splitlines() if line.strip()]
     error: str | None = lines[-1].strip() if lines else f"exit code {code}, no message"
     if code in ENDED_FROM_OUTSIDE:
-        return {"status": "lost", "exit_code": code, "error": error, "result": None}
-    if code == 0 and result is None:
+        result, status = None, "lost"
+    elif code == 0 and result is not None:
+        error, status = None, "done"
+    elif code == 0:
         error = "exit code 0, but no JSON document on stdout"
-    done = code == 0 and result is not None
-    return {
-        "status": "done" if done else "failed",
-        "exit_code": code,
-        "error": None if done else error,
-        "result": result,
-    }
-
-
-def lost(trial: Trial, why: str) -> Record:
-    """Return the record of `trial`, whose Ray worker ended without a record. `why`: message of the error."""
-    return {
-        **about(trial),
-        **{"status": "lost", "exit_code": None, "error": why, "result": None, "repeated": 0, "unsure": []},
-        **{"began_at": None, "seconds": None, "host": None, "folder": None},
-    }
+    update = {"status": status, "exit_code": code, "error": error, "result": result}
+    return planned(trial).model_copy(update=update)
 
 
 def _command(trial: Trial, own: Path, program: str) -> list[str]:
@@ -281,7 +254,7 @@ def at_once(clock: TrialClock) -> int:
     return 1 if clock is TrialClock.HOST else len(machine.here.cores())
 
 
-def run_here(trials: Sequence[Trial], place: TrialPlace, inherited: tuple[int, ...] = ()) -> Generator[Record]:
+def run_here(trials: Sequence[Trial], place: TrialPlace, inherited: tuple[int, ...] = ()) -> Generator[TrialRecord]:
     """Do `trials`, all with the same command, on this machine, and yield their records as they end.
 
     Closing the generator ends the trials that still run.
@@ -299,21 +272,16 @@ def run_here(trials: Sequence[Trial], place: TrialPlace, inherited: tuple[int, .
             children.end()
 
 
-def run_inside(trials: Sequence[Trial], call: Callable[[list[str]], tuple[int, str, str]]) -> Generator[Record]:
+def run_inside(trials: Sequence[Trial], call: Callable[[list[str]], tuple[int, str, str]]) -> Generator[TrialRecord]:
     """Do `trials` of the virtual clock in this process, one after the other, and yield their records as they end.
 
     `call`: function from the words of a command line after `trilane` to (exit code, text of stdout, text of stderr).
     """
     for trial in trials:
         began_at, start = machine.here.now().isoformat(timespec="milliseconds"), time.monotonic()
-        ended = ended_as(*call(trial.arguments))
+        ended = ended_as(trial, *call(trial.arguments))
         seconds = round(time.monotonic() - start, 3)
-        yield {
-            **about(trial),
-            **ended,
-            **{"repeated": 0, "unsure": [], "began_at": began_at, "seconds": seconds},
-            **{"host": host_facts(), "folder": None},
-        }
+        yield ended.model_copy(update={"began_at": began_at, "seconds": seconds, "host": host_facts()})
 
 
 def at_once_on_ray(clock: TrialClock) -> int:
@@ -366,7 +334,7 @@ def required_ray() -> Any:
     return ray
 
 
-def _run_on(ray: Any, place: TrialPlace, trials: Sequence[Trial]) -> Generator[Record]:
+def _run_on(ray: Any, place: TrialPlace, trials: Sequence[Trial]) -> Generator[TrialRecord]:
     resources = _resources(ray, trials[0].kind.clock)
     task = ray.remote(num_cpus=1, resources=resources, max_retries=0)(perform_there)
     going = {task.remote(trial, str(place.folder), str(place.working_folder), place.program): trial for trial in trials}
@@ -388,17 +356,18 @@ def _resources(ray: Any, clock: TrialClock) -> dict[str, int]:
     return {RESOURCE: 1}
 
 
-def _record(ray: Any, reference: Any, trial: Trial) -> Record:
+def _record(ray: Any, reference: Any, trial: Trial) -> TrialRecord:
+    """Return the record behind `reference`; if the worker ended without a record, the trial is lost."""
     try:
-        found: Record = ray.get(reference)
+        found: TrialRecord = ray.get(reference)
     except ray.exceptions.RayTaskError as error:
         raise error.cause from None
     except ray.exceptions.RayError as error:
-        return lost(trial, str(error).partition("\n")[0])
+        return planned(trial).model_copy(update={"status": "lost", "error": str(error).partition("\n")[0]})
     return found
 
 
-def perform_there(trial: Trial, folder: str, working_folder: str, program: str) -> Record:
+def perform_there(trial: Trial, folder: str, working_folder: str, program: str) -> TrialRecord:
     """Do `trial` in a Ray worker, on the machine that Ray chose, and return its record.
 
     `folder`: folder of the sweep on the driver's machine. If this machine cannot read it, run folders are not kept.

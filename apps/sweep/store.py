@@ -14,24 +14,79 @@ import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, Literal, Self
+
+from pydantic import Field
 
 from trilane.apps.sweep.definition import Trial
 from trilane.errors import BadInputError, reason
+from trilane.pipeline.run_metrics import Record
+from trilane.units import HOST_CLOCK
 from trilane.writing import WRITABLE, write_bytes
 
 SWEEP, TRIALS, LOCK = "sweep.json", "trials.jsonl", ".lock"
 #: Seconds for the trials of a killed sweep to end; they hold its lock until then.
 LOCK_S = 15.0
-Record = dict[str, Any]
 TRIES = 3
+#: Keys of a trial in the answers of `trilane sweep` and `trilane tune`, in their order.
+ROW = ("id", "command", "options", "repeat", "status", "exit_code", "error", "seconds", "repeated", "unsure")
+
+
+class TrialRecord(Record, extra="ignore"):
+    """A line of `trials.jsonl`; docs/sweeps.md describes its keys. Lines of other versions may have other keys.
+
+    In answers, `status` may also be `planned`, for a trial that was not tried, or `pruned`, after a short run.
+    """
+
+    schema_: int = Field(default=1, alias="schema")
+    id: str
+    command: tuple[str, ...] = ()
+    options: dict[str, Any] = Field(default={})
+    repeat: int = 1
+    clock: str = HOST_CLOCK
+    status: Literal["planned", "done", "failed", "lost", "pruned"]
+    exit_code: int | None = None
+    error: str | None = None
+    result: dict[str, Any] | None = None
+    repeated: int = 0
+    unsure: tuple[str, ...] = ()
+    began_at: str | None = None
+    seconds: float | None = None
+    host: dict[str, Any] | None = None
+    folder: str | None = None
+    tries: int = 1
+
+    @property
+    def is_ended(self) -> bool:
+        """Whether the trial is final: done, or failed by itself. A lost trial may be tried again."""
+        return self.status in ("done", "failed")
+
+    def row(self) -> dict[str, Any]:
+        """Return the trial as an entry of `trials` in the output of `trilane sweep --json`."""
+        document = self.model_dump(mode="json", include={*ROW})
+        return {key: document[key] for key in ROW}
+
+
 #: Does trials and yields their records as they end. If its generator is closed, trials that still run are ended.
-Engine = Callable[[Sequence[Trial]], Generator[Record]]
+Engine = Callable[[Sequence[Trial]], Generator[TrialRecord]]
 
 
-def whole_lines(text: bytes, where: str | Path) -> tuple[list[Record], int]:
+def planned(trial: Trial) -> TrialRecord:
+    """Return the record of a trial that was not tried."""
+    return TrialRecord(
+        id=trial.id,
+        command=("trilane", *trial.arguments),
+        options=dict(trial.options),
+        repeat=trial.repeat,
+        clock=trial.kind.clock,
+        status="planned",
+    )
+
+
+def whole_lines(text: bytes, where: str | Path) -> tuple[list[TrialRecord], int]:
     """Return (records, size) of a `trials.jsonl`: its records, and the number of bytes up to the last record.
 
     Text after the last line feed is left out. The last line is also left out if it is no record.
@@ -40,7 +95,7 @@ def whole_lines(text: bytes, where: str | Path) -> tuple[list[Record], int]:
 
     Raises BadInputError, which names the line, for an earlier line that is no record.
     """
-    records: list[Record] = []
+    records: list[TrialRecord] = []
     size, lines = 0, text.split(b"\n")[:-1]
     for number, line in enumerate(lines, start=1):
         record = _record(line)
@@ -55,20 +110,19 @@ def whole_lines(text: bytes, where: str | Path) -> tuple[list[Record], int]:
     return records, size
 
 
-def _record(line: bytes) -> Record | None:
+def _record(line: bytes) -> TrialRecord | None:
     try:
-        found = json.loads(line)
+        return TrialRecord.model_validate(json.loads(line))
     except ValueError:
         return None
-    return found if isinstance(found, dict) and {"id", "status"} <= found.keys() else None
 
 
-def latest(records: Sequence[Record]) -> dict[str, Record]:
+def latest(records: Sequence[TrialRecord]) -> dict[str, TrialRecord]:
     """Return the last record of each trial, by the trial's name, in the order in which the trials first ended."""
-    return {str(record["id"]): record for record in records}
+    return {record.id: record for record in records}
 
 
-def read_trials(folder: Path) -> dict[str, Record]:
+def read_trials(folder: Path) -> dict[str, TrialRecord]:
     """Return the `latest` records of the sweep in `folder`.
 
     Raises BadInputError if the folder has no `trials.jsonl`, or if a line of this file is broken.
@@ -80,10 +134,39 @@ def read_trials(folder: Path) -> dict[str, Record]:
         raise BadInputError.of_os_error(path, error, "the trials of a sweep") from error
 
 
+@dataclass(frozen=True)
+class SweepSummary:
+    """How the trials of a sweep ended.
+
+    `folder`: folder of the sweep. `trials`: last record of each trial. `skipped`: number of trials that had ended
+    before this call of the sweep.
+    """
+
+    folder: Path
+    trials: tuple[TrialRecord, ...]
+    skipped: int
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """The numbers of trials: in all, by status, and skipped."""
+        found = Counter(record.status for record in self.trials)
+        by_status = {status: found[status] for status in ("done", "failed", "lost", "planned")}
+        return {"trials": len(self.trials), **by_status, "skipped": self.skipped}
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the keys `folder`, `counts` and `trials` of the output of `trilane sweep --json`."""
+        return {
+            "folder": str(self.folder),
+            "counts": self.counts,
+            "trials": [record.row() for record in self.trials],
+        }
+
+
 class Store:
     """The folder of a sweep, open for the one process that runs the sweep; a context manager.
 
     `folder`: absolute path of the folder. `done`: last records by the trial's name, from the folder and from `add`.
+    `lock`: file descriptor of the lock. A child process that inherits it holds the lock too, until its end.
 
     Entering makes the folder, or opens a folder with the same trials. Entering raises BadInputError if:
     - the folder cannot be written, its files are broken, or another process works in it;
@@ -99,9 +182,9 @@ class Store:
         `resume`: whether to go on with a sweep that has begun.
         """
         self.folder = folder.absolute()
-        self.done: dict[str, Record] = {}
+        self.done: dict[str, TrialRecord] = {}
         self._trials, self._about, self._resume = trials, about, resume
-        self._lock = self._file = -1
+        self.lock = self._file = -1
 
     def __enter__(self) -> Self:
         if self._resume and not (self.folder / SWEEP).is_file():
@@ -126,30 +209,38 @@ class Store:
         self._close()
 
     @property
-    def lock(self) -> int:
-        """The file descriptor of the lock. A child process that inherits it holds the lock too, until its end."""
-        return self._lock
+    def ended(self) -> set[str]:
+        """The names of the trials that are final."""
+        return {name for name, record in self.done.items() if record.is_ended}
 
-    def add(self, record: Mapping[str, Any]) -> None:
+    def summary(self, before: set[str]) -> SweepSummary:
+        """Return how the trials ended. `before`: names of the trials that ended before this call of the sweep."""
+        found = tuple(self.done.get(trial.id) or planned(trial) for trial in self._trials)
+        return SweepSummary(self.folder, found, sum(trial.id in before for trial in self._trials))
+
+    def add(self, record: TrialRecord) -> None:
         """Write a trial's record, and wait until the record is on the disk.
 
         Raises BadInputError if it cannot be written.
         """
-        line = json.dumps(record, separators=(",", ":"), allow_nan=False).encode() + b"\n"
+        line = (
+            json.dumps(record.model_dump(mode="json", by_alias=True), separators=(",", ":"), allow_nan=False).encode()
+            + b"\n"
+        )
         try:
             while line:
                 line = line[os.write(self._file, line) :]
             os.fsync(self._file)
         except OSError as error:
             raise BadInputError.of_os_error(self.folder / TRIALS, error, WRITABLE, "--resume goes on") from error
-        self.done[str(record["id"])] = dict(record)
+        self.done[record.id] = record
 
     def _take_lock(self) -> None:
-        self._lock = os.open(self.folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
+        self.lock = os.open(self.folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
         give_up_at = time.monotonic() + LOCK_S
         while True:
             try:
-                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                fcntl.flock(self.lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 return
             except BlockingIOError:
                 if time.monotonic() > give_up_at:
@@ -172,7 +263,7 @@ class Store:
         os.ftruncate(self._file, size)
         os.lseek(self._file, 0, os.SEEK_END)
         self.done = latest(records)
-        ended = sum(is_ended(self.done.get(name)) for name in ids)
+        ended = len(self.ended.intersection(ids))
         if self.done and ended < len(ids) and not self._resume:
             found = f"a sweep with {ended} of {len(ids)} trials done"
             raise BadInputError(self.folder, found, "a new folder, or one that is complete", "--resume goes on with it")
@@ -192,10 +283,10 @@ class Store:
             raise BadInputError(self.folder, found, "the same files", "choose another --out")
 
     def _close(self) -> None:
-        for descriptor in (self._file, self._lock):
+        for descriptor in (self._file, self.lock):
             if descriptor >= 0:
                 os.close(descriptor)
-        self._file = self._lock = -1
+        self._file = self.lock = -1
 
 
 def input_digests(trials: Sequence[Trial]) -> dict[str, str]:
@@ -209,73 +300,25 @@ def _flat(value: Any) -> Iterable[Any]:
     return value if isinstance(value, list | tuple) else [value]
 
 
-def is_ended(record: Mapping[str, Any] | None) -> bool:
-    """Return whether a trial is final: done, or failed by itself.
-
-    A lost trial is not final, because it may be tried again.
-
-    `record`: record of the trial; None for a trial that was not tried.
-    """
-    return record is not None and record["status"] in ("done", "failed")
-
-
-def run_sweep(trials: Sequence[Trial], store: Store, engine: Engine, told: Callable[[Record], None]) -> None:
+def run_sweep(trials: Sequence[Trial], store: Store, engine: Engine, told: Callable[[TrialRecord], None]) -> None:
     """Do all `trials` that have not ended in `store`, the open folder of the sweep.
 
     `engine`: function that does trials. `told`: function that gets the record of each trial that is not tried again.
     """
-    left = [trial for trial in trials if not is_ended(store.done.get(trial.id))]
+    ended = store.ended
+    left = [trial for trial in trials if trial.id not in ended]
     for attempt in range(1, TRIES + 1):
-        lost_now: list[Trial] = []
+        lost: set[str] = set()
         for record in _records(engine, left):
-            if record["status"] == "lost" and attempt < TRIES:
-                lost_now += [trial for trial in left if trial.id == record["id"]]
+            if record.status == "lost" and attempt < TRIES:
+                lost.add(record.id)
                 continue
-            store.add({**record, "tries": attempt})
+            store.add(record.model_copy(update={"tries": attempt}))
             told(record)
-        left = lost_now
+        left = [trial for trial in left if trial.id in lost]
 
 
-def _records(engine: Engine, trials: list[Trial]) -> Iterator[Record]:
+def _records(engine: Engine, trials: list[Trial]) -> Iterator[TrialRecord]:
     if trials:
         with closing(engine(trials)) as records:
             yield from records
-
-
-def summary(trials: Sequence[Trial], store: Store, before: set[str]) -> dict[str, Any]:
-    """Return how the trials of a sweep ended.
-
-    Keys: `folder`: folder of the sweep. `counts`: numbers of trials, in all and by status. `trials`: results of
-    `row_of`.
-
-    `store`: open folder of the sweep. `before`: names of the trials that ended before this call of the sweep; they
-    count as `skipped` too.
-    """
-    rows = [row_of(trial, store.done.get(trial.id)) for trial in trials]
-    counts = Counter(row["status"] for row in rows)
-    return {
-        "folder": str(store.folder),
-        "counts": {
-            "trials": len(rows),
-            **{status: counts[status] for status in ("done", "failed", "lost", "planned")},
-            "skipped": sum(trial.id in before for trial in trials),
-        },
-        "trials": rows,
-    }
-
-
-def row_of(trial: Trial, record: Record | None) -> dict[str, Any]:
-    """Return `trial` as a row of a summary: its options, and how it ended.
-
-    `record`: record of the trial; None for a trial that was not tried, whose status is `planned`.
-    """
-    ended = record or {"status": "planned", "exit_code": None, "error": None, "seconds": None}
-    return {
-        "id": trial.id,
-        "command": ["trilane", *trial.arguments],
-        "options": dict(trial.options),
-        "repeat": trial.repeat,
-        **{key: ended[key] for key in ("status", "exit_code", "error", "seconds")},
-        "repeated": ended.get("repeated", 0),
-        "unsure": ended.get("unsure", []),
-    }

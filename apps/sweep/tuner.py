@@ -17,8 +17,8 @@ from itertools import pairwise
 from typing import Any, NamedTuple
 
 from trilane.apps.compare.overview import entry_of
-from trilane.apps.sweep.definition import METRICS, Definition, Options, SweepKind, Trial, Value, trials_of
-from trilane.apps.sweep.store import Record, row_of
+from trilane.apps.sweep.definition import METRICS, Definition, Options, SweepKind, Trial, Value, trials_of, value_at
+from trilane.apps.sweep.store import TrialRecord, planned
 from trilane.errors import BadInputError, MissingPartError, did_you_mean
 
 #: Number of random proposals before the search learns from results.
@@ -34,7 +34,7 @@ AT_LIMIT = 1e-9
 FRAMES = "frames"
 KEEP = re.compile(r"\s*([A-Za-z][\w.-]*)\s*(<=|>=|<|>)\s*([-+]?[\d.]+(?:e[-+]?\d+)?)\s*([A-Za-z]*)\s*", re.IGNORECASE)
 #: Function that does those trials that have not ended, and returns the records of all by name.
-Do = Callable[[Sequence[Trial]], Mapping[str, Record]]
+Do = Callable[[Sequence[Trial]], Mapping[str, TrialRecord]]
 #: Figures that the frontier weighs beside those asked for, if every trial has them.
 WEIGHED = ("psnr", "power")
 
@@ -128,33 +128,25 @@ class Aim:
         return any(keep.more_is_better for keep in self.keeps if keep.name == name)
 
 
-def figures_of(record: Record | None, names: Sequence[str] = ()) -> dict[str, float]:
+def figures_of(record: TrialRecord, names: Sequence[str] = ()) -> dict[str, float]:
     """Return the figures of a trial, by name: the `METRICS` that its result has, and the dotted keys among `names`.
 
-    Return an empty mapping for a trial that is not done. `record`: record of the trial; None for a trial not tried.
+    Return an empty mapping for a trial that is not done.
     """
-    result = (record or {}).get("result")
-    if record is None or record["status"] != "done" or not isinstance(result, dict):
+    if record.status != "done" or record.result is None:
         return {}
-    several = result.get("pipelines")
-    document = several[0] if isinstance(several, list) and several else result
+    several = record.result.get("pipelines")
+    document = several[0] if isinstance(several, list) and several else record.result
     paths = {name: METRICS[name].path if name in METRICS else tuple(name.split(".")) for name in (*METRICS, *names)}
     found = {name: _at(document, path) for name, path in paths.items() if path}
     found["psnr"] = entry_of("", document).psnr_db
-    return {name: value for name, value in found.items() if value is not None and not _is_no_time(name, value)}
+    # A run without times may have the time 0, which would win every comparison.
+    times = {name for name, metric in METRICS.items() if metric.unit == "ms"}
+    return {name: value for name, value in found.items() if value is not None and (value > 0 or name not in times)}
 
 
-def _is_no_time(name: str, value: float) -> bool:
-    """Return whether the figure `name` is a time, but `value` is 0 or less, because the run has no times.
-
-    Such a 0 would win every comparison.
-    """
-    return name in METRICS and METRICS[name].unit == "ms" and value <= 0
-
-
-def _at(found: Any, path: Sequence[str]) -> float | None:
-    for key in path:
-        found = found.get(key) if isinstance(found, dict) else None
+def _at(document: Any, path: Sequence[str]) -> float | None:
+    found = value_at(document, path)
     is_number = isinstance(found, int | float) and not isinstance(found, bool) and math.isfinite(found)
     return float(found) if is_number else None
 
@@ -308,7 +300,7 @@ class Search:
                 places[name] = asked.suggest_categorical(name, list(range(len(values))))
         return asked, self.space.at(places)
 
-    def is_hopeless(self, asked: Any, trial: Trial, record: Record, frames: int) -> bool:
+    def is_hopeless(self, asked: Any, trial: Trial, record: TrialRecord, frames: int) -> bool:
         """Return whether the result of a short run ends `trial`. If so, count the trial as tried and pruned.
 
         The short run ends the trial if its first goal is worse than the median of the short runs of completed trials.
@@ -327,12 +319,12 @@ class Search:
         self.pruned.add(trial.id)
         return True
 
-    def learn(self, asked: Any, trial: Trial, record: Record | None) -> None:
+    def learn(self, asked: Any, trial: Trial, record: TrialRecord) -> None:
         """Count `trial` as tried, and tell Optuna its result.
 
         A trial without a figure of a goal or limit counts as failed.
 
-        `asked`: Optuna's trial. `record`: record of the trial; None if it was not done.
+        `asked`: Optuna's trial. `record`: record of the trial.
         """
         self.tried[trial.id] = trial
         figures = figures_of(record, self.aim.names)
@@ -348,7 +340,7 @@ class Search:
             self._best = rank, dict(asked.params)
 
 
-def tune(search: Search, do: Do, budget: int, together: int = 1, short: int | None = None) -> Mapping[str, Record]:
+def tune(search: Search, do: Do, budget: int, together: int = 1, short: int | None = None) -> Mapping[str, TrialRecord]:
     """Try at most `budget` configurations, and return the records of all trials that were done in full, by name.
 
     `search`: search without results. `do`: function that does trials. `together`: number of configurations that are
@@ -356,7 +348,7 @@ def tune(search: Search, do: Do, budget: int, together: int = 1, short: int | No
 
     Raises BadInputError if the first results all lack the same figure of a goal or limit.
     """
-    records: dict[str, Record] = {}
+    records: dict[str, TrialRecord] = {}
     while len(search.tried) < budget and search.left:
         count = min(together, budget - len(search.tried), search.left)
         batch = [search.propose() for _ in range(count)]
@@ -370,19 +362,19 @@ def tune(search: Search, do: Do, budget: int, together: int = 1, short: int | No
             ]
         records.update(do([trial for _, trial in batch]) if batch else {})
         for asked, trial in batch:
-            search.learn(asked, trial, records.get(trial.id))
+            search.learn(asked, trial, records[trial.id])
         if not search.has_learned:
-            _require_figures(search.aim, [record for record in records.values() if record["status"] == "done"])
+            _require_figures(search.aim, [record for record in records.values() if record.status == "done"])
     return records
 
 
-def _require_figures(aim: Aim, done: Sequence[Record]) -> None:
+def _require_figures(aim: Aim, done: Sequence[TrialRecord]) -> None:
     if len(done) < MOST_WITHOUT_FIGURE:
         return
     known = {name for record in done for name in figures_of(record, aim.names)}
     for name in aim.names:
         if name not in known:
-            what = " ".join(done[0]["command"][1:2])
+            what = " ".join(done[0].command[1:2])
             remedy = "measure it: tune run with --check 4" if name.endswith("psnr") else ""
             expected = f"one of {', '.join(sorted(known))}"
             raise BadInputError(
@@ -390,12 +382,73 @@ def _require_figures(aim: Aim, done: Sequence[Record]) -> None:
             )
 
 
-def answer(search: Search, records: Mapping[str, Record]) -> dict[str, Any]:
-    """Return the answer of a search.
+@dataclass(frozen=True)
+class JudgedTrial:
+    """A trial in the answer of a search.
 
-    Keys: `best`: the best trial that keeps all limits; None if no trial keeps them. `nearest`: the trial that misses
-    the limits least; None if there is a `best`. `weighed`: names of the figures that the frontier compares. `frontier`:
-    trials that no other trial beats. `trials`: rows of all trials. `not_tried`: result of `_not_tried`.
+    `record`: record of the trial. `metrics`: its figures, by name. `keeps`: whether it keeps all limits; None if it
+    lacks a figure of a goal or limit. `misses`: limits that it misses.
+    """
+
+    record: TrialRecord
+    metrics: Mapping[str, float]
+    keeps: bool | None
+    misses: tuple[str, ...]
+
+    @property
+    def command(self) -> list[str]:
+        """The words of the command line that runs the configuration by hand, without `--json`."""
+        return list(self.record.command[:-1])
+
+    def row(self) -> dict[str, Any]:
+        """Return the trial as an entry of `trials` in the output of `trilane tune --json`."""
+        return {**self.record.row(), "metrics": self.metrics, "keeps": self.keeps}
+
+    def chosen(self) -> dict[str, Any]:
+        """Return the trial as `best`, `nearest` or an entry of `frontier` in the output of `trilane tune --json`."""
+        return {
+            **{"id": self.record.id, "command": self.command, "options": self.record.options},
+            **{"metrics": self.metrics, "keeps": self.keeps, "misses": self.misses, "unsure": self.record.unsure},
+        }
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The answer of a search.
+
+    `best`: the best trial that keeps all limits; None if no trial keeps them. `nearest`: the trial that misses the
+    limits least; None if there is a `best`. `weighed`: names of the figures that the frontier compares. `frontier`:
+    trials that no other trial beats. `trials`: all trials. `size`: number of all configurations. `not_tried`: for each
+    axis, the values that no trial had; an axis whose values were all tried is missing.
+    """
+
+    best: JudgedTrial | None
+    nearest: JudgedTrial | None
+    weighed: list[str]
+    frontier: list[JudgedTrial]
+    trials: list[JudgedTrial]
+    size: int
+    not_tried: dict[str, list[Value]]
+
+    @property
+    def left(self) -> int:
+        """The number of configurations that were not tried."""
+        return self.size - len(self.trials)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the keys of the output of `trilane tune --json` that the search answers (docs/tune.md)."""
+        return {
+            "best": self.best and self.best.chosen(),
+            "nearest": self.nearest and self.nearest.chosen(),
+            "weighed": self.weighed,
+            "frontier": [trial.chosen() for trial in self.frontier],
+            "trials": [trial.row() for trial in self.trials],
+            "not_tried": {"count": self.left, "of": self.size, "values": self.not_tried},
+        }
+
+
+def answer(search: Search, records: Mapping[str, TrialRecord]) -> Answer:
+    """Return the answer of a search.
 
     `search`: search that has ended. `records`: all known records of the space by the trial's name, also from an earlier
     search or sweep.
@@ -403,47 +456,42 @@ def answer(search: Search, records: Mapping[str, Record]) -> dict[str, Any]:
     aim, space = search.aim, search.space
     found = [trial for trial in space.trials if trial.id in records and trial.id not in search.tried]
     ended = [*search.tried.values(), *found]
-    known = {trial.id: figures_of(records.get(trial.id), aim.names) for trial in ended}
-    judged = [trial for trial in ended if aim.has_all(known[trial.id])]
-    weighed = [name for name in WEIGHED if judged and all(name in known[trial.id] for trial in judged)]
+    pruned = {"status": "pruned"}
+    trials = [_judged(aim, records.get(trial.id) or planned(trial).model_copy(update=pruned)) for trial in ended]
+    judged = [trial for trial in trials if trial.keeps is not None]
+    weighed = [name for name in WEIGHED if judged and all(name in trial.metrics for trial in judged)]
     names = list(dict.fromkeys([*aim.names, *weighed]))
-    costs = {trial.id: aim.costs(known[trial.id], names) for trial in judged}
+    costs = {trial.record.id: aim.costs(trial.metrics, names) for trial in judged}
     numbers = {trial.id: number for number, trial in enumerate(space.trials)}
-    fit = [trial for trial in judged if aim.keeps_all(known[trial.id])]
-    best = min(fit, key=lambda trial: (costs[trial.id], numbers[trial.id]), default=None)
-    nearest = min(judged, key=lambda trial: (aim.missed(known[trial.id]), costs[trial.id]), default=None)
+
+    def cost(trial: JudgedTrial) -> tuple[float, ...]:
+        return costs[trial.record.id]
+
+    fit = [trial for trial in judged if trial.keeps]
+    best = min(fit, key=lambda trial: (cost(trial), numbers[trial.record.id]), default=None)
+    nearest = min(judged, key=lambda trial: (aim.missed(trial.metrics), cost(trial)), default=None)
     on = _frontier(costs)
-
-    def chosen(trial: Trial | None) -> dict[str, Any] | None:
-        return None if trial is None else _chosen(aim, trial, records[trial.id], known[trial.id])
-
-    return {
-        "best": chosen(best),
-        "nearest": chosen(nearest) if best is None else None,
-        "weighed": names,
-        "frontier": [chosen(trial) for trial in sorted(judged, key=lambda trial: costs[trial.id]) if trial.id in on],
-        "trials": [_row(search, trial, records.get(trial.id), known[trial.id]) for trial in ended],
-        "not_tried": _not_tried(space, ended),
+    untried = {
+        name: [each for each in several if all(trial.options[name] != each for trial in ended)]
+        for name, several in space.axes.items()
     }
+    return Answer(
+        best=best,
+        nearest=None if best else nearest,
+        weighed=names,
+        frontier=sorted((trial for trial in judged if trial.record.id in on), key=cost),
+        trials=trials,
+        size=len(space.trials),
+        not_tried={name: left for name, left in untried.items() if left},
+    )
 
 
-def _chosen(aim: Aim, trial: Trial, record: Record, figures: Mapping[str, float]) -> dict[str, Any]:
-    return {
-        "id": trial.id,
-        "command": ["trilane", *trial.command, *trial.words],
-        "options": dict(trial.options),
-        "metrics": dict(figures),
-        "keeps": aim.keeps_all(figures),
-        "misses": [str(keep) for keep, miss in zip(aim.keeps, aim.misses(figures), strict=True) if miss > 0],
-        "unsure": record.get("unsure", []),
-    }
-
-
-def _row(search: Search, trial: Trial, record: Record | None, figures: Mapping[str, float]) -> dict[str, Any]:
-    aim = search.aim
-    keeps = aim.keeps_all(figures) if aim.has_all(figures) else None
-    row = {**row_of(trial, record), "metrics": dict(figures), "keeps": keeps}
-    return {**row, "status": "pruned"} if record is None and trial.id in search.pruned else row
+def _judged(aim: Aim, record: TrialRecord) -> JudgedTrial:
+    figures = figures_of(record, aim.names)
+    if not aim.has_all(figures):
+        return JudgedTrial(record, figures, None, ())
+    missed = (str(keep) for keep, miss in zip(aim.keeps, aim.misses(figures), strict=True) if miss > 0)
+    return JudgedTrial(record, figures, aim.keeps_all(figures), tuple(missed))
 
 
 def _frontier(costs: Mapping[str, tuple[float, ...]]) -> set[str]:
@@ -459,20 +507,3 @@ def _frontier(costs: Mapping[str, tuple[float, ...]]) -> set[str]:
     several = set(costs.values())
     on = {own for own in several if not any(beats(other, own) for other in several)}
     return {name for name, own in costs.items() if own in on}
-
-
-def _not_tried(space: Space, ended: Sequence[Trial]) -> dict[str, Any]:
-    """Return which part of `space` was not tried. `ended`: trials that were tried.
-
-    Keys: `count`: number of configurations not tried. `of`: number of all configurations. `values`: for each axis, the
-    values that no trial had; an axis whose values were all tried is missing.
-    """
-    values = {
-        name: [each for each in several if all(trial.options[name] != each for trial in ended)]
-        for name, several in space.axes.items()
-    }
-    return {
-        "count": len(space.trials) - len(ended),
-        "of": len(space.trials),
-        "values": {name: left for name, left in values.items() if left},
-    }

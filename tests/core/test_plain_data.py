@@ -42,7 +42,16 @@ CHANGING = {
     "stages.cpu.mesh_bounds._Extent",
 }
 #: Models that keep keys which they do not know: what other versions of Trilane have measured.
-OPEN = {"apps.compare.sides.ImportedTime", "avatars.manifest.AccuracyFigures", "avatars.manifest.Validation"}
+OPEN = {
+    "apps.compare.sides.ComparedCounts",
+    "apps.compare.sides.ComparedFigures",
+    "apps.compare.sides.ComparedStage",
+    "apps.compare.sides.ComparedUnit",
+    "apps.compare.sides.ImportedTime",
+    "apps.sweep.store.TrialRecord",
+    "avatars.manifest.AccuracyFigures",
+    "avatars.manifest.Validation",
+}
 
 
 def module_names() -> Iterator[str]:

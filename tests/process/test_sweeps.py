@@ -21,7 +21,7 @@ import pytest
 from trilane import machine
 from trilane.apps.sweep.definition import Trial, TrialClock
 from trilane.apps.sweep.engines import TrialPlace, at_once, run_here
-from trilane.apps.sweep.store import TRIALS, Store, read_trials, run_sweep
+from trilane.apps.sweep.store import TRIALS, Store, TrialRecord, read_trials, run_sweep
 
 FAKE = "support.sweep_trial"
 #: `trilane` that tries the module in place of Trilane.
@@ -46,7 +46,7 @@ def log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return file
 
 
-def swept(folder: Path, trials: list[Trial]) -> dict[str, dict[str, Any]]:
+def swept(folder: Path, trials: list[Trial]) -> dict[str, TrialRecord]:
     """The records after a sweep of `trials`."""
     with Store(folder, trials, {}, resume=False) as store:
         place = TrialPlace(store.folder, program=FAKE)
@@ -77,10 +77,10 @@ def test_trials_of_the_host_clock_one_after_the_other_with_their_folders(tmp_pat
     assert at_once(TrialClock.HOST) == 1
     for trial in trials:
         record = records[trial.id]
-        assert record["result"] == {"schema": 1, "words": ["run", *trial.words, "--json"], "threads": "7"}
-        assert record["command"] == ["trilane", "run", *trial.words, "--json"]
-        assert (record["status"], record["clock"], record["folder"]) == ("done", "host", trial.id)
-        assert record["host"]["cpu"]["cores_allowed"] == list(machine.here.cores())
+        assert record.result == {"schema": 1, "words": ["run", *trial.words, "--json"], "threads": "7"}
+        assert record.command == ("trilane", "run", *trial.words, "--json")
+        assert (record.status, record.clock, record.folder) == ("done", "host", trial.id)
+        assert record.host is not None and record.host["cpu"]["cores_allowed"] == list(machine.here.cores())
         assert (tmp_path / "s" / trial.id / "report.json").is_file()
     assert not list((tmp_path / "s").glob("*.partial"))
 
@@ -89,7 +89,7 @@ def test_virtual_trials_are_packed(tmp_path: Path, log: Path, monkeypatch: pytes
     monkeypatch.setattr(machine.here, "cores", lambda: (0, 1))
     monkeypatch.setenv("SWEEP_TRIAL_TOGETHER", "2")
     records = swept(tmp_path / "s", numbered("predict", 2))
-    assert {(record["clock"], record["folder"]) for record in records.values()} == {("virtual", None)}
+    assert {(record.clock, record.folder) for record in records.values()} == {("virtual", None)}
     (_, first_end), (second_begin, _) = spans(log)
     assert second_begin < first_end
 
@@ -98,13 +98,9 @@ def test_failed_trials_are_kept_and_not_repeated_and_lost_ones_are(tmp_path: Pat
     failing = Trial(("run",), {"n": 1}, ("--code", "3"))
     killed = Trial(("run",), {"n": 2}, ("--die-once", str(tmp_path / "mark")))
     records = swept(tmp_path / "s", [failing, killed])
-    assert {key: records[failing.id][key] for key in ("status", "exit_code", "error", "tries")} == {
-        "status": "failed",
-        "exit_code": 3,
-        "error": "error: as it was asked",
-        "tries": 1,
-    }
-    assert (records[killed.id]["status"], records[killed.id]["tries"]) == ("done", 2)
+    failed = records[failing.id]
+    assert (failed.status, failed.exit_code, failed.error, failed.tries) == ("failed", 3, "error: as it was asked", 1)
+    assert (records[killed.id].status, records[killed.id].tries) == ("done", 2)
     assert Counter(note["what"] for note in notes(log)) == {"begin": 3, "end": 2}
 
 
@@ -123,8 +119,9 @@ def test_a_disturbed_run_is_done_again_and_the_least_disturbed_is_kept(
 ) -> None:
     trial = Trial(("run",), {"n": 1}, ("--others", shares))
     record = swept(tmp_path / "s", [trial])[trial.id]
-    assert (record["result"]["other_programs"], record["repeated"], record["tries"]) == (kept, calls - 1, 1)
-    assert record["unsure"] == ([] if kept <= 0.05 else ["other programs took 10 % of its cores"])
+    assert record.result is not None
+    assert (record.result["other_programs"], record.repeated, record.tries) == (kept, calls - 1, 1)
+    assert record.unsure == (() if kept <= 0.05 else ("other programs took 10 % of its cores",))
     assert (tmp_path / "s" / trial.id / "report.json").read_text() == str(kept)
     assert sorted(path.name for path in (tmp_path / "s").iterdir() if path.is_dir()) == [trial.id]
     assert sum(note["what"] == "begin" for note in notes(log)) == calls

@@ -21,9 +21,10 @@ from trilane.apps.compare.difference import Finding
 from trilane.apps.compare.pages import comparison_page
 from trilane.apps.compare.rows import Figure
 from trilane.apps.compare.run_frames import frames_of
-from trilane.apps.compare.sides import ComparedRun, RunKind, Side
+from trilane.apps.compare.sides import ComparedRun, RunKind, Side, compared_run
 from trilane.pipeline.journal import Worked, journal_of
 from trilane.pipeline.reckoning import reckoned
+from trilane.pipeline.run_metrics import Bound, PathShare
 
 
 def side(*seeds: int, factors: Mapping[str, float] | None = None, counted: bool = True) -> Side:
@@ -34,12 +35,12 @@ def side(*seeds: int, factors: Mapping[str, float] | None = None, counted: bool 
         if not counted:
             records = [each._replace(figures={}) if isinstance(each, Worked) else each for each in records]
         report = make_report(**{**run.report, "clock": "host", "other_programs": 0.0, "baseline": None})
-        runs.append(ComparedRun(f"run {seed}", RunKind.RUN, report, frames_of(records)))
+        runs.append(compared_run(f"run {seed}", RunKind.RUN, report, frames_of(records)))
     return Side("runs", tuple(runs))
 
 
 def one(base: Side, other: Side) -> Comparison:
-    return compare(base, [other])[0]
+    return compare(base, other)
 
 
 def named(verdict: str) -> list[str]:
@@ -126,7 +127,7 @@ def bounded(seed: int, **factors: float) -> ComparedRun:
     assert run.recording is not None
     begun, *records = journal_of(run.recording, run.jobs, {}, run.report)
     found = reckoned(run.recording.graph, run.recording.settings, {}, records)
-    return ComparedRun(
+    return compared_run(
         f"run {seed}", RunKind.RUN, make_report(**run.report, **found.figures), frames_of([begun, *records])
     )
 
@@ -152,11 +153,11 @@ def test_what_bounded_either_run_is_named_and_that_it_changed() -> None:
     assert bounds_text(several.bounds) == (
         "bound: gpu in 1 of 2 runs, dsp in 1 of 2 runs; was dsp in 2 of 2 runs: whether it changed cannot be told"
     )
-    assert several.as_json()["bound"]["other"][0] == slow.document["bound"]
+    assert several.bounds.other[0] == slow.figures.bound
 
 
-def bound(name: str, low: float | None) -> dict[str, Any]:
-    return {"unit": {"name": name, "share": 0.6, "share_low": low, "share_high": 0.7}, "stage": None}
+def bound(name: str, low: float | None) -> Bound:
+    return Bound(unit=PathShare(name=name, share=0.6, share_low=low, share_high=0.7), stage=None)
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from trilane.apps.compare.gate import GatedPair, LimitOutcome, judge, read_gate,
 from trilane.apps.compare.pages import comparison_page
 from trilane.apps.compare.rows import Figure, noise_between, remarks
 from trilane.apps.compare.run_frames import Key, frames_of
-from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, changes, read_side, read_told
+from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, changes, compared_run, read_side, read_told
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, JournalWriter, Worked, journal_of
 from trilane.scheduler.virtual import Simulation
@@ -34,11 +34,16 @@ def told(run: Simulation, name: str = "run", **changes: Any) -> ComparedRun:
     assert run.recording is not None
     frames = frames_of(journal_of(run.recording, run.jobs, {}, run.report))
     report = make_report(**{**run.report, "policy": run.recording.settings.policy, **changes})
-    return ComparedRun(name, RunKind.RUN, report, frames)
+    return compared_run(name, RunKind.RUN, report, frames)
+
+
+def reported(name: str = "run", **changes: Any) -> ComparedRun:
+    """A run of which only the report is there."""
+    return compared_run(name, RunKind.REPORT, make_report(**changes))
 
 
 def pair(base: ComparedRun, other: ComparedRun) -> Comparison:
-    return compare(Side(base.name, (base,)), [Side(other.name, (other,))])[0]
+    return compare(Side(base.name, (base,)), Side(other.name, (other,)))
 
 
 @pytest.fixture
@@ -160,7 +165,7 @@ def test_several_runs_a_side_stand_for_it() -> None:
         )
         for name, start, factor in (("a", 1, 1.0), ("b", 4, 1.0), ("c", 7, 1.05))
     ]
-    alike, longer = compare(sides[0], sides[1:])
+    alike, longer = (compare(sides[0], side) for side in sides[1:])
     assert alike.verdict == NO_DIFFERENCE
     assert "infer takes " in longer.verdict
     one = pair(sides[0].runs[0], sides[2].runs[0])
@@ -174,8 +179,9 @@ def test_several_runs_a_side_stand_for_it() -> None:
 
 def test_what_explains_a_change_is_what_differed_between_the_runs() -> None:
     """By the table. Others left 0.9 and 0.976 of the cores; the mean of both bases' shares counts for two runs."""
-    base = make_report(clock="host", other_programs=0.1)
-    other = make_report(clock="host", other_programs=0.024, config={**base["config"], "pace_ns": {"infer": 5}})
+    base = reported("a", clock="host", other_programs=0.1)
+    config = {**make_report()["config"], "pace_ns": {"infer": 5}}
+    other = reported("b", clock="host", other_programs=0.024, config=config)
     noise = noise_between([base], [other], {"infer": 0.1})
     assert noise.of_time() == (0.03, 0.0, 5, pytest.approx(log(0.976 / 0.9)))
     assert noise.of_time("p90").relative == pytest.approx(0.045)
@@ -187,12 +193,12 @@ def test_what_explains_a_change_is_what_differed_between_the_runs() -> None:
     assert noise.held == frozenset()
     held = noise_between([other], [other], {"infer": 0.1})
     assert held.of_work("infer", "typical") == (0.002, 0.0, 5, 0.0)
-    full = make_report(clock="host", other_programs=1.0)
+    full = reported(clock="host", other_programs=1.0)
     assert noise_between([base], [full], {}).others[0] == pytest.approx(log(0.9 / 0.01))
-    virtual = make_report(clock="virtual")
+    virtual = reported("d", clock="virtual")
     noise = noise_between([virtual], [virtual], {"infer": 0.1})
     assert {noise.of_time(), noise.of_work("infer", "typical"), noise.of_share(), noise.of_count()} == {Chance()}
-    said = remarks({"a": base, "b": other, "c": make_report(), "d": virtual})
+    said = remarks([base, other, reported("c"), virtual])
     assert [text[:2] for text in said] == ["a:", "c:"]
     assert "had 10 % of its cores, by which frames may take up to 11 % longer" in said[0]
 
@@ -204,17 +210,17 @@ def test_a_core_on_which_every_stage_is_slower_is_slower_itself() -> None:
         for name, unit in (("pose", "cpu"), ("present", "cpu"), ("infer", "dsp"))
     }
     share = make_report()["units"]["dsp"]
-    report = make_report(
-        stages=stages, units={"cpu": {**share, "cores": [0]}, "dsp": {**share, "cores": [1]}}, other_programs=0.0
-    )
+    units = {"cpu": {**share, "cores": [0]}, "dsp": {**share, "cores": [1]}}
+    report = reported(stages=stages, units=units, other_programs=0.0)
 
-    def slower(other: dict[str, Any], **effects: float) -> dict[str, float]:
+    def slower(other: ComparedRun, **effects: float) -> dict[str, float]:
         noise = noise_between([report], [other], effects)
         return {stage: noise.of_work(stage, "typical").explained for stage in effects}
 
     assert slower(report, pose=0.2, present=0.3, infer=0.5) == {"pose": 0.2, "present": 0.2, "infer": 0.0}
     assert set(slower(report, pose=0.2, present=-0.3, infer=0.5).values()) == {0.0}
-    elsewhere = {**report, "machine": {**report["machine"], "system": "another"}}
+    machine = {**make_report()["machine"], "system": "another"}
+    elsewhere = reported(stages=stages, units=units, other_programs=0.0, machine=machine)
     assert set(slower(elsewhere, pose=0.2, present=0.3).values()) == {0.0}
 
 
@@ -224,17 +230,21 @@ def test_only_the_keys_that_differ_are_named() -> None:
     other["config"] = {**base["config"], "policy": "latest", "pace_ns": {"infer": 5}, "shapes": [[1, 2]]}
     other["policy"] = "latest"
     other["stages"] = {"infer": {**base["stages"]["infer"], "unit": "gpu"}}
-    assert changes(base, other) == [
+
+    def changed(first: dict[str, Any], second: dict[str, Any]) -> list[Change]:
+        return changes(*(compared_run("run", RunKind.REPORT, each) for each in (first, second)))
+
+    assert changed(base, other) == [
         Change("policy", "pipelined", "latest"),
         Change("config.pace_ns.infer", None, 5),
         Change("config.shapes", None, [[1, 2]]),
         Change("stages.infer.unit", "dsp", "gpu"),
         Change("made.revision", "x", "y"),
     ]
-    assert changes(base, base) == []
+    assert changed(base, base) == []
     prediction = {**base, "config": {**base["config"], "edge": "double"}}
     del prediction["policy"], prediction["edge"]
-    assert changes(base, prediction) == []
+    assert changed(base, prediction) == []
 
 
 def test_bytes_that_a_stage_moves_are_named() -> None:
@@ -246,7 +256,7 @@ def test_bytes_that_a_stage_moves_are_named() -> None:
             else record
             for record in journal_of(run.recording, run.jobs, {}, run.report)
         ]
-        return ComparedRun("run", RunKind.RUN, make_report(**run.report), frames_of(records))
+        return compared_run("run", RunKind.RUN, make_report(**run.report), frames_of(records))
 
     run = simulated(1, frames=60)
     assert pair(moved(run, 1.0), moved(run, 1.5)).verdict == "raster bytes read +50 %"
@@ -277,7 +287,7 @@ def test_a_stage_that_only_waits_longer_for_its_core_takes_no_longer() -> None:
         else record
         for record in journal_of(run.recording, run.jobs, {}, run.report)
     ]
-    waits = ComparedRun("waits", RunKind.RUN, make_report(**run.report), frames_of(records))
+    waits = compared_run("waits", RunKind.RUN, make_report(**run.report), frames_of(records))
     found = pair(told(simulated(1)), waits)
     assert found.verdict.startswith("frame time +2") and "unit dsp (infer) has no core" in found.verdict
     assert "takes" not in found.verdict
@@ -305,7 +315,7 @@ def test_drops_and_errors_are_named() -> None:
 def test_a_report_without_a_journal_has_summaries(make: Make) -> None:
     base, other = make("a"), make("b", policy="sequential", seed=2)
     (base / NAME).unlink()
-    found = compare(read_side(str(base)), [read_side(str(other / "report.json"))])[0]
+    found = compare(read_side(str(base)), read_side(str(other / "report.json")))
     assert "frame time +" in found.verdict and "is starved" in found.verdict
     assert sum("only summaries are compared" in note for note in found.notes) == 2
     assert found.rows[Figure("frame time", "", "", "p99", "ms")].probability is None
@@ -356,7 +366,7 @@ def test_a_journal_that_is_cut_off_is_compared_until_there_or_refused(make: Make
     base, other = make("a"), make("b", seed=2)
     whole = (other / NAME).read_bytes()
     (other / NAME).write_bytes(whole[: len(whole) * 3 // 4])
-    found = compare(read_side(str(base)), [read_side(str(other))])[0]
+    found = compare(read_side(str(base)), read_side(str(other)))
     assert any("its journal ends before the run did" in note for note in found.notes)
     (other / NAME).write_bytes(whole[:2000])
     with pytest.raises(BadInputError, match=r"b/journal\.msgpack: found fewer than two presented frames"):
@@ -415,9 +425,9 @@ def test_of_a_thousand_files_that_are_not_there_one_is_named() -> None:
 def test_a_side_of_several_runs_shows_what_its_reports_say() -> None:
     runs = [told(simulated(seed, frames=60, factors={"infer": seed / 2.0}), f"r{seed}") for seed in range(1, 5)]
     ab, cd = Side("a,b", tuple(runs[:2])), Side("c,d", tuple(runs[2:]))
-    there, back = compare(ab, [cd])[0].rows, compare(cd, [ab])[0].rows
+    there, back = compare(ab, cd).rows, compare(cd, ab).rows
     figure = Figure("frame time", "", "", "mean", "ms")
-    means = [run.document["frame_time_ms"]["mean"] for run in runs]
+    means = [run.figures.frame_time_ms["mean"] or 0.0 for run in runs]
     assert there[figure].base == pytest.approx((means[0] + means[1]) / 2, rel=1e-6)
     assert there[figure].other == pytest.approx((means[2] + means[3]) / 2, rel=1e-6)
     assert all((row.base, row.other) == pytest.approx((back[key].other, back[key].base)) for key, row in there.items())
@@ -451,20 +461,20 @@ def test_a_run_that_was_killed_is_compared_by_its_journal(
     folder = killed(tmp_path / "runs" / f"gone.{NOBODY}.partial", slow, {**facts, "config": config}, keep=0.8)
     for name in (str(folder), "gone", "runs/gone", str(folder / NAME)):
         other = read_side(name)
-        found = compare(read_side(str(base)), [other])[0]
+        found = compare(read_side(str(base)), other)
         assert [change.key for change in found.changes] == ["config.pace_ns.pose"]
         assert "infer takes " in found.verdict
         assert any("it did not end by itself and has no report" in note for note in found.notes)
-    document = other.runs[0].document
-    assert 60 < document["frames"]["presented"] == document["frames"]["requested"] < 120
-    assert (document["bottleneck"], document["bound"]["stage"]["name"]) == ("dsp", "infer")
+    frames, bound = other.runs[0].figures.frames, other.runs[0].figures.bound
+    assert frames is not None and 60 < frames.presented == frames.requested < 120
+    assert bound is not None and bound.stage is not None and (bound.unit.name, bound.stage.name) == ("dsp", "infer")
     live = killed(tmp_path / "runs" / f"live.{os.getpid()}.partial", slow, facts, keep=0.8)
     assert "it still goes on" in read_side(str(live)).runs[0].remark
     done = read_side(str(killed(tmp_path / "done", slow, facts))).runs[0]
     assert done.remark == "it has no report: compared by its journal"
-    assert done.document["frame_time_ms"]["mean"] == pytest.approx(slow.report["frame_time_ms"]["mean"])
+    assert done.figures.frame_time_ms["mean"] == pytest.approx(slow.report["frame_time_ms"]["mean"])
     (base / NAME).unlink()
-    assert "only summaries" in compare(read_side(str(base)), [read_side("gone")])[0].notes[0]
+    assert "only summaries" in compare(read_side(str(base)), read_side("gone")).notes[0]
 
 
 def test_what_a_journal_says_of_a_run_is_what_its_report_says(tmp_path: Path) -> None:
@@ -472,16 +482,17 @@ def test_what_a_journal_says_of_a_run_is_what_its_report_says(tmp_path: Path) ->
     run = simulated(5, frames=80, policy="latest", period_ms=5)
     read = read_side(str(killed(tmp_path / "a", run, {"clock": "virtual"}, keep=0.999))).runs[0]
     assert read.frames is not None and not read.frames.is_whole
-    mine, report = read.document, run.report
-    assert mine["policy"] == "latest"
+    mine, report = read.figures, run.report
+    assert read.settings["policy"] == "latest"
     for key in ("frame_time_ms", "latency_ms"):
-        assert mine[key]["mean"] == pytest.approx(report[key]["mean"], rel=0.02)
+        assert getattr(mine, key)["mean"] == pytest.approx(report[key]["mean"], rel=0.02)
     for stage, row in report["stages"].items():
-        assert mine["stages"][stage]["unit"] == row["unit"]
-        assert mine["stages"][stage]["service_ms"]["mean"] == pytest.approx(row["service_ms"]["mean"], rel=0.02)
+        assert mine.stages[stage].unit == row["unit"]
+        assert mine.stages[stage].service_ms["mean"] == pytest.approx(row["service_ms"]["mean"], rel=0.02)
     for unit, row in report["units"].items():
-        assert mine["units"][unit]["busy"] == pytest.approx(row["busy"], abs=0.03)
-    assert sum(mine["frames"]["dropped"].values()) == pytest.approx(sum(report["frames"]["dropped"].values()), abs=3)
+        assert mine.units[unit].busy == pytest.approx(row["busy"], abs=0.03)
+    assert mine.frames is not None
+    assert sum(mine.frames.dropped.values()) == pytest.approx(sum(report["frames"]["dropped"].values()), abs=3)
     broken = killed(tmp_path / "b", run, {"config": [1]})
     with pytest.raises(BadInputError, match=r"config: found \[1\], expected names and their values"):
         read_side(str(broken))

@@ -29,7 +29,7 @@ from trilane.apps.compare.difference import Difference
 from trilane.apps.compare.gate import METRICS, GatedPair, LimitOutcome, Weighed, judge, read_gate, runs_needed, whole
 from trilane.apps.compare.rows import FRAME_TIME, MS, Figure
 from trilane.apps.compare.run_frames import frames_of
-from trilane.apps.compare.sides import ComparedRun, RunKind, Side
+from trilane.apps.compare.sides import ComparedRun, RunKind, Side, compared_run
 from trilane.errors import BadInputError
 from trilane.pipeline.journal import Worked, journal_of
 from trilane.scheduler.events import Settings, chain
@@ -52,7 +52,7 @@ def run(
     if not counted:
         records = [each._replace(figures={}) if isinstance(each, Worked) else each for each in records]
     facts = {"clock": "host", "other_programs": others or QUIET, "baseline": None, **changes}
-    return ComparedRun(f"run {seed}", RunKind.RUN, make_report(**{**simulation.report, **facts}), frames_of(records))
+    return compared_run(f"run {seed}", RunKind.RUN, make_report(**{**simulation.report, **facts}), frames_of(records))
 
 
 def outcome(base: ComparedRun, other: ComparedRun, *limits: str) -> LimitOutcome:
@@ -60,7 +60,7 @@ def outcome(base: ComparedRun, other: ComparedRun, *limits: str) -> LimitOutcome
 
 
 def pair(base: ComparedRun, other: ComparedRun) -> GatedPair:
-    found = compare(Side(base.name, (base,)), [Side(other.name, (other,))])[0]
+    found = compare(Side(base.name, (base,)), Side(other.name, (other,)))
     return GatedPair(other.name, found.base, found.other, found.rows, found.changes)
 
 
@@ -94,9 +94,7 @@ def test_a_frame_time_that_doubles_without_more_instructions_never_passes() -> N
     assert other.frames is not None and base.frames is not None
     kept = {key: each for key, each in run(2, dict.fromkeys(STAGES, 2.0)).frames.series.items()}  # type: ignore[union-attr]
     counted = {key: each for key, each in other.frames.series.items() if key.measure == "instructions"}
-    waits = ComparedRun("waits", RunKind.RUN, other.document, type(other.frames)(
-        other.frames.begun, {**kept, **counted}, other.frames.ended, other.frames.presented, other.frames.counted
-    ))  # fmt: skip
+    waits = replace(other, name="waits", frames=replace(other.frames, series={**kept, **counted}))
     said = reason(base, waits, "slower=5%")
     assert said.startswith("slower=5%: broken: ") and "frame time +" in said
 
@@ -154,7 +152,7 @@ def test_the_error_of_the_frames_has_a_limit_in_decibels() -> None:
     assert "--check" in reason(base, run(3), "psnr=0.5dB")
     sides = [Side(name, tuple(run(seed, **checked(db, 30.0)) for seed, db in enumerate(values, 1)))
              for name, values in (("a", (35.0, 35.1, 35.2)), ("b", (34.0, 34.1, 34.2)))]  # fmt: skip
-    found = compare(sides[0], [sides[1]])[0]
+    found = compare(sides[0], sides[1])
     several = judge([read_gate("psnr=0.5dB")], [GatedPair("b", *sides, found.rows, found.changes)])[0]
     assert several.outcome is LimitOutcome.BROKEN
     row = several.figures[0].row
@@ -368,7 +366,7 @@ def pairs(load: float, change: float, number: int, *, counted: bool, runs: int =
             Side(name, tuple(run(next(seeds), factors, counted=counted, others=load) for _ in range(runs)))
             for name, factors in (("base", {}), ("other", {stage: change}))
         ]
-        found = compare(made[0], [made[1]])[0]
+        found = compare(made[0], made[1])
         yield stage, GatedPair("other", *made, found.rows, found.changes)
 
 
@@ -394,8 +392,9 @@ def test_how_often_the_gate_is_right(load: float, counted: bool) -> None:
 
 def test_runs_that_lost_nothing_keep_a_limit_of_losses() -> None:
     assert reason(run(1), run(2), "lost=1%") == "lost=1%: kept: no run lost or dropped a frame"
-    frames = run(2).document["frames"]
-    losing = {**frames, "presented": frames["presented"] - 30, "dropped": {"raster->infer": 30}}
+    frames = run(2).figures.frames
+    assert frames is not None
+    losing = {**frames.as_json(), "presented": frames.presented - 30, "dropped": {"raster->infer": 30}}
     assert outcome(run(1), run(2, frames=losing), "lost=1%") is LimitOutcome.BROKEN
 
 
@@ -413,7 +412,7 @@ def at_times(seed: int, slow: str = "", others: float = QUIET) -> ComparedRun:
     waited = [job._replace(cpu_ns=0) for job in done.jobs]  # nothing says that the long jobs computed
     records = [*journal_of(done.recording, waited, {"clock": "host"}, done.report)]
     facts = {"clock": "host", "other_programs": others, "baseline": None}
-    return ComparedRun(f"run {seed}", RunKind.RUN, make_report(**{**done.report, **facts}), frames_of(records))
+    return compared_run(f"run {seed}", RunKind.RUN, make_report(**{**done.report, **facts}), frames_of(records))
 
 
 def test_beside_other_programs_few_long_jobs_are_neither_passed_nor_called_slower() -> None:
@@ -428,7 +427,7 @@ def of_four(name: str, first_seed: int, slow: str = "") -> Side:
 def test_few_jobs_that_take_much_longer_are_not_passed_though_the_typical_job_is_as_before(stage: str) -> None:
     """The mean doubles while the middle half does not change, and neither stage bounds the frame time."""
     for other, expected in ((of_four("slow", 9, stage), LimitOutcome.BROKEN), (of_four("same", 20), LimitOutcome.KEPT)):
-        found = compare(of_four("base", 0), [other])[0]
+        found = compare(of_four("base", 0), other)
         pairs = [GatedPair(other.name, found.base, found.other, found.rows, found.changes)]
         judged = judge([read_gate("slower=12%")], pairs)[0]
         assert judged.outcome is expected
@@ -437,6 +436,6 @@ def test_few_jobs_that_take_much_longer_are_not_passed_though_the_typical_job_is
 
 def test_a_stage_that_one_side_lacks_is_not_passed() -> None:
     other = run(2)
-    stages = {name: row for name, row in other.document["stages"].items() if name != "infer"}
-    less = replace(other, document={**other.document, "stages": stages})
+    stages = {name: row for name, row in other.figures.stages.items() if name != "infer"}
+    less = replace(other, figures=other.figures.model_copy(update={"stages": stages}))
     assert reason(run(1), less, "slower=100%") == "slower=100%: cannot tell: not on both sides: infer"

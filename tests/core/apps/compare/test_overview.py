@@ -12,7 +12,6 @@ import pytest
 
 from trilane.apps.compare.overview import (
     Entry,
-    columns,
     entry_of,
     frontier,
     read_entries,
@@ -163,7 +162,7 @@ def test_a_command_can_be_typed_again() -> None:
 def test_only_what_differs_is_a_column() -> None:
     one, two = entry_of("1", REPORT), entry_of("2", REPORT | {"config": {"policy": "latest", "encoder": "resnet18"}})
     assert varied([one, two]) == ["policy"]
-    assert columns([one, two])[:2] == ["name", "policy"]
+    assert list(table_rows([one, two])[0])[:2] == ["name", "policy"]
     assert [row["policy"] for row in table_rows([one, two])] == ["pipelined", "latest"]
 
 
@@ -317,7 +316,7 @@ def test_tables_have_the_same_rows(tmp_path: Path) -> None:
     write_csv(tmp_path / "t.csv", entries)
     with (tmp_path / "t.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
-    assert list(rows[0]) == columns(entries)
+    assert list(rows[0]) == list(table_rows(entries)[0])
     assert [(row["name"], row["frame_ms"], row["on_frontier"]) for row in rows] == [
         ("128, far.toml", "20.0", "True"),
         ("64", "", "False"),

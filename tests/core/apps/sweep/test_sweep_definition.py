@@ -27,6 +27,7 @@ from trilane.apps.sweep.definition import (
     read_sweep,
     trials_of,
 )
+from trilane.apps.sweep.store import SweepSummary, TrialRecord
 from trilane.errors import BadInputError
 
 EXAMPLE = Path(__file__).resolve().parents[4] / "docs" / "examples" / "chip-sweep.toml"
@@ -241,26 +242,26 @@ def test_an_address_where_nobody_listens_is_found_at_once() -> None:
         engines._try_address(known_to_ray_alone)
 
 
+OF_SIZES = Definition(RUN, {}, {"size": [0]})
+
+
+def ended(*trials: dict[str, Any]) -> SweepSummary:
+    """A sweep whose trials ended with these keys of their records."""
+    common = {"status": "done", "seconds": 1.0, "options": {"size": 0}}
+    records = (TrialRecord.model_validate({"id": str(place), **common, **own}) for place, own in enumerate(trials))
+    return SweepSummary(Path("s"), tuple(records), 0)
+
+
 def test_a_summary_says_why_trials_failed(capsys: pytest.CaptureFixture[str]) -> None:
-    rows = [
-        {"id": str(place), "options": {"size": place}, "status": status, "seconds": 1.0, "error": error}
-        for place, (status, error) in enumerate(
-            [("failed", "no [room]"), ("done", None), ("failed", "no [room]"), ("lost", "killed")]
-        )
-    ]
-    counts = dict.fromkeys(("trials", "done", "failed", "lost", "skipped"), 1)
-    print_summary({"trials": rows, "counts": counts, "clock": "host"}, Definition(RUN, {}, {"size": [0]}), {})
+    ends = [("failed", "no [room]"), ("done", None), ("failed", "no [room]"), ("lost", "killed")]
+    print_summary(ended(*({"status": status, "error": error} for status, error in ends)), OF_SIZES, "host")
     printed = capsys.readouterr().out
     assert printed.splitlines()[-2:] == ["2 failed: no [room]", "1 lost: killed"] and "worst" not in printed
 
 
 def test_the_row_of_a_trial_on_a_busy_machine_says_so(capsys: pytest.CaptureFixture[str]) -> None:
-    rows = [
-        {"id": size, "options": {"size": size}, "status": "done", "seconds": 1.0, "error": None, "unsure": unsure}
-        for size, unsure in (("96", []), ("128", ["other programs took 27 %"]))
-    ]
-    counts = dict.fromkeys(("trials", "done", "failed", "lost", "skipped"), 1)
-    print_summary({"trials": rows, "counts": counts, "clock": "host"}, Definition(RUN, {}, {"size": [0]}), {})
+    busy_one = {"options": {"size": "128"}, "unsure": ["other programs took 27 %"]}
+    print_summary(ended({"options": {"size": "96"}}, busy_one), OF_SIZES, "host")
     quiet, busy = (line for line in capsys.readouterr().out.splitlines() if "done" in line and "│" in line)
     assert "96" in quiet and "UNSURE" not in quiet
     assert "128" in busy and "done, UNSURE" in busy
@@ -281,12 +282,7 @@ def test_defects_that_are_found_late_name_the_file(tmp_path: Path, text: str, fo
 
 
 def test_a_prediction_of_a_pipeline_file_shows_its_variant(capsys: pytest.CaptureFixture[str]) -> None:
-    rows = [
-        {"id": "a", "options": {"set": ["run.fps=60"]}, "repeat": 1, "status": "done", "seconds": 2.0, "error": None}
-    ]
-    counts = dict.fromkeys(("trials", "done", "failed", "lost", "skipped"), 1)
     pipelines = [{"what_if": "", "fps": 30.0}, {"what_if": "run.fps=60", "fps": 59.5}]
-    records = {"a": {"result": {"pipelines": pipelines}}}
-    document = {"trials": rows, "counts": counts, "clock": "virtual"}
-    print_summary(document, Definition(("predict",), {}, {"set": [["run.fps=60"]]}), records)
+    trial = {"options": {"set": ["run.fps=60"]}, "result": {"pipelines": pipelines}}
+    print_summary(ended(trial), Definition(("predict",), {}, {"set": [["run.fps=60"]]}), "virtual")
     assert "59.5" in capsys.readouterr().out

@@ -13,15 +13,29 @@ from hypothesis import strategies as st
 from trilane.apps.sweep import store as module
 from trilane.apps.sweep.definition import Trial
 from trilane.apps.sweep.engines import ended_as
-from trilane.apps.sweep.store import SWEEP, TRIALS, Store, latest, read_trials, run_sweep, summary, whole_lines
+from trilane.apps.sweep.store import (
+    SWEEP,
+    TRIALS,
+    Store,
+    TrialRecord,
+    latest,
+    planned,
+    read_trials,
+    run_sweep,
+    whole_lines,
+)
 from trilane.errors import BadInputError
 
 TRIALS_3 = [Trial(("predict",), {"size": size}, ("--size", size)) for size in ("1", "2", "3")]
 FIRST, SECOND, THIRD = TRIALS_3
 
 
-def record(trial: Trial, status: str = "done", **more: Any) -> dict[str, Any]:
-    return {"id": trial.id, "status": status, "exit_code": 0, "error": None, "seconds": 1.0, **more}
+def record(trial: Trial, status: str = "done") -> TrialRecord:
+    return planned(trial).model_copy(update={"status": status, "exit_code": 0, "seconds": 1.0})
+
+
+def line(of: TrialRecord) -> bytes:
+    return json.dumps(of.as_json()).encode() + b"\n"
 
 
 def opened(folder: Path, trials: list[Trial] = TRIALS_3, *, resume: bool = False) -> Store:
@@ -37,13 +51,14 @@ def test_a_file_cut_anywhere_has_the_lines_before_the_cut(contents: list[dict[st
     cut = data.draw(st.integers(0, len(whole)))
     ends = [sum(map(len, lines[:count])) for count in range(len(lines) + 1)]
     before = max(count for count, end in enumerate(ends) if end <= cut)
-    assert whole_lines(whole[:cut], "x") == (records[:before], ends[before])
+    found, size = whole_lines(whole[:cut], "x")
+    assert ([each.id for each in found], size) == ([each["id"] for each in records[:before]], ends[before])
 
 
 def test_a_wrong_last_line_is_torn_and_a_wrong_one_before_it_is_named() -> None:
-    good = json.dumps(record(FIRST)).encode() + b"\n"
+    good = line(record(FIRST))
     assert whole_lines(good + b"\0\0\0\n", "x") == ([record(FIRST)], len(good))
-    for wrong in (b"\0\n", b"[1]\n", b'{"id": "a"}\n', b"\n"):
+    for wrong in (b"\0\n", b"[1]\n", b'{"id": "a"}\n', b'{"id": "a", "status": "done", "options": 5}\n', b"\n"):
         with pytest.raises(BadInputError, match=r"trials.jsonl, line 2: found no trial.*done again"):
             whole_lines(good + wrong + good, "trials.jsonl")
 
@@ -113,7 +128,7 @@ def test_only_lost_trials_are_tried_again(tmp_path: Path) -> None:
     with opened(tmp_path) as store:
         run_sweep(TRIALS_3, store, engine, told.append)
         assert asked == [TRIALS_3, [FIRST, THIRD], [FIRST]]
-        assert {name: (each["status"], each["tries"]) for name, each in store.done.items()} == {
+        assert {name: (each.status, each.tries) for name, each in store.done.items()} == {
             SECOND.id: ("failed", 1),
             THIRD.id: ("done", 2),
             FIRST.id: ("lost", 3),
@@ -121,8 +136,8 @@ def test_only_lost_trials_are_tried_again(tmp_path: Path) -> None:
         assert len(told) == 3
         run_sweep(TRIALS_3, store, engine, told.append)
         assert asked[3:] == [[FIRST]] * 3  # asked for once more, what was lost is tried again; the failed one is not
-        found = summary(TRIALS_3, store, {THIRD.id})
-    assert found["counts"] == {"trials": 3, "done": 1, "failed": 1, "lost": 1, "planned": 0, "skipped": 1}
+        found = store.summary({THIRD.id})
+    assert found.counts == {"trials": 3, "done": 1, "failed": 1, "lost": 1, "planned": 0, "skipped": 1}
 
 
 @pytest.mark.parametrize(
@@ -141,12 +156,12 @@ def test_only_lost_trials_are_tried_again(tmp_path: Path) -> None:
 )
 def test_how_a_process_ended(code: int, out: str, status: str, error: str | None) -> None:
     result = {"a": 1} if out.startswith("{") and status != "lost" else None
-    expected = {"status": status, "exit_code": code, "error": error, "result": result}
-    assert ended_as(code, out, "first\n  the last line \n\n") == expected
+    found = ended_as(FIRST, code, out, "first\n  the last line \n\n")
+    assert (found.status, found.exit_code, found.error, found.result) == (status, code, error, result)
 
 
 def test_a_process_without_a_word() -> None:
-    assert ended_as(-11, "", "")["error"] == "exit code -11, no message"
+    assert ended_as(FIRST, -11, "", "").error == "exit code -11, no message"
 
 
 def test_a_sweep_of_a_file_with_other_contents_is_another_sweep(tmp_path: Path) -> None:

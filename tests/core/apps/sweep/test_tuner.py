@@ -17,8 +17,8 @@ pytest.importorskip("optuna")
 from trilane.apps.cli.tune import _called, _goals, _space
 from trilane.apps.sweep.definition import Definition, Options, SweepKind, Trial
 from trilane.apps.sweep.engines import run_inside
-from trilane.apps.sweep.store import Record, Store, run_sweep, whole_lines
-from trilane.apps.sweep.tuner import Aim, Do, Keep, Search, Space, answer, figures_of, keep_of, tune
+from trilane.apps.sweep.store import Store, TrialRecord, planned, run_sweep, whole_lines
+from trilane.apps.sweep.tuner import Aim, Answer, Do, Keep, Search, Space, answer, figures_of, keep_of, tune
 from trilane.errors import BadInputError, MissingPartError
 
 #: 6 x 5 x 2 x 5 = 300 configurations.
@@ -47,24 +47,24 @@ def bowl(options: Options) -> dict[str, Any]:
     return {"frame_time_ms": {"mean": frame}, "power_w": 6.0 - x, "fps": 1e3 / frame}
 
 
-def done(trial: Trial, result: Mapping[str, Any] | None) -> Record:
+def done(trial: Trial, result: Mapping[str, Any] | None) -> TrialRecord:
     status = "failed" if result is None else "done"
     told = {"exit_code": 0 if result else 2, "error": None if result else "error: no", "seconds": 0.1}
-    return {"id": trial.id, "status": status, "result": result, "command": ["trilane", *trial.arguments], **told}
+    return planned(trial).model_copy(update={"status": status, "result": result, **told})
 
 
 def doing(function: Any) -> tuple[Do, list[Trial]]:
     """A `Do` of a function of the options, and the trials that it did."""
     asked: list[Trial] = []
 
-    def do(trials: Sequence[Trial]) -> dict[str, Record]:
+    def do(trials: Sequence[Trial]) -> dict[str, TrialRecord]:
         asked.extend(trials)
         return {trial.id: done(trial, function(trial.options)) for trial in trials}
 
     return do, asked
 
 
-def found(aim: Aim, seed: int, function: Any = bowl, budget: int = 60) -> dict[str, Any]:
+def found(aim: Aim, seed: int, function: Any = bowl, budget: int = 60) -> Answer:
     search = Search(space(), aim, seed)
     return answer(search, tune(search, doing(function)[0], budget))
 
@@ -80,14 +80,14 @@ def found(aim: Aim, seed: int, function: Any = bowl, budget: int = 60) -> dict[s
 )
 def test_the_best_of_300_is_found_in_60_trials(keeps: tuple[str, ...], best: float) -> None:
     answers = [found(Aim(("frame",), tuple(map(keep_of, keeps))), seed) for seed in SEEDS]
-    near = [each["best"] is not None and each["best"]["metrics"]["frame"] <= 1.02 * best for each in answers]
+    near = [each.best is not None and each.best.metrics["frame"] <= 1.02 * best for each in answers]
     assert sum(near) >= 9
-    assert all(len(each["trials"]) == len({row["id"] for row in each["trials"]}) == 60 for each in answers)
-    assert min(each["best"]["metrics"]["frame"] for each in answers if each["best"]) == best
+    assert all(len(each.trials) == len({row.record.id for row in each.trials}) == 60 for each in answers)
+    assert min(each.best.metrics["frame"] for each in answers if each.best) == best
 
 
 @pytest.fixture(scope="module", params=["snapdragon-888", "snapdragon-8-gen-3"])
-def swept(request: pytest.FixtureRequest) -> tuple[Space, dict[str, Record]]:
+def swept(request: pytest.FixtureRequest) -> tuple[Space, dict[str, TrialRecord]]:
     """The example of the page: all 300 predictions of a chip."""
     example = Path(__file__).parents[4] / "docs/examples/chip-tune.toml"
     _, _, whole = _space([str(example)], [], request.param)
@@ -102,7 +102,7 @@ def swept(request: pytest.FixtureRequest) -> tuple[Space, dict[str, Record]]:
 @pytest.mark.slow
 @pytest.mark.parametrize(("goal", "keeps"), [("latency", ("power<2.5W", "fps>=30")), ("energy", ("fps>=30",))])
 def test_a_search_comes_within_2_percent_of_a_sweep_of_a_chip(
-    goal: str, keeps: tuple[str, ...], swept: tuple[Space, dict[str, Record]]
+    goal: str, keeps: tuple[str, ...], swept: tuple[Space, dict[str, TrialRecord]]
 ) -> None:
     """Of 300 predicted configurations 60 are tried: in 9 of 10 seeds the best of the sweep is met."""
     whole, records = swept
@@ -115,28 +115,28 @@ def test_a_search_comes_within_2_percent_of_a_sweep_of_a_chip(
         search = Search(whole, aim, seed)
         tried = tune(search, lambda trials: {trial.id: records[trial.id] for trial in trials}, 60)
         assert len(tried) == 60
-        told = answer(search, tried)["best"]
-        near.append(told is not None and aim.costs(told["metrics"], aim.goals)[0] <= best + 0.02 * abs(best))
+        told = answer(search, tried).best
+        near.append(told is not None and aim.costs(told.metrics, aim.goals)[0] <= best + 0.02 * abs(best))
     assert sum(near) >= 9
 
 
 def test_a_search_is_better_than_drawing_by_chance() -> None:
     """By chance 60 of 300 have the best with a probability of 0.2, so in 10 draws 2 on average."""
-    exact = [found(Aim(("frame",)), seed)["best"]["metrics"]["frame"] == 7 for seed in SEEDS]
-    assert sum(exact) >= 8
+    bests = [found(Aim(("frame",)), seed).best for seed in SEEDS]
+    assert sum(best is not None and best.metrics["frame"] == 7 for best in bests) >= 8
 
 
 def test_the_same_seed_tries_the_same_and_another_one_others() -> None:
-    orders = [[row["id"] for row in found(Aim(("fps",)), seed, budget=25)["trials"]] for seed in (3, 3, 4)]
+    orders = [[row.record.id for row in found(Aim(("fps",)), seed, budget=25).trials] for seed in (3, 3, 4)]
     assert orders[0] == orders[1] != orders[2]
 
 
 def test_a_limit_that_nothing_keeps_gives_the_nearest() -> None:
     told = found(Aim(("frame",), (keep_of("power<0.5"),)), 0)
-    assert told["best"] is None
-    assert told["nearest"]["metrics"]["power"] == 1.0
-    assert told["nearest"]["misses"] == ["power<0.5"]
-    assert not any(row["keeps"] for row in told["frontier"])
+    assert told.best is None and told.nearest is not None
+    assert told.nearest.metrics["power"] == 1.0
+    assert told.nearest.misses == ("power<0.5",)
+    assert not any(row.keeps for row in told.frontier)
 
 
 def test_the_frontier_by_hand_and_what_was_not_tried() -> None:
@@ -151,7 +151,7 @@ def test_the_frontier_by_hand_and_what_was_not_tried() -> None:
     records = {
         trial.id: done(trial, function(trial.options)) for trial in small.trials if trial.options["never"] == "a"
     }
-    told = answer(search, records)
+    told = answer(search, records).as_json()
     assert [row["options"]["x"] for row in told["frontier"]] == [1, 3, 0]
     assert told["best"]["options"] == {"fixed": 1, "x": 1, "never": "a"}
     assert told["best"]["command"] == ["trilane", "predict", "--fixed=1", "--x=1", "--never=a"]
@@ -161,7 +161,7 @@ def test_the_frontier_by_hand_and_what_was_not_tried() -> None:
 
 def test_two_goals_have_a_frontier_of_both() -> None:
     told = found(Aim(("frame", "power")), 1)
-    pairs = [(row["metrics"]["frame"], row["metrics"]["power"]) for row in told["frontier"]]
+    pairs = [(row.metrics["frame"], row.metrics["power"]) for row in told.frontier]
     assert pairs == sorted(pairs) and [power for _, power in pairs] == sorted((p for _, p in pairs), reverse=True)
     assert pairs[-1][1] == 1.0
 
@@ -175,10 +175,10 @@ def test_failed_trials_are_kept_and_the_search_goes_on(tmp_path: Path) -> None:
         options = dict(word.lstrip("-").split("=") for word in words[1:-1])
         return (2, "", "error: no a\n") if options["word"] == "a" else (0, json.dumps(bowl(options)), "")
 
-    def search() -> dict[str, Any]:
+    def search() -> Answer:
         found = Search(whole, Aim(("frame",)), 5)
 
-        def do(trials: Sequence[Trial]) -> Mapping[str, Record]:
+        def do(trials: Sequence[Trial]) -> Mapping[str, TrialRecord]:
             run_sweep(trials, store, lambda left: run_inside(left, call), lambda _record: None)
             return {trial.id: store.done[trial.id] for trial in trials}
 
@@ -189,14 +189,14 @@ def test_failed_trials_are_kept_and_the_search_goes_on(tmp_path: Path) -> None:
     begun = time.monotonic()
     told = search()
     most_s = time.monotonic() - begun
-    failed = [row for row in told["trials"] if row["status"] == "failed"]
+    failed = [row for row in told.as_json()["trials"] if row["status"] == "failed"]
     assert failed and all((row["exit_code"], row["error"], row["keeps"]) == (2, "error: no a", None) for row in failed)
-    assert told["best"]["options"]["word"] != "a"
-    assert told["best"]["metrics"]["frame"] == min(row["metrics"]["frame"] for row in told["trials"] if row["metrics"])
+    assert told.best is not None and told.best.record.options["word"] != "a"
+    assert told.best.metrics["frame"] == min(row.metrics["frame"] for row in told.trials if row.metrics)
     records, _ = whole_lines((tmp_path / "s" / "trials.jsonl").read_bytes(), "")
     assert len(records) == len(calls) == 40
-    assert sum(record["seconds"] for record in records) <= most_s + 40 * 0.0005  # each is rounded to a millisecond
-    assert sum(record["status"] == "failed" for record in records) == len(failed)
+    assert sum(record.seconds or 0.0 for record in records) <= most_s + 40 * 0.0005  # each is rounded to a millisecond
+    assert sum(record.status == "failed" for record in records) == len(failed)
     assert search() == told
     assert len(calls) == 40
 
@@ -218,14 +218,14 @@ def test_a_short_run_ends_a_trial_below_the_median() -> None:
     told = answer(search, tune(search, do, 40, short=5))
     short = [trial for trial in asked if trial.options.get("frames") == 5]
     whole = [trial for trial in asked if "frames" not in trial.options]
-    assert (len(short), len(told["trials"])) == (40, 40)
+    assert (len(short), len(told.trials)) == (40, 40)
     assert not {trial.id for trial in short} & {trial.id for trial in search.space.trials}
-    pruned = [row for row in told["trials"] if row["status"] == "pruned"]
+    pruned = [row.record for row in told.trials if row.record.status == "pruned"]
     assert len(pruned) == 40 - len(whole) >= 5
     kept = [bowl(trial.options)["frame_time_ms"]["mean"] for trial in whole]
-    dropped = [bowl(row["options"])["frame_time_ms"]["mean"] for row in pruned]
+    dropped = [bowl(row.options)["frame_time_ms"]["mean"] for row in pruned]
     assert sum(kept) / len(kept) < sum(dropped) / len(dropped)
-    assert told["best"]["metrics"]["frame"] == min(kept)
+    assert told.best is not None and told.best.metrics["frame"] == min(kept)
 
 
 def test_a_figure_that_no_result_has_ends_the_search_early() -> None:
@@ -282,7 +282,7 @@ def test_figures_are_finite_numbers_of_a_trial_that_is_done() -> None:
         "units": {"a": 1},
     }
     assert figures_of(done(trial, result), ["units.a", "units"]) == {"latency": 3.0, "psnr": 40.5, "units.a": 1.0}
-    assert figures_of({**done(trial, result), "status": "failed"}) == {}
+    assert figures_of(done(trial, result).model_copy(update={"status": "failed"})) == {}
     assert figures_of(done(trial, {"pipelines": [{"fps": 30.0}, {"fps": 10.0}]})) == {"fps": 30.0}
 
 
