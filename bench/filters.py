@@ -16,7 +16,6 @@ from trilane.arrays import BUCKET_STEP, U8
 from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import reshaped
 from trilane.bench.lib.fixture import (
-    SLOTS,
     WARM_UP,
     ground_truth,
     interleaved_ms,
@@ -24,6 +23,7 @@ from trilane.bench.lib.fixture import (
     standing,
     summary_ms,
 )
+from trilane.bench.lib.interleaved_processes import SLOTS
 from trilane.errors import BadInputError
 from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
 from trilane.stages.gpu.opengl import describe

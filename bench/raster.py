@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import MAX_SIDE, U8, Floats
-from trilane.bench.lib.fixture import ENCODING, INPUTS, SLOTS, Fixture, interleaved_ms, standing, summary_ms
+from trilane.bench.lib.fixture import ENCODING, Fixture, interleaved_ms, standing, summary_ms
+from trilane.bench.lib.interleaved_processes import INPUTS, SLOTS
 from trilane.body.skinning import FrameSkinner
 from trilane.errors import BadInputError, TrilaneError
 from trilane.stages.config import Quantisation

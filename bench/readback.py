@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from trilane.arrays import U8
-from trilane.bench.lib.fixture import ENCODING, INPUTS, SLOTS, WARM_UP, interleaved_ms, standing, summary_ms
+from trilane.bench.lib.fixture import ENCODING, WARM_UP, interleaved_ms, standing, summary_ms
+from trilane.bench.lib.interleaved_processes import INPUTS, SLOTS
 from trilane.errors import TrilaneError
 from trilane.stages.gpu import opengl
 from trilane.stages.gpu.opengl import describe, open_context

@@ -24,7 +24,7 @@ from trilane.scheduler.policy import POLICIES, run_settings
 from trilane.scheduler.virtual import Simulation, simulate
 from trilane.transport.slots import DEFAULT_EDGE
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import AFTER_INFER, BEFORE_INFER, INFER, LATENCY_TO, NS_PER_MS, UNITS, UnitName
+from trilane.units import AFTER_INFER, BEFORE_INFER, INFER, LATENCY_TO, NS_PER_MS, TARGET_FPS, UNITS, UnitName
 
 NETWORK_UNITS: tuple[UnitName, ...] = ("gpu", "dsp")
 PACKED_BYTES_PER_PIXEL = 16
@@ -48,7 +48,7 @@ class Variant(NamedTuple):
     policy: str = "pipelined"
     edge: str = "single"
     batch: int = 1
-    fps: float = 30.0
+    fps: float = TARGET_FPS
 
 
 REFERENCE = Variant()

@@ -61,6 +61,7 @@ from trilane.hw_profiles.schema import (
     interval_around,
 )
 from trilane.hw_profiles.unit_times import amounts, join, numbers_of, time_on
+from trilane.pipeline.file_keys import LONGEST_MS
 from trilane.scheduler.stats import student_quantile
 from trilane.units import BURST, UNITS, UnitName
 
@@ -75,7 +76,6 @@ STEPS, ENOUGH = 50, 1e-6
 #: the time is probably in another unit of time.
 FAR_OFF, A_UNIT = 10.0, 100.0
 LEAST_ROWS, MOST_ROWS = 2, 1000
-LONGEST_MS = 3.6e6
 RATE_OF_TERM = np.array([RATES.index(TERMS[name]) for name in NAMES])
 PRECISIONS: Final = {"int8": "int8", "w8a8": "int8", "fp16": "fp16", "float": "fp16", "fp32": "fp32"}
 RUNTIMES: Final[tuple[EngineRuntime, ...]] = get_args(EngineRuntime)

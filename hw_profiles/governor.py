@@ -53,7 +53,7 @@ class ThermalState:
     @classmethod
     def at_rest(cls, profile: Profile) -> ThermalState:
         """Return the state of a device that was off for a long time: all temperatures are ambient."""
-        ambient = profile.thermal.ambient_c.or_else(25.0)
+        ambient = profile.thermal.ambient
         return cls(ambient, dict.fromkeys(UNITS, ambient))
 
     def advance(self, profile: Profile, power_w: Mapping[UnitName, float], seconds: float) -> None:
@@ -63,7 +63,7 @@ class ThermalState:
         """
         thermal, before = profile.thermal, headroom_k(profile, self)
         device_w = sum(power_w.values()) + thermal.base_power_w.or_else(0.0)
-        goal = thermal.ambient_c.or_else(25.0) + thermal.device_k_per_w.or_else(5.0) * device_w
+        goal = thermal.ambient + thermal.resistance * device_w
         self.device_c = _approach(self.device_c, goal, seconds, thermal.device_time_s.or_else(600.0))
         for name, unit in profile.units.items():
             goal = self.device_c + unit.junction_k_per_w.or_else(1.0) * power_w[name]
@@ -79,7 +79,7 @@ def _approach(value: float, goal: float, seconds: float, time_constant: float) -
 def headroom_k(profile: Profile, thermal_state: ThermalState) -> float:
     """Return how many kelvins are left to the nearer of two limits, skin and junction; negative above the limit."""
     thermal = profile.thermal
-    skin = thermal.skin_limit_c.or_else(45.0) - thermal_state.device_c
+    skin = thermal.skin_limit - thermal_state.device_c
     return min(skin, thermal.junction_limit_c.or_else(95.0) - max(thermal_state.junction_c.values()))
 
 
@@ -148,9 +148,8 @@ def power_allocator(
     Parameters: as for `step_wise`.
     """
     thermal = profile.thermal
-    resistance = thermal.device_k_per_w.or_else(5.0)
-    shed = (thermal.skin_limit_c.or_else(45.0) - thermal.ambient_c.or_else(25.0)) / resistance
-    granted = shed - thermal.base_power_w.or_else(0.0) + headroom_k(profile, thermal_state) / resistance
+    shed = (thermal.skin_limit - thermal.ambient) / thermal.resistance
+    granted = shed - thermal.base_power_w.or_else(0.0) + headroom_k(profile, thermal_state) / thermal.resistance
     wanted = sum(power_w.values())
     if wanted > granted:
         throttle.lower(requested, power_w)

@@ -166,7 +166,7 @@ class Engine(ProfileTable):
     """A tensor engine at one precision under one runtime."""
 
     element_bytes: Literal[1, 2] = Field(description="Bytes of one element.")
-    on_chip_mb: Rate = Field(description="Memory for activations on the chip, megabytes.")
+    on_chip_mb: Rate = Field(description="Memory for activations on the chip, MiB.")
     rates: EngineRates = Field(description="The numbers of the chip; the next table lists them.")
     factors: dict[str, Rate] = Field(
         default={},
@@ -363,6 +363,21 @@ class Thermal(ProfileTable):
     governor: Literal["step_wise", "power_allocator"] = Field(description="Governor of the Linux thermal framework.")
     poll_s: Seconds = Field(description="Time between two polls of the governor.")
 
+    @property
+    def ambient(self) -> float:
+        """Return the temperature of the surroundings, °C; 25 if unknown."""
+        return self.ambient_c.or_else(25.0)
+
+    @property
+    def skin_limit(self) -> float:
+        """Return the limit of the device's surface, °C; 45 if unknown."""
+        return self.skin_limit_c.or_else(45.0)
+
+    @property
+    def resistance(self) -> float:
+        """Return the thermal resistance from the device to the surroundings, K/W; 5 if unknown."""
+        return self.device_k_per_w.or_else(5.0)
+
 
 class Profile(ProfileTable):
     """A chip in a device."""
@@ -389,7 +404,7 @@ class Profile(ProfileTable):
             missing = [name for name in names if name not in stated]
             if missing:
                 raise UnexpectedValue(f"no {what} {', '.join(missing)}", f"all of {', '.join(names)}")
-        if (self.thermal.skin_limit_c.value or 0) <= (self.thermal.ambient_c.value or 0):
+        if self.thermal.skin_limit <= self.thermal.ambient:
             raise UnexpectedValue("thermal.skin_limit_c at or below thermal.ambient_c", "it above")
         return self
 

@@ -214,7 +214,6 @@ SLICE: Final = 16  # frames of a placement in its turn
 SKIPPED: Final = 6  # first frames of a slice, which do not count: they were in flight when the units were moved
 DRAIN: Final = 6  # frames after the last slice, so that the pipeline does not run empty during the slice
 PERIOD_NS: Final = 33_333_333
-HANG_NS: Final = 10_000_000_000
 
 #: The cores of each unit.
 Cores = Mapping[str, tuple[int, ...]]
@@ -309,7 +308,7 @@ class _Live:
         count = len(self._group.places)
         order = [(turn + number) % count for number in range(count)]
         self._processes.first = first
-        settings = run_settings("pipelined", SLICE * count + DRAIN, PERIOD_NS, hang_ns=HANG_NS)
+        settings = run_settings("pipelined", SLICE * count + DRAIN, PERIOD_NS)
         core = Core(self._group.pipeline.graph(), settings)
         log = RunLog()
         clock = RealtimeClock(core, self._processes, self._interrupts, log, None, None, None)

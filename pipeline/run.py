@@ -39,7 +39,7 @@ from trilane.pipeline.surroundings import (
 from trilane.pipeline.unit_processes import UnitProcesses, close_units, start_units
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.core import Core, run_loop
-from trilane.scheduler.events import Abort, Outcome, OutcomeKind, Settings
+from trilane.scheduler.events import HANG_NS, Abort, Outcome, OutcomeKind, Settings
 from trilane.scheduler.ledger import Books
 from trilane.scheduler.policy import run_settings
 from trilane.scheduler.stats import MOST_EXACT, energy_score
@@ -65,7 +65,6 @@ class DdSketch:
         return self._sketch.get_quantile_value(share) or 0.0
 
 
-HANG_NS = 10_000_000_000
 FRAMES_ON_RUNGS = 4  # frames that measure each rung before the run; the first one warms up
 
 

@@ -105,6 +105,7 @@ def _joined(first: str, second: str) -> str:
 
 
 NEVER: Final = (1 << 62) - 1  # ns, later than any time
+HANG_NS: Final = 10_000_000_000  # longest time of a job before its unit counts as hung
 
 
 class Job(NamedTuple):
@@ -471,7 +472,7 @@ class Settings:
     in_flight: int = 0
     in_queue: int = 0
     queue_timeout_ns: int = 0
-    hang_ns: int = 10_000_000_000
+    hang_ns: int = HANG_NS
     start_ns: int = 120_000_000_000
     max_failures: int = 5
 

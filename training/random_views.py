@@ -32,6 +32,8 @@ BANDS: dict[str, tuple[tuple[str, ...], float, float]] = {
     "upper_body": (("spine2", "spine3", "neck"), 0.75, 1.25),
     "face": (("head",), 0.34, 0.60),
 }
+#: Least and greatest height in metres that fills the screen in band `anywhere`.
+ANYWHERE_M = (0.4, 2.5)
 #: Joints that a camera may aim at in band `anywhere`, which only training has.
 ANYWHERE = (
     "left_wrist",
@@ -72,7 +74,7 @@ def random_view(rng: np.random.Generator, band: str, joints: F64) -> View:
 
     `band`: a name of `BANDS`, or `anywhere`.
     """
-    names, least, most = BANDS.get(band, (ANYWHERE, 0.4, 2.5))
+    names, least, most = BANDS.get(band, (ANYWHERE, *ANYWHERE_M))
     aim = joints[JOINT_INDEX[names[rng.integers(len(names))]]]
     if band == "face":
         aim = aim + 0.04 * (joints[JOINT_INDEX["left_eye"]] - joints[JOINT_INDEX["head"]]) / 0.1

@@ -30,6 +30,7 @@ from trilane.apps.run.verdict import Trust, trust_of
 from trilane.apps.watch.followed_run import FollowedRun, RunState, folder_of
 from trilane.errors import BadInputError
 from trilane.files import require_file
+from trilane.pipeline.file_keys import LONGEST_MS
 from trilane.pipeline.journal import NAME as JOURNAL
 from trilane.pipeline.journal import read_journal
 from trilane.pipeline.reckoning import places_of, reckoned
@@ -402,7 +403,7 @@ WALL: Final = "wall"
 #: Name of the unknown unit of imported stages.
 UNIT: Final = "imported"
 #: Longest and shortest plausible time, ms: an hour, and a millionth of a nanosecond.
-LONGEST_MS, SHORTEST_MS = 3.6e6, 1e-12
+SHORTEST_MS = 1e-12
 Ms = Annotated[float, Field(ge=0, le=LONGEST_MS)]
 
 

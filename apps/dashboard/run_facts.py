@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Final
 from trilane.options import NOTHING, option_of
 from trilane.pipeline.journal import Begun, config_of
 from trilane.stages.run_options import RunOptions
+from trilane.units import TARGET_FPS
 
 if TYPE_CHECKING:
     from trilane.apps.run.report import Report
@@ -193,7 +194,7 @@ def facts_of_folder(folder: Path, begun: Begun) -> RunFacts:
         scene.get("name", folder.name),
         str(facts.get("clock", "host")),
         _machine_line(machine) if machine else "",
-        scene.get("fps", 30.0),
+        scene.get("fps", TARGET_FPS),
         _output(scene),
         {"policy": begun.settings.policy},
         {},

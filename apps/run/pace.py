@@ -25,7 +25,7 @@ from trilane.scheduler.virtual import simulate
 from trilane.stages.avatar_assets import painting
 from trilane.stages.config import RunConfig
 from trilane.transport.slots import DEFAULT_EDGE
-from trilane.units import BEFORE_INFER, BYPASS, SUSTAINED
+from trilane.units import BEFORE_INFER, BYPASS, SUSTAINED, TARGET_FPS
 
 MAX_SLOW_MOTION = 1000.0
 #: Delay at the end of a job that does not count as late: waking up takes this long on a quiet machine.
@@ -81,7 +81,13 @@ def release_fps(pace: Pace, scene_fps: float) -> float:
 
 
 def compare(
-    pace: Pace, policy: str, frames: int, jobs: Sequence[JobRecord], *, edge: str = DEFAULT_EDGE, fps: float = 30.0
+    pace: Pace,
+    policy: str,
+    frames: int,
+    jobs: Sequence[JobRecord],
+    *,
+    edge: str = DEFAULT_EDGE,
+    fps: float = TARGET_FPS,
 ) -> PaceComparison:
     """Compare a run at a chip's pace with the same run in virtual time.
 

@@ -45,7 +45,7 @@ from trilane.pipeline.file_keys import (
 )
 from trilane.pipeline.pipeline_file import PipelineFile, assignments, read_pipeline, stage_inputs
 from trilane.pipeline.result import Failure, JournalFile, RunResult
-from trilane.pipeline.run import HANG_NS, run_pipeline
+from trilane.pipeline.run import run_pipeline
 from trilane.pipeline.stage import payload_bytes
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.placement import Place
@@ -425,7 +425,7 @@ class _Asked:
     ) -> None:
         self.options, self.file, self.pipeline, self.watch = options, file, pipeline, watch
         is_endless = watch is not None and not options.frames and file.run.arrivals is None
-        self.settings = scheduler_settings(file, ENDLESS if is_endless else frames, hang_ns=HANG_NS)
+        self.settings = scheduler_settings(file, ENDLESS if is_endless else frames)
         self.machine, self.made = machine_facts(), made_facts(command)
         units = {unit: each.model_dump(mode="json") for unit, each in pipeline.units.items()}
         self.config: dict[str, Any] = {

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from trilane.arrays import F32
 from trilane.avatars.bundle import Bundle, bundle_folder, load_bundle
+from trilane.bench.lib.interleaved_processes import INPUTS
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.joints import JOINT_INDEX, Posed, Skeleton
 from trilane.body.skinning import largest_weights
@@ -32,9 +33,6 @@ DISTANCE_M, HEIGHT_M, FRAME_M = 3.0, 0.9, 1.9
 ARMS_DOWN_RAD = 1.1
 ARMS_STEP_RAD = 0.07  # how much higher the arms are in each further pose
 WARM_UP = 5
-#: Number of inputs that take turns, and of slots that take turns. They have no common divisor, so that each input comes
-#: to each slot.
-INPUTS, SLOTS = 5, 2
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,8 @@ from trilane.errors import TrilaneError
 
 START_S = 300.0
 WARM_UP = 3
-#: Number of inputs that take turns, and of slots that take turns.
+#: Number of inputs that take turns, and of slots that take turns. They have no common divisor, so that each input comes
+#: to each slot.
 INPUTS, SLOTS = 5, 2
 
 

@@ -23,6 +23,7 @@ from typing import Any, Final, Literal, NamedTuple, TypeGuard
 import numpy as np
 
 from trilane.errors import BadInputError
+from trilane.pipeline.file_keys import LONGEST_MS
 
 #: run: one job of a whole network. layer: a part of such a job. wall: a time measured from outside, with all waits.
 Kind = Literal["run", "layer", "wall"]
@@ -34,7 +35,6 @@ MOST_NAMES: Final = 50_000
 MOST_REFUSED: Final = 1000  # refused rows that are listed; further ones are only counted
 UNNAMED: Final = "unnamed"
 LONGEST_NAME: Final = 300
-LONGEST_MS: Final = 3.6e6
 WARM_UP: Final = 1.5  # a first run longer than this times the median of the other runs looks like a warm-up
 #: Remedy for a time that contains queueing.
 QUEUEING: Final = "a wall time that contains queueing is no service time"

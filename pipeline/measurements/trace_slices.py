@@ -94,7 +94,8 @@ def packets_in(data: bytes) -> Iterator[TracePacket]:
 def _left_after(data: bytes, left: int) -> int:
     """Return how many further bytes may be read after `data`. Raises BadInputError if `data` exceeds `left` bytes."""
     if len(data) > left:
-        raise BadInputError("the trace", "over 512 MiB unpacked", "less", "record for a shorter time")
+        found = f"over {MOST_UNPACKED_BYTES >> 20} MiB unpacked"
+        raise BadInputError("the trace", found, "less", "record for a shorter time")
     return left - len(data)
 
 

@@ -239,17 +239,17 @@ def _bytes(text: str) -> int:
     return int(text[:-1]) * KERNEL_UNITS[text[-1]] if text[-1:] in KERNEL_UNITS else int(text)
 
 
-MB: Final = 1 << 20
+MIB: Final = 1 << 20
 #: Address space of the largest process of a default run: unit dsp, with OpenVINO.
-ADDRESS_BYTES: Final = 1700 * MB
+ADDRESS_BYTES: Final = 1700 * MIB
 #: Address space that every process of a run needs. With less, no OpenGL driver loads. With less than half of this
 #: size, NumPy ends the process.
-LEAST_ADDRESS_BYTES: Final = 512 * MB
+LEAST_ADDRESS_BYTES: Final = 512 * MIB
 #: Memory of the smallest run: tensors of 64x64, pictures of 160x120. With less, the kernel ends processes of the run.
-LEAST_RUN_BYTES: Final = 255 * MB
+LEAST_RUN_BYTES: Final = 255 * MIB
 #: Memory of all processes of a default run, with shared pages counted once.
-RUN_BYTES: Final = 600 * MB
-NEEDED: Final = f"a run takes {RUN_BYTES // MB} MB"
+RUN_BYTES: Final = 600 * MIB
+NEEDED: Final = f"a run takes {RUN_BYTES // MIB} MiB"
 
 _KILLS = here.oom_kills()
 
@@ -257,13 +257,13 @@ _KILLS = here.oom_kills()
 def require_memory(part: int = 1) -> None:
     """Raise TrilaneError if a limit on memory is below the need of the smallest run, divided by `part`."""
     if (limit := _address_limit()) < LEAST_ADDRESS_BYTES // part:
-        found = f"found a limit of {limit // MB} MB of addresses (ulimit -v)"
-        expected = f"expected at least {ADDRESS_BYTES // MB} MB for a run"
+        found = f"found a limit of {limit // MIB} MiB of addresses (ulimit -v)"
+        expected = f"expected at least {ADDRESS_BYTES // MIB} MiB for a run"
         raise TrilaneError(f"memory: {found}, {expected}: ulimit -v unlimited")
     group = here.memory_limit_bytes()
     if group is not None and group < LEAST_RUN_BYTES // part:
-        found = f"found a limit of {group // MB} MB for the control group"
-        raise TrilaneError(f"memory: {found}, expected at least {RUN_BYTES // MB} MB for a run")
+        found = f"found a limit of {group // MIB} MiB for the control group"
+        raise TrilaneError(f"memory: {found}, expected at least {RUN_BYTES // MIB} MiB for a run")
 
 
 def shortage() -> str:
@@ -273,11 +273,11 @@ def shortage() -> str:
     let a run of small tensors pass.
     """
     if (limit := _address_limit()) < ADDRESS_BYTES:
-        needed = f"a run's largest process takes {ADDRESS_BYTES // MB} MB: ulimit -v unlimited"
-        return f"each process may have {limit // MB} MB of addresses (ulimit -v), and {needed}"
+        needed = f"a run's largest process takes {ADDRESS_BYTES // MIB} MiB: ulimit -v unlimited"
+        return f"each process may have {limit // MIB} MiB of addresses (ulimit -v), and {needed}"
     group = here.memory_limit_bytes()
     if group is not None and group < RUN_BYTES:
-        return f"the control group may have {group // MB} MB of memory, and {NEEDED}"
+        return f"the control group may have {group // MIB} MiB of memory, and {NEEDED}"
     return ended_by_system()
 
 
@@ -288,7 +288,7 @@ def ended_by_system() -> str:
     """
     if here.oom_kills() <= _KILLS:
         return ""
-    free = f"{here.free_bytes() // MB} MB are free now"
+    free = f"{here.free_bytes() // MIB} MiB are free now"
     return f"the system has meanwhile ended a process because memory ran out, and {NEEDED}; {free}"
 
 

@@ -22,7 +22,7 @@ from trilane.pipeline.unit_processes import listen_before_run
 from trilane.stages.configure import required_machine
 from trilane.transport.messages import BUILDING, Failed
 
-MB = 1 << 20
+MIB = 1 << 20
 LIMITS = Path(__file__).parents[2] / "docs" / "limits.md"
 GIGABYTE = str(1 << 30)
 
@@ -33,7 +33,7 @@ def plenty(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     monkeypatch.setattr(resource, "getrlimit", lambda _kind: (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     monkeypatch.setattr(machine.here, "memory_limit_bytes", lambda: None)
     monkeypatch.setattr(machine.here, "oom_kills", lambda: machine._KILLS)
-    monkeypatch.setattr(machine.here, "free_bytes", lambda: 77 * MB)
+    monkeypatch.setattr(machine.here, "free_bytes", lambda: 77 * MIB)
     return monkeypatch
 
 
@@ -46,12 +46,12 @@ def test_plenty_of_memory_is_never_short(plenty: pytest.MonkeyPatch) -> None:
 
 def test_each_shortage_says_what_is_there_and_what_is_needed(plenty: pytest.MonkeyPatch) -> None:
     plenty.setattr(machine.here, "oom_kills", lambda: machine._KILLS + 1)
-    ended = "the system has meanwhile ended a process because memory ran out, and a run takes 600 MB"
-    assert machine.shortage() == machine.ended_by_system() == f"{ended}; 77 MB are free now"
-    plenty.setattr(machine.here, "memory_limit_bytes", lambda: 200 * MB)
-    assert machine.shortage() == "the control group may have 200 MB of memory, and a run takes 600 MB"
-    plenty.setattr(resource, "getrlimit", lambda _kind: (900 * MB, 900 * MB))
-    said = "each process may have 900 MB of addresses (ulimit -v), and a run's largest process takes 1700 MB"
+    ended = "the system has meanwhile ended a process because memory ran out, and a run takes 600 MiB"
+    assert machine.shortage() == machine.ended_by_system() == f"{ended}; 77 MiB are free now"
+    plenty.setattr(machine.here, "memory_limit_bytes", lambda: 200 * MIB)
+    assert machine.shortage() == "the control group may have 200 MiB of memory, and a run takes 600 MiB"
+    plenty.setattr(resource, "getrlimit", lambda _kind: (900 * MIB, 900 * MIB))
+    said = "each process may have 900 MiB of addresses (ulimit -v), and a run's largest process takes 1700 MiB"
     assert machine.shortage() == f"{said}: ulimit -v unlimited"
 
 
@@ -64,13 +64,13 @@ def limit_addresses(plenty: pytest.MonkeyPatch, bytes_: int) -> None:
 def test_addresses_are_short_below_what_the_largest_process_takes(plenty: pytest.MonkeyPatch) -> None:
     """docs/limits.md has the figure, and the measured one that it is rounded up from, by less than a twentieth."""
     row = next(line for line in LIMITS.read_text().splitlines() if line.startswith("| `machine.ADDRESS_BYTES`"))
-    needed, measured_mb = int(row.split("|")[2]), int(re.findall(r"measured, .*?: (\d+) MB", row)[0])
-    assert measured_mb * MB <= needed < 1.05 * measured_mb * MB
+    needed, measured_mb = int(row.split("|")[2]), int(re.findall(r"measured, .*?: (\d+) MiB", row)[0])
+    assert measured_mb * MIB <= needed < 1.05 * measured_mb * MIB
     limit_addresses(plenty, needed)
     assert machine.shortage() == ""
     limit_addresses(plenty, needed - 1)
-    said = f"(ulimit -v), and a run's largest process takes {needed // MB} MB: ulimit -v unlimited"
-    assert machine.shortage() == f"each process may have {(needed - 1) // MB} MB of addresses {said}"
+    said = f"(ulimit -v), and a run's largest process takes {needed // MIB} MiB: ulimit -v unlimited"
+    assert machine.shortage() == f"each process may have {(needed - 1) // MIB} MiB of addresses {said}"
 
 
 @pytest.mark.parametrize("part", [1, 2])
@@ -81,8 +81,8 @@ def test_a_limit_of_addresses_that_no_run_fits_in_is_refused(plenty: pytest.Monk
     limit_addresses(plenty, least - 1)
     with pytest.raises(TrilaneError) as raised:
         machine.require_memory(part)
-    found = f"memory: found a limit of {(least - 1) // MB} MB of addresses (ulimit -v)"
-    assert str(raised.value) == f"{found}, expected at least 1700 MB for a run: ulimit -v unlimited"
+    found = f"memory: found a limit of {(least - 1) // MIB} MiB of addresses (ulimit -v)"
+    assert str(raised.value) == f"{found}, expected at least 1700 MiB for a run: ulimit -v unlimited"
 
 
 @pytest.mark.parametrize("part", [1, 2])
@@ -94,14 +94,14 @@ def test_a_control_group_that_no_run_fits_in_is_refused(plenty: pytest.MonkeyPat
     plenty.setattr(machine.here, "memory_limit_bytes", lambda: least - 1)
     with pytest.raises(TrilaneError) as raised:
         machine.require_memory(part)
-    found = f"memory: found a limit of {(least - 1) // MB} MB for the control group"
-    assert str(raised.value) == f"{found}, expected at least 600 MB for a run"
+    found = f"memory: found a limit of {(least - 1) // MIB} MiB for the control group"
+    assert str(raised.value) == f"{found}, expected at least 600 MiB for a run"
 
 
 def test_no_opengl_context_is_no_missing_package_where_memory_is_short(plenty: pytest.MonkeyPatch) -> None:
     with pytest.raises(MissingPartError, match=r"no OpenGL 3\.3 context"):
         required_machine(lambda: None)
-    plenty.setattr(resource, "getrlimit", lambda _kind: (600 * MB, 600 * MB))
+    plenty.setattr(resource, "getrlimit", lambda _kind: (600 * MIB, 600 * MIB))
     with pytest.raises(TrilaneError) as raised:
         required_machine(lambda: None)
     assert str(raised.value).startswith("no OpenGL context could be made; memory is short: each process may have 600")
@@ -139,10 +139,10 @@ def test_a_unit_that_fails_where_memory_is_short_says_so(
     link = Sent()
     assert unit_loop._fail(link, job, "unit gpu", error) == getattr(error, "exit_code", 1)  # type: ignore[arg-type]
     assert "memory is short" not in link.told.pop().message
-    plenty.setattr(resource, "getrlimit", lambda _kind: (600 * MB, 600 * MB))
+    plenty.setattr(resource, "getrlimit", lambda _kind: (600 * MIB, 600 * MIB))
     unit_loop._fail(link, job, "unit gpu", error)  # type: ignore[arg-type]
     message = link.told.pop().message
-    assert message.startswith("unit gpu: memory is short: each process may have 600 MB") == is_told
+    assert message.startswith("unit gpu: memory is short: each process may have 600 MiB") == is_told
     assert "apt-get" not in message
 
 
@@ -158,9 +158,9 @@ def test_a_unit_that_ends_before_the_run_where_memory_is_short_says_so(plenty: p
 def test_an_unexpected_error_is_no_defect_where_memory_is_short(plenty: pytest.MonkeyPatch) -> None:
     assert describe(ValueError("x"))[0].endswith("this is a defect of Trilane, --debug shows where")
     assert describe(MemoryError("cannot have 3 GB")) == ("memory is short: cannot have 3 GB", 1)
-    plenty.setattr(resource, "getrlimit", lambda _kind: (600 * MB, 600 * MB))
+    plenty.setattr(resource, "getrlimit", lambda _kind: (600 * MIB, 600 * MIB))
     said, code = describe(ImportError("failed to map segment from shared object"))
-    assert code == 1 and said.startswith("memory is short: each process may have 600 MB of addresses")
+    assert code == 1 and said.startswith("memory is short: each process may have 600 MiB of addresses")
     assert said.endswith("; ImportError: failed to map segment from shared object")
     assert describe(TrilaneError("its own reason"))[0] == "its own reason"
 
@@ -170,11 +170,11 @@ def test_a_run_without_room_for_its_libraries_says_how_much_it_needs(limit_mb: i
     """OpenBLAS ends a process, NumPy raises MemoryError, and EGL finds no driver, as the limit rises."""
 
     def limited() -> None:
-        resource.setrlimit(resource.RLIMIT_AS, (limit_mb * MB, limit_mb * MB))
+        resource.setrlimit(resource.RLIMIT_AS, (limit_mb * MIB, limit_mb * MIB))
 
     command = [sys.executable, "-m", "trilane", "run", "--frames", "4"]
     done = subprocess.run(command, cwd=tmp_path, preexec_fn=limited, capture_output=True, text=True, check=False)
-    found = f"found a limit of {limit_mb} MB of addresses (ulimit -v), expected at least 1700 MB for a run"
+    found = f"found a limit of {limit_mb} MiB of addresses (ulimit -v), expected at least 1700 MiB for a run"
     assert (done.returncode, done.stderr) == (1, f"error: memory: {found}: ulimit -v unlimited\n")
     assert list(tmp_path.iterdir()) == []
 

@@ -25,7 +25,7 @@ from trilane.stages.gpu.opengl import open_context
 from trilane.stages.gpu.raster import Placement
 from trilane.stages.gpu.skinned_mesh import BodyPose, SkinnedMesh, avatar_mesh
 from trilane.training.capture.capture import Capture, Fit
-from trilane.training.random_views import BANDS, OUTPUT_ROWS, SCREENS, Crop, Cropper, View
+from trilane.training.random_views import ANYWHERE_M, BANDS, OUTPUT_ROWS, SCREENS, Crop, Cropper, View
 from trilane.training.sample_renderer import ANYWHERE_BAND, BAND_NAMES, LEAST_PIXELS, UvRaster
 from trilane.training.surface import vertex_areas
 
@@ -370,9 +370,6 @@ class VertexCentres:
 # Rule: a view is an affine map of the frame's pixels (`image_map`), and the same map is applied to the frame's camera.
 # A band states how many metres fill the screen's height, so it means the same as for the synthetic person. A frame is
 # enlarged by at most `most_enlarged`.
-
-#: Least and most metres over the screen's height in band `anywhere`, as in `random_view`.
-ANYWHERE_M = (0.4, 2.5)
 
 
 @dataclass(frozen=True)

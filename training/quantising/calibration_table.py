@@ -5,7 +5,6 @@ Rule: the error is measured on frames that are never used for calibration, again
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ import onnx
 import onnxruntime
 from numpy.typing import NDArray
 
-from trilane.arrays import F32
+from trilane.arrays import F32, psnr_db
 from trilane.errors import BadInputError
 from trilane.hw_profiles.governor import figure_for
 from trilane.training.quantising.quantise import quantise
@@ -102,7 +101,7 @@ def _errors(float_pictures: Sequence[F32], pictures: Sequence[NDArray[np.uint8]]
     differences = [np.abs(true - picture) for true, picture in zip(float_pictures, pictures, strict=True)]
     squares = [float(np.square(difference, dtype=np.float64).mean()) for difference in differences]
     return {
-        "psnr_db": float(np.mean([20 * math.log10(255) - 10 * math.log10(max(square, 1e-12)) for square in squares])),
+        "psnr_db": float(np.mean([psnr_db(square / 255**2) for square in squares])),
         "mean": float(np.mean([difference.mean() for difference in differences])),
         "largest": float(max(difference.max() for difference in differences)),
     }

@@ -9,7 +9,7 @@ import pytest
 from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Variant, settings_of
 from trilane.pipeline import run
-from trilane.scheduler.events import Settings
+from trilane.scheduler.events import HANG_NS, Settings
 from trilane.scheduler.policy import POLICIES, run_settings
 from trilane.unexpected_value import UnexpectedValue
 
@@ -32,7 +32,7 @@ def test_settings_by_hand() -> None:
 @pytest.mark.parametrize("policy", POLICIES)
 @pytest.mark.parametrize("fps", [30.0, 24.0, 7.3])
 def test_a_run_and_a_prediction_have_the_same_settings(policy: str, fps: float) -> None:
-    here: Any = run._settings(policy, 90, fps, None, run.HANG_NS, 0.0, None)
+    here: Any = run._settings(policy, 90, fps, None, HANG_NS, 0.0, None)
     assert settings_of(Variant(policy, "double", fps=fps), 90, 1 * MS) == here
 
 
