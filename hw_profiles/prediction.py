@@ -115,7 +115,8 @@ class ApplicationPrediction(Record):
     """The prediction of one configuration, with the keys of report.json and further keys.
 
     `machine`, `config`, `network`: chip, application and network.
-    `frame_time_ms`, `latency_ms`, `fps`: with a course over minutes, the times and the rate are means over it.
+    `frame_time_ms`, `fps`, `power_w`: with a course over minutes, means over it. `latency_ms`, `stages`, `units`,
+    `efficiency`: at the corners of the performance profile.
     `fps_start`, `fps_settled`: rate at the first moment, and in the last fifth of the moments.
     `display_capped`: whether the display or the wanted rate limits the rate. `stages`, `units`: by name.
     `efficiency`: time of the slowest unit's stages, divided by the frame time.
@@ -123,7 +124,8 @@ class ApplicationPrediction(Record):
     `base_power_kind`: kind of the profile's number. `power`: power of the settled device.
     `temperature_c`, `caps`, `timeline`: course over minutes; without one, no temperature is set.
     `rate`, `power_limit`: answers about the rate and the limit that were wanted.
-    `expected_error`: relative error of the network's time; null if unknown. `confidence`: 1 - `expected_error`.
+    `expected_error`: relative error of the network's time; null if unknown.
+    `confidence`: 1 - `expected_error`, at least 0; null if unknown.
     `placement`: cores of this machine's units; absent for a chip. `notes`: sentences for the reader of the figures.
     `alternatives`: rows of `what_if`; absent if nobody asked for them.
     """

@@ -105,7 +105,7 @@ def _sentence(fps: float, times: FrameInterval, missed: Mapping[str, int], frame
     """Return a sentence that says whether the rate holds, such as `holds 30 fps: yes; 12-19 ms of 33 ms (80 %)`."""
     frame_ms = 1e3 / fps
     if times.low_ms is None or times.high_ms is None:
-        holds = "yes" if times.ms <= frame_ms else "no"
+        holds = "yes" if 1 - times.ms * fps / 1e3 >= 0 else "no"
         return f"holds {fps:g} fps: {holds}; {_short(times.ms)} ms of {_short(frame_ms)} ms (no interval)"
     holds = "yes" if times.high_ms <= frame_ms else "no" if times.low_ms > frame_ms else "perhaps"
     said = " and ".join(f"{count} {what}" for what, count in missed.items() if count)

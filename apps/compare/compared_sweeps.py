@@ -218,7 +218,7 @@ def _configurations(folder: Path) -> dict[str, dict[int, TrialRecord]]:
     for record in read_trials(folder).values():
         words = record.command
         if len(words) < 2:
-            raise BadInputError(folder / TRIALS, f"trial {record.id} without command or options", "a sweep's trials")
+            raise BadInputError(folder / TRIALS, f"trial {record.id} without a command", "a sweep's trials")
         key = json.dumps([words[1:3] if words[1] == "bench" else words[1:2], record.options], sort_keys=True)
         found.setdefault(key, {})[record.repeat] = record
     return found

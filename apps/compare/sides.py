@@ -72,7 +72,7 @@ Statistics = dict[str, float | None]
 
 
 class ComparedCounts(Record, extra="ignore"):
-    """Counts of a run's frames, with the keys of a report, as in the classes below."""
+    """Counts of a run's frames. The fields here and in the classes below have the names of a report's keys."""
 
     requested: int
     presented: int

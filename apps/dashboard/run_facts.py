@@ -172,7 +172,7 @@ def _output(scene: Mapping[str, Any]) -> tuple[int, int]:
 
     `scene`: block `scene` of `config` in report.json.
     """
-    output = scene.get("output", {})
+    output = scene.get("output") or {}
     return output.get("width", 640), output.get("height", 480)
 
 
@@ -199,7 +199,7 @@ def facts_of_folder(folder: Path, begun: Begun) -> RunFacts:
         {"policy": begun.settings.policy},
         {},
         None,
-        facts.get("accuracy", {}),
+        facts.get("accuracy") or {},
     )
 
 

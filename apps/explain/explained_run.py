@@ -81,7 +81,7 @@ class ExplainedRun:
     """Where the time of the run in `folder` went.
 
     `begun`, `records`: first record, and other records, of the run's journal. `report`: report of the run; None while
-    the run goes on. `slowest`: number of slowest frames to describe.
+    the run goes on. `most`: number of slowest frames to describe.
 
     `remark`: sentence on a journal that ends before the run; empty for a whole journal.
     `messages`: messages of the run. `frames`: number of presented frames.
@@ -94,7 +94,7 @@ class ExplainedRun:
     """
 
     def __init__(
-        self, folder: Path, begun: Begun, records: Iterable[Record], report: Report | None, slowest: int = 10
+        self, folder: Path, begun: Begun, records: Iterable[Record], report: Report | None, most: int = 10
     ) -> None:
         self.folder, self.begun, self.report, self._places = folder, begun, report, places_of(begun)
         graph, settings, config = begun.graph, begun.settings, config_of(begun)
@@ -104,7 +104,7 @@ class ExplainedRun:
         self.left: dict[str, Counter[str]] = {}
         timeline = Timeline(graph, settings, waits=True)
         reckoning = Reckoning(graph, settings, self._places, timeline)
-        slow = SlowFrames(graph, reckoning.paths, reckoning.sharing, slowest)
+        slow = SlowFrames(graph, reckoning.paths, reckoning.sharing, most)
         joins, said = Joins(graph), deque[str](maxlen=MOST_MESSAGES)
         self.frames, first_ns, last_ns, record = 0, 0, 0, None
         for record in records:

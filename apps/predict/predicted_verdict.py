@@ -70,8 +70,9 @@ def pipeline_verdict(row: Mapping[str, Any], of_run: Trust | None = None, *, is_
     cycle = () if row.get("limit") == "rate" else row.get("cycle", ())
     bound = _bound({name: stages[name] for name in cycle if name in stages} or stages, needs.ms)
     shorter = _less_work(row.get("precision"))
-    if "cycle" in row and bound and (others := [unit for unit in row["units"] if unit != bound.unit]):
-        shorter = f"--set stages.{next(iter(bound.stages))}.unit={others[0]}"
+    if "cycle" in row and bound:
+        others = [unit for unit in row["units"] if unit != bound.unit]
+        shorter = f"--set stages.{next(iter(bound.stages))}.unit={others[0]}" if others else ""
     dropped = wanted_drops(frames["dropped"])
     late = LateFrames(frames["presented"] + dropped, row["deadline_misses"], dropped)
     seen = "--trace FILE: which frames are late, and what they wait for" if rate and late.missed else ""

@@ -75,7 +75,7 @@ def facts_of(
         trust_of(run.model_dump(include={"clock", "other_programs", "processor", "temperature_c"})),
         is_held_to_rate=is_paced,
         failure=(report and report.failure) or "",
-        frame_ms=run.frame_time_ms.mean,
+        frame_ms=run.frame_time_ms.mean if run.frames.presented > 1 else None,
         slow=slow_percentile(dict(run.frame_time_ms)),
         latency_ms=run.latency_ms.mean,
         alone=(baseline.fps, baseline.latency_ms.mean) if baseline and baseline.fps else None,

@@ -86,21 +86,28 @@ def planned(trial: Trial) -> TrialRecord:
     )
 
 
+def of_trial(trial: Trial, record: TrialRecord | None) -> TrialRecord:
+    """Return `record` with the words and options of `trial`; without a record, the record of a trial not tried."""
+    own = planned(trial)
+    said = {"command": own.command, "options": own.options, "repeat": own.repeat}
+    return own if record is None else record.model_copy(update=said)
+
+
 def whole_lines(text: bytes, where: str | Path) -> tuple[list[TrialRecord], int]:
     """Return (records, size) of a `trials.jsonl`: its records, and the number of bytes up to the last record.
 
-    Text after the last line feed is left out. The last line is also left out if it is no record.
+    Text after the last line feed is left out. The last line is also left out if it is no JSON object.
 
     `text`: content of the file. `where`: name of the file for the message of the error.
 
-    Raises BadInputError, which names the line, for an earlier line that is no record.
+    Raises BadInputError, which names the line, for any other line that is no record.
     """
     records: list[TrialRecord] = []
     size, lines = 0, text.split(b"\n")[:-1]
     for number, line in enumerate(lines, start=1):
         record = _record(line)
-        if record is None and number < len(lines):
-            expected = "a JSON object with id and status"
+        if record is None and (number < len(lines) or _is_object(line)):
+            expected = "a JSON object with the keys of docs/sweeps.md"
             raise BadInputError(
                 f"{where}, line {number}", "no trial", expected, "without this line its trial is done again"
             )
@@ -115,6 +122,13 @@ def _record(line: bytes) -> TrialRecord | None:
         return TrialRecord.model_validate(json.loads(line))
     except ValueError:
         return None
+
+
+def _is_object(line: bytes) -> bool:
+    try:
+        return isinstance(json.loads(line), dict)
+    except ValueError:
+        return False
 
 
 def latest(records: Sequence[TrialRecord]) -> dict[str, TrialRecord]:
@@ -215,7 +229,7 @@ class Store:
 
     def summary(self, before: set[str]) -> SweepSummary:
         """Return how the trials ended. `before`: names of the trials that ended before this call of the sweep."""
-        found = tuple(self.done.get(trial.id) or planned(trial) for trial in self._trials)
+        found = tuple(of_trial(trial, self.done.get(trial.id)) for trial in self._trials)
         return SweepSummary(self.folder, found, sum(trial.id in before for trial in self._trials))
 
     def add(self, record: TrialRecord) -> None:
@@ -223,10 +237,8 @@ class Store:
 
         Raises BadInputError if it cannot be written.
         """
-        line = (
-            json.dumps(record.model_dump(mode="json", by_alias=True), separators=(",", ":"), allow_nan=False).encode()
-            + b"\n"
-        )
+        document = record.model_dump(mode="json", by_alias=True)
+        line = json.dumps(document, separators=(",", ":"), allow_nan=False).encode() + b"\n"
         try:
             while line:
                 line = line[os.write(self._file, line) :]

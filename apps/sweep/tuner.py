@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 from trilane.apps.compare.overview import entry_of
 from trilane.apps.sweep.definition import METRICS, Definition, Options, SweepKind, Trial, Value, trials_of, value_at
-from trilane.apps.sweep.store import TrialRecord, planned
+from trilane.apps.sweep.store import TrialRecord, of_trial, planned
 from trilane.errors import BadInputError, MissingPartError, did_you_mean
 
 #: Number of random proposals before the search learns from results.
@@ -231,14 +231,12 @@ class Search:
     """A search of `space` for `aim`: Optuna's proposals and their results.
 
     `seed`: seed of the proposals. `tried`: proposed trials that ended, by name, in the order of their ends.
-    `pruned`: names of the trials that a short run ended.
     """
 
     def __init__(self, space: Space, aim: Aim, seed: int) -> None:
         """Begin a search without results. Raises MissingPartError without Optuna."""
         self.space, self.aim = space, aim
         self.tried: dict[str, Trial] = {}
-        self.pruned: set[str] = set()
         self._optuna = required_optuna()
         self._chance = random.Random(seed)
         self._given: set[str] = set()
@@ -316,7 +314,6 @@ class Search:
             return False
         self._study.tell(asked, state=self._optuna.trial.TrialState.PRUNED)
         self.tried[trial.id] = trial
-        self.pruned.add(trial.id)
         return True
 
     def learn(self, asked: Any, trial: Trial, record: TrialRecord) -> None:
@@ -457,7 +454,11 @@ def answer(search: Search, records: Mapping[str, TrialRecord]) -> Answer:
     found = [trial for trial in space.trials if trial.id in records and trial.id not in search.tried]
     ended = [*search.tried.values(), *found]
     pruned = {"status": "pruned"}
-    trials = [_judged(aim, records.get(trial.id) or planned(trial).model_copy(update=pruned)) for trial in ended]
+    tried = [
+        of_trial(trial, records[trial.id]) if trial.id in records else planned(trial).model_copy(update=pruned)
+        for trial in ended
+    ]
+    trials = [_judged(aim, record) for record in tried]
     judged = [trial for trial in trials if trial.keeps is not None]
     weighed = [name for name in WEIGHED if judged and all(name in trial.metrics for trial in judged)]
     names = list(dict.fromkeys([*aim.names, *weighed]))

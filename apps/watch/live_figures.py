@@ -177,7 +177,7 @@ class LiveFigures:
             frame_times=self._frame_times.now(),
             latencies=self._latencies.now(),
             began_at=str(self._facts.get("began_at", "")),
-            accuracy=self._facts.get("accuracy", {}),
+            accuracy=self._facts.get("accuracy") or {},
             sources=self._sources(clock),
         )
         return replace(figures, verdict=self._verdict(figures) if self._timeline.presented > 1 else None)
@@ -287,7 +287,7 @@ class LiveFigures:
             f"{TEMPERATURE}{SENSOR}": MEASURED,
             "duty": COMPUTED,
         }
-        accuracy = self._facts.get("accuracy", {})
+        accuracy = self._facts.get("accuracy") or {}
         return sources | {f"accuracy.{name}": facts["source"] for name, facts in accuracy.items() if "source" in facts}
 
 

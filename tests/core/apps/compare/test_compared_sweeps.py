@@ -131,7 +131,7 @@ def test_without_run_folders_the_results_are_compared(sweep: SweepOf) -> None:
             {"status": "done", "command": ["trilane", "bench", "raster"], "options": {}, "result": {"rows": []}},
             "no run",
         ),
-        ({"status": "done", "options": {}}, "without command or options"),
+        ({"status": "done", "options": {}}, "without a command"),
         ({"status": "lost", "command": ["trilane", "run"], "options": {}}, "no trial that .* has too, done in both"),
     ],
 )
