@@ -248,7 +248,10 @@ def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, in
 
 
 def _through_pipeline(size: int, frames: int) -> Times:
-    """Run `handoff_pipeline`, and return (times from raster's end to infer's begin, times to infer's end), in µs."""
+    """Run `handoff_pipeline` with slots of `size` KiB, and return its times, in µs.
+
+    They are (times from raster's end to infer's begin, times to infer's end).
+    """
     result = run_pipeline(handoff_pipeline(size * 1024), frames, policy="sequential")
     if result.interrupted:
         raise KeyboardInterrupt

@@ -302,7 +302,7 @@ def _latency_ms(runs: list[dict[str, Any]]) -> dict[str, float | None]:
 
 
 def _summary(setting: Setting, runs: list[dict[str, Any]]) -> dict[str, Any]:
-    """Return the row of `setting`: medians of numbers over its runs, most frequent names, and sums of lost frames."""
+    """Return the row of `setting` over its runs: medians, most frequent names, sums of dropped and lost frames."""
     names, sums = ("slowest", "busiest"), ("dropped", "lost")
     row: dict[str, Any] = {**vars(setting)}
     for key in (key for key in runs[0] if key not in (LATENCIES, UNITS_MS)):

@@ -182,13 +182,20 @@ def _trilane_variants(graph: Graph, service: Service, frames: int) -> dict[str, 
 
 
 def _simpy_variants(graph: Graph, service: Service, frames: int) -> tuple[dict[str, Run], dict[str, dict[str, str]]]:
-    """Return (functions that run the models in SimPy, by variant; the key `absent` of `measure` without SimPy)."""
+    """Return (functions that run the models in SimPy, by variant; facts for the result of `measure`).
+
+    Without SimPy the facts are the key `absent`, else nothing.
+    """
     try:
         models = _models()
     except ModuleNotFoundError:
         return {}, {"absent": {SIMPY: f"not installed: {install_line('peers')}"}}
-    given = graph, service, frames, PERIOD_NS
-    return {variant: partial(lambda model: model(*given).run(), model) for variant, model in models.items()}, {}
+    return {variant: partial(_run_model, model, graph, service, frames) for variant, model in models.items()}, {}
+
+
+def _run_model(model: Any, graph: Graph, service: Service, frames: int) -> list[int]:
+    presented_ns: list[int] = model(graph, service, frames, PERIOD_NS).run()
+    return presented_ns
 
 
 def _models() -> dict[str, Any]:

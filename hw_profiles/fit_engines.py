@@ -398,7 +398,10 @@ def _cost(at: F64, data: _Rows, mean: F64, spread: F64) -> float:
 
 
 def _derivatives(at: F64, data: _Rows, mean: F64, spread: F64, chips: int) -> tuple[F64, F64]:
-    """Return (half the gradient of `_cost`, half its curvature as if `predict` were linear)."""
+    """Return (half the gradient of `_cost`, half its curvature as if `predict` were linear).
+
+    `at`, `mean`, `spread`: logarithms of the numbers, their prior means and deviations (numbers,).
+    """
     ms, shares = data.predict(_from_flat(at))
     misses = np.log(ms / data.ms) / NOISE
     weights = (NU + 1) / (NU + misses**2)  # rows with a large error count little

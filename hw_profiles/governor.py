@@ -197,6 +197,7 @@ class Governor:
         self._ticks = self._throttled_ticks = 0
         self._first_throttled_s: float | None = None
         self._joules = 0.0
+        # (device, junction)
         self._hottest_c = self._thermal_state.device_c, max(self._thermal_state.junction_c.values())
         self._duty: dict[UnitName, int] = {}
         self.due_ns = 0

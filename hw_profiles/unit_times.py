@@ -43,8 +43,6 @@ Bound = Literal["arithmetic", "activation traffic", "spill", "weight traffic", "
 BOUNDS: tuple[Bound, ...] = ("arithmetic", "activation traffic", "spill", "weight traffic", "fixed")
 #: Terms of each rate, as a mask (rates, terms).
 OF_RATE = np.array([[TERMS[name] == rate for name in NAMES] for rate in RATES])
-#: Terms that belong to the job and not to a layer, as a mask (terms,).
-OF_JOB = np.array([name in ("input", "output", "job") for name in NAMES])
 
 
 @dataclass(frozen=True)
@@ -239,7 +237,7 @@ def time_on(
     time = layer_times(unit, memory, work, clock_fraction, contended=contended, batch=batch)
     by_bound = 1e3 * time.layers.sum(axis=0)
     parts = {
-        "fixed": float(by_bound[4]) + unit.permute_fixed_ms.or_else(0.0) * (work.input_tensors > 1),
+        "fixed": float(by_bound[4]) + (unit.permute_fixed_ms.or_else(0.0) if work.input_tensors > 1 else 0.0),
         "input": 1e3 * time.job + batch * work.input_elements * unit.input_ns_per_element.or_else(0.0) / 1e6,
         "weights": float(by_bound[3]),
         "fallback": sum(ms for _, ms in fallback_ms(unit, work, batch)),
@@ -420,7 +418,7 @@ def _operator_seconds(
 ) -> NDArray[np.float64]:
     """Return the time of each operator in seconds (operators,): the larger of its arithmetic and its traffic.
 
-    `counts`, `classes`: tables of a `Work`.
+    `counts`: `Work.table` (operators, 5). `classes`: index into CLASSES of each operator (operators,).
     """
     macs, moved, c_in, c_out = counts[:, 0], counts[:, 1], counts[:, 2], counts[:, 3]
     padded = macs * _padding_factor(c_in, machine.block) * _padding_factor(c_out, machine.block)

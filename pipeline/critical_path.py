@@ -263,7 +263,10 @@ class Paths:
             yield from _divided(now, from_ns, HELD if is_latched else self._overhead(now, from_ns))
 
     def _overhead(self, now: ExplainedJob, from_ns: int) -> str:
-        """Return the kind (STALLED, STOPPED or OVERHEAD) of time since `from_ns` that has no cause of `OF_GAPS`."""
+        """Return the kind of time from `from_ns` to the begin of `now` that has no cause of `OF_GAPS`.
+
+        The kind is STALLED, STOPPED or OVERHEAD.
+        """
         begin_ns = now.job.begin_ns
         for stall in reversed(self._stalls):
             if stall.end_ns <= from_ns:
@@ -273,7 +276,7 @@ class Paths:
         return STOPPED if from_ns < now.stopped_ns <= begin_ns else OVERHEAD
 
     def _unreleased(self, job: JobRecord, from_ns: int, end_ns: int) -> Iterator[Piece]:
-        """Yield the pieces of the time before the frame of its first job `job` was released, the latest piece first.
+        """Yield the pieces of the time before the frame whose first job is `job` was released, the latest piece first.
 
         Time in which a unit was down is a piece of kind DOWN, because it explains why no earlier frame was presented.
         """
@@ -289,7 +292,10 @@ class Paths:
         yield Piece(RELEASE, job.stage, job, from_ns, end_ns)
 
     def _bound_by(self, now: ExplainedJob) -> tuple[ExplainedJob | None, bool]:
-        """Return (job whose end let `now` begin, None if unknown; whether `now` also waited for its release)."""
+        """Return (job whose end let `now` begin; whether `now` also waited for its frame's release).
+
+        The job is None if it is unknown.
+        """
         key, job = now.key, now.job
         own = [self._before.get(key), self._input.get(key)]
         mine = self._jobs.get(own[0]) if own[0] else None
@@ -366,8 +372,8 @@ def parts(piece: Piece, begin_ns: int, end_ns: int, sharing: Sharing | None = No
 def _divided_preempted(stage: str, ns: int, taken: Mapping[str, int], lacked_ns: int) -> dict[Part, int]:
     """Divide `ns` of the `lacked_ns` in which a job of `stage` had no core; return ns by (kind, stage).
 
-    `taken`: part of `lacked_ns` in which each other stage had the core, in ns. Each has the same share of `ns`. Time
-    that no stage explains counts as preempted.
+    `taken`: part of `lacked_ns` in which each other stage had the core, in ns. Each gets the same share of `ns` as
+    of `lacked_ns`. Time that no stage explains counts as preempted.
     """
     found = {(TAKEN, other): ns * of_other // lacked_ns for other, of_other in taken.items()}
     left_ns = ns - sum(found.values())

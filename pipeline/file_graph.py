@@ -94,23 +94,20 @@ def settings_of(file: PipelineFile, frames: int = 0, seed: int = 0, **others: An
     return run_settings(run.policy, count, period_ns, period_ns, **given)
 
 
-def edge_rules(file: PipelineFile, times_ns: Mapping[str, int] | None = None) -> dict[str, str]:
+def edge_rules(file: PipelineFile) -> dict[str, str]:
     """Return the edge rule of each stream, by the name of the stage that writes it.
 
     If the file states no rule, a stream has two slots. Where branches meet, a stream may need more slots, so that they
     do not make the period longer with the file's times. If the file does not state all times, the slots are those for
     equally long stages, each on a unit of its own. These slots are enough for any times, because no cycle has more
     stages than slots. A run and all predictions of a file have the same slots.
-
-    `times_ns`: time in ns of a job of each stage, in place of the file's times; None: the file's times.
     """
     given = {name: file.run.edge for name in file.readers} if file.run.edge else {}
     given |= file.edges
     rules = {name: given.get(name, DEFAULT_EDGE) for name in file.readers}
     graph, in_flight = graph_of(file, rules), in_flight_of(file)
-    if times_ns is None:
-        known = {name: time.mean_ms for name, stage in file.stages.items() if (time := stage.own_time) is not None}
-        times_ns = {name: round(ms * NS_PER_MS) for name, ms in known.items()}
+    known = {name: time.mean_ms for name, stage in file.stages.items() if (time := stage.own_time) is not None}
+    times_ns = {name: round(ms * NS_PER_MS) for name, ms in known.items()}
     if len(times_ns) < len(file.stages):
         apart = tuple(replace(stage, unit=stage.name) for stage in graph.stages)
         graph, in_flight, times_ns = replace(graph, stages=apart), 0, dict.fromkeys(file.stages, 1)

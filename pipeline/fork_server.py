@@ -81,7 +81,10 @@ def serve(requests: socket.socket) -> None:
 
 
 def _reap(codes: dict[int, int], options: int) -> None:
-    """Reap the units that have ended, and write their exit codes to their pipes. `options`: options of waitpid."""
+    """Reap the units that have ended, and write their exit codes to their pipes.
+
+    `options`: WNOHANG reaps units that have ended, 0 waits for all.
+    """
     with contextlib.suppress(ChildProcessError):
         while (ended := os.waitpid(-1, options))[0]:
             writes = codes.pop(ended[0])

@@ -212,7 +212,8 @@ class RunValues:
         if self._unit_of.get(stage) != unit:
             if stage not in self._unit_of:
                 raise _unknown("stage", stage, self._unit_of)
-            raise UnexpectedValue(f"stage {stage!r} on unit {self.unit(unit)!r}", f"unit {self._unit_of[stage]!r}")
+            self.unit(unit)
+            raise UnexpectedValue(f"stage {stage!r} on unit {unit!r}", f"unit {self._unit_of[stage]!r}")
         if (
             min(ready_ns, dispatch_ns, begin_ns, *lost) < 0
             or not max(ready_ns, dispatch_ns, begin_ns) <= end_ns <= NEVER

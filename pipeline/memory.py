@@ -127,7 +127,10 @@ def map_assets(fd: int) -> dict[str, NDArray[Any]]:
 
 
 def _index(assets: Assets) -> tuple[dict[str, dict[str, Any]], int]:
-    """Return (`dtype`, `shape` and `offset` in bytes of each array, by its name; end of the last array in bytes)."""
+    """Return (`dtype`, `shape` and `offset` in bytes of each array, by its name; end of the last array in bytes).
+
+    Offsets count from the first page after the index.
+    """
     index, offset = {}, 0
     for name, array in assets.items():
         if array.dtype.kind not in _KINDS:

@@ -95,7 +95,10 @@ class ReplayFindings(NamedTuple):
 
 
 class _Block(NamedTuple):
-    """LEAST_FRAMES presented frames in a row: needs of each frame's jobs by stage, and time since the frame before."""
+    """LEAST_FRAMES presented frames in a row: needs of each frame's jobs by stage, and the time of the row.
+
+    The time counts from the frame before the row to its last frame.
+    """
 
     needs: tuple[Mapping[str, Need], ...]
     span_ns: int

@@ -217,17 +217,14 @@ class _KeptRun:
         self._source = source
 
     def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
-        """Record a step of `core`, after its actions were carried out. If there is a `failure`, raise it."""
+        """Record a step of `core`, after its actions were carried out."""
         self.recording.add(now_ns, events, actions, core)
 
     def say(self, text: str) -> None:
         """Do nothing, because the log of the run keeps the messages."""
 
     def reckoned(self, places: Placement) -> Reckoned:
-        """Return what bounded the whole run; called after the loop. `places`: cores and threads of the run's units.
-
-        Raises `failure` if the recorded steps and jobs are gone.
-        """
+        """Return what bounded the whole run; called after the loop. `places`: cores and threads of the run's units."""
         if self._source is not None:
             self.jobs += [worked.job for worked in self._source.ended() if worked is not None]
         recording = self.recording
@@ -277,6 +274,7 @@ class _JournaledRun:
         return self._writer.failure
 
     def add(self, now_ns: int, events: tuple[Event, ...], actions: tuple[Action, ...], core: Core) -> None:
+        """Record a step of `core`, after its actions were carried out. If there is a `failure`, raise it."""
         if self._writer.failure is not None:
             raise self._writer.failure
         follows: list[Accounted | Counted] = []
@@ -316,6 +314,7 @@ class _JournaledRun:
             self._writer.flush()
 
     def reckoned(self, places: Placement) -> Reckoned:
+        """Return what bounded the whole run. Raises `failure` if the recorded steps and jobs are gone."""
         with suppress(UnwrittenError):  # it stays as `failure`
             self.flush()
         records = read_journal(self._file.path)

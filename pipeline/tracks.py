@@ -121,7 +121,7 @@ class ChainTrack:
         self._waiting[job.stage].sort()
 
     def lose(self, frame: int, now_ns: int) -> GoneFrame:
-        """Note that a frame is lost, and return it. A track whose `lost_for` returns lost frames returns None here."""
+        """Note that a frame is lost, and return it."""
         return GoneFrame(frame, self._leave(frame, now_ns))
 
     def lost_for(self, _cause: str, _now_ns: int) -> GoneFrame | None:
@@ -142,7 +142,7 @@ class ChainTrack:
         return GoneFrame(UNKNOWN, now_ns)
 
     def late(self, _unit: str) -> list[str]:
-        """Return the stages whose output the unit lacks for the oldest frame that has only some inputs: none."""
+        """Return an empty list: no stage of a chain has several inputs."""
         return []
 
     def _frame(self, number: int, now_ns: int) -> FrameState:
@@ -215,6 +215,7 @@ class GraphTrack:
         return [*frames, *(frame for frame, _ in self._core.source.queue)] if not state.before else frames
 
     def late(self, unit: str) -> list[str]:
+        """Return the stages whose output the unit lacks for the oldest frame that has only some inputs."""
         stages = self._core.flow.stages
         for frame in self._core.frames.values():
             for stage in self._core.units[unit].stages:
@@ -241,6 +242,7 @@ class GraphTrack:
         """Do nothing, because the second scheduler has taken the event."""
 
     def lose(self, _frame: int, _now_ns: int) -> GoneFrame | None:
+        """Return None: `lost_for` returns lost frames."""
         return None
 
     def lost_for(self, cause: str, now_ns: int) -> GoneFrame:

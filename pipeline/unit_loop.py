@@ -373,7 +373,10 @@ def _close(unit: str, link: Link, stages: Iterable[BoundStage]) -> int:
 
 
 def _fail(link: Link, job_id: int, where: str, error: Exception) -> int:
-    """Send the error to the scheduler as one sentence, and return its exit code. The traceback goes to stderr."""
+    """Send the error to the scheduler as one sentence, and return its exit code. The traceback goes to stderr.
+
+    `job_id`: id of the failed job; BUILDING or CLOSING outside a job.
+    """
     traceback.print_exception(error)
     known = isinstance(error, TrilaneError)
     text = str(error) if known else f"{where}: {type(error).__name__}: {error}"

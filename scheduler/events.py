@@ -254,8 +254,21 @@ class Finish(NamedTuple):
     outcome: Outcome
 
 
-UnitEvent = UnitReady | JobDone | JobFailed | UnitDied | Pinged | Pong | SchedulerStalled | SetDuty
-Event = UnitEvent | StageAlone | Stop | FrameRequest | Hold | Abort
+Event = (
+    UnitReady
+    | JobDone
+    | JobFailed
+    | UnitDied
+    | Pinged
+    | Pong
+    | SchedulerStalled
+    | SetDuty
+    | StageAlone
+    | Stop
+    | FrameRequest
+    | Hold
+    | Abort
+)
 Action = Dispatch | Kill | Start | Finish
 EVENTS, ACTIONS = get_args(Event), get_args(Action)
 
@@ -357,7 +370,10 @@ class Graph:
             self._check_bypass(names, self.bypass)
 
     def _check_inputs(self) -> None:
-        """Raise UnexpectedValue for a stage whose inputs are not a few different earlier stages, or a wrong `every`."""
+        """Raise UnexpectedValue for a stage with wrong inputs, or with `every` below 1.
+
+        Right inputs are a few different earlier stages.
+        """
         known: set[str] = set()
         for stage in self.stages:
             if stage.inputs is None:

@@ -22,7 +22,6 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import compress
 from math import ceil, lcm
 from typing import Final, NamedTuple
 
@@ -122,9 +121,11 @@ class _Waits:
         """Yield the waits of stages without inputs that come from the limit of frames in flight."""
         read = self.graph.streams
         ends = [name for name in self.names if name not in read]
-        is_root = [all(one.latest for one in self.graph.inputs_of(index)) for index in range(len(self.names))]
+        roots = [
+            name for index, name in enumerate(self.names) if all(one.latest for one in self.graph.inputs_of(index))
+        ]
         for end in ends:
-            for root in compress(self.names, is_root):
+            for root in roots:
                 yield from self._behind(end, root, in_flight, 1, in_flight=True)
 
     def _behind(

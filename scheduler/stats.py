@@ -138,7 +138,10 @@ def batch_interval(values: Sequence[float]) -> float | None:
 
 
 def _half_width(values: Sequence[float], batches: int) -> float:
-    """Return half the 95 % interval, by Student's t over the means of batches; the first values may fill none."""
+    """Return half the width of the 95 % interval, by Student's t over the means of `batches` batches.
+
+    First values that fill no batch do not count.
+    """
     length = len(values) // batches
     first = len(values) - batches * length
     means = [fmean(values[first + batch * length : first + (batch + 1) * length]) for batch in range(batches)]

@@ -240,6 +240,7 @@ def _reads(begin: float, end: float, count: int, side: int, taps: int) -> tuple[
     The n pixels of the picture with centres in [begin, end) get values; `first` is the number of the first of them. Row
     k of `weights` (n, count) says how much each pixel of the layer counts for pixel `first` + k of the picture, by
     `taps` reads.
+    `side`: pixels of the picture along the axis.
     """
     first, last = (min(max(int(np.ceil(place - 0.5)), 0), side) for place in (begin, end))
     middles = np.arange(first, last)[:, None] + 0.5

@@ -114,7 +114,10 @@ def tensor(image: ReferenceImage, texture: F64, scale: float, zero_point: int) -
 
 
 def _target_corners(world: F64, clip: F64, shape: tuple[int, int]) -> F64:
-    """Return the vertices (N,4) as (column * w, row * w, z, w): place in the picture in pixels, clip coordinates."""
+    """Return the vertices (N,4) as (column * w, row * w, z, w): place in the picture in pixels, clip coordinates.
+
+    `world`: vertices (N,3). `clip`: matrix projection @ view (4,4).
+    """
     x, y, z, w = np.moveaxis(np.c_[world, np.ones(len(world))] @ (FLIP_Y @ clip).T, -1, 0)
     return np.stack([(x + w) * shape[1] / 2, (y + w) * shape[0] / 2, z, w], axis=-1)
 
@@ -145,7 +148,10 @@ def _fragments(
 
 
 def _boxes(corners: F64, shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return (first column and row (F,2), side (F,)) of a square around each triangle; the side is 0 for none."""
+    """Return (first column and row (F,2), side (F,)) of a square around each triangle, in pixels.
+
+    Side 0: the triangle is outside the picture.
+    """
     limit = np.array([shape[1], shape[0]])
     w = corners[..., 3]
     in_front = (w > 0).all(axis=1)

@@ -84,7 +84,10 @@ class FullBody:
         return np.asarray(np.einsum("vab,vb->va", moved[:, :, :3], rest) + moved[:, :, 3])
 
     def _placed(self, turns: F64, translation: F64, world: F64) -> F64:
-        """Return the matrices (55,3,4) of the joints from the body at rest to the world."""
+        """Return the matrices (55,3,4) of the joints from the body at rest to the world.
+
+        `turns`: rotation matrices (55,3,3) of the joints.
+        """
         placed: dict[int, F64] = {}
 
         def place(joint: int) -> F64:

@@ -183,7 +183,10 @@ def _runtime(variant: ProcessVariant) -> Runs:
 
 
 def _ort_default(variant: ProcessVariant) -> Runs:
-    """Return endless calls that each infer once as in ONNX Runtime's introductory example, with its defaults."""
+    """Return endless calls that each infer once as in ONNX Runtime's introductory example.
+
+    They run with its defaults but the threads of `variant`.
+    """
     import onnxruntime
 
     settings = onnxruntime.SessionOptions()
@@ -201,7 +204,10 @@ def _ort_default(variant: ProcessVariant) -> Runs:
 
 
 def _openvino_default(variant: ProcessVariant) -> Runs:
-    """Return endless calls that each infer once as in OpenVINO's introductory example, with its defaults."""
+    """Return endless calls that each infer once as in OpenVINO's introductory example.
+
+    They run with its defaults but the threads of `variant`.
+    """
     from trilane.stages.dsp.runtime import quiet_openvino
 
     openvino = quiet_openvino()
