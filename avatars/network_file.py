@@ -386,7 +386,8 @@ def _external_file(tensor: TensorProto, path: Path) -> Path:
 
 
 def _external_tensors(model: onnx.ModelProto) -> list[TensorProto]:
-    attributes = [attribute for node in model.graph.node for attribute in node.attribute]
-    of_nodes = (tensor for one in attributes for tensor in (*([one.t] if one.HasField("t") else ()), *one.tensors))
-    tensors = (*model.graph.initializer, *of_nodes)
+    tensors = list(model.graph.initializer)
+    for attribute in (one for node in model.graph.node for one in node.attribute):
+        tensors += [attribute.t] if attribute.HasField("t") else []
+        tensors += attribute.tensors
     return [tensor for tensor in tensors if tensor.data_location == TensorProto.EXTERNAL]

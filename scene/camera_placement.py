@@ -230,9 +230,9 @@ def _judged(path: CameraPath, movers: Sequence[Mover], ways: Sequence[Way]) -> F
     The moments cover one cycle, and contain the moment at which each way is farthest from the origin. If a motion holds
     its end, one cycle of the camera after that end is covered too.
     """
-    times = {Wrap.BOUNCE: 2, Wrap.LOOP: 1, Wrap.HOLD: 1}
     cycles = (
-        mover.motion.duration_s * times[mover.motion.wrap] + path.duration_s * (mover.motion.wrap is Wrap.HOLD)
+        mover.motion.duration_s * (2 if mover.motion.wrap is Wrap.BOUNCE else 1)
+        + path.duration_s * (mover.motion.wrap is Wrap.HOLD)
         for mover in movers
     )
     cycle_s = max(path.duration_s, JUDGED_EVERY_S, *cycles)

@@ -368,7 +368,10 @@ def _pixels(rect: Rect, output: Shape) -> tuple[int, int]:
 
 
 def _extent(sizes: Sequence[tuple[int, int]], rows: Sequence[Sequence[int]], margin: int) -> Shape:
-    """Return the least tensor shape for `rows`; one pixel per row and per avatar is reserved, as in `_scale`."""
+    """Return the least tensor shape for `rows`; one pixel per row and per avatar is reserved, as in `_scale`.
+
+    `sizes`: (height, width), tensor pixels.
+    """
     height = sum(max(sizes[k][0] for k in row) for row in rows) + margin * (len(rows) - 1) + len(rows)
     width = max(sum(sizes[k][1] for k in row) + margin * (len(row) - 1) + len(row) for row in rows)
     return _whole_steps(height), _whole_steps(width)
@@ -382,7 +385,10 @@ def _whole_steps(side: int) -> int:
 def _arrangements(
     sizes: Sequence[tuple[float, float]], buckets: Sequence[Shape], margin: int
 ) -> Iterator[_Arrangement]:
-    """Yield the avatars' arrangements in each bucket: in one row, in two rows, and so on up to one row per avatar."""
+    """Yield the avatars' arrangements in each bucket: in one row, in two rows, and so on up to one row per avatar.
+
+    `sizes`: (height, width), picture pixels.
+    """
     for rows in _rows(sizes):
         for shape in buckets:
             yield _Arrangement(shape, rows, _scale(sizes, shape, rows, margin))
@@ -397,7 +403,10 @@ def _rows(sizes: Sequence[tuple[float, float]]) -> Iterator[tuple[tuple[int, ...
 
 
 def _scale(sizes: Sequence[tuple[float, float]], shape: Shape, rows: Sequence[Sequence[int]], margin: int) -> float:
-    """Return the largest scale at which `rows` fit in `shape`, the number of tensor pixels per picture pixel."""
+    """Return the largest scale at which `rows` fit in `shape`, the number of tensor pixels per picture pixel.
+
+    `sizes`: (height, width), picture pixels.
+    """
     high = (shape[0] - margin * (len(rows) - 1) - len(rows)) / sum(max(sizes[k][0] for k in row) for row in rows)
     wide = ((shape[1] - margin * (len(row) - 1) - len(row)) / sum(sizes[k][1] for k in row) for row in rows)
     return min(high, *wide)
@@ -406,7 +415,10 @@ def _scale(sizes: Sequence[tuple[float, float]], shape: Shape, rows: Sequence[Se
 def _crops(
     rects: Sequence[Rect], sizes: Sequence[tuple[float, float]], output: Shape, arrangement: _Arrangement, margin: int
 ) -> tuple[tuple[Rect, Cell], ...]:
-    """Return crop rectangle and cell of each avatar, in the order of `rects`."""
+    """Return crop rectangle and cell of each avatar, in the order of `rects`.
+
+    `sizes`: (height, width), picture pixels.
+    """
     placed: dict[int, tuple[Rect, Cell]] = {}
     top = 0
     for row in arrangement.rows:

@@ -138,11 +138,9 @@ def floor_lift(
     dense = int(motion.duration_s * SAMPLES_PER_S) + 1
     times_s = np.linspace(0.0, motion.duration_s, min(max(len(motion.times_s), dense), MAX_SAMPLES[rule]))
     poses, pelvises = motion.sample_all(times_s)
-    heights = np.stack([
-        # Copied, because the skeleton writes its next pose to the same buffer.
-        skeleton.pose(pose, pelvis * scale + shift).matrices[:, 1].copy()
-        for pose, pelvis in zip(poses, pelvises, strict=True)
-    ])  # fmt: skip
+    posed = (skeleton.pose(pose, pelvis * scale + shift) for pose, pelvis in zip(poses, pelvises, strict=True))
+    # Copied, because the skeleton writes its next pose to the same buffer.
+    heights = np.stack([one.matrices[:, 1].copy() for one in posed])
     lowest = shape.lowest(heights)
     if rule == "frame":
         return times_s, -lowest

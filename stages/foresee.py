@@ -215,7 +215,10 @@ def _foreseen(
     networks: Sequence[int],
     room: tuple[int, int],
 ) -> tuple[tuple[Shape, ...], tuple[tuple[int, Shape], ...]]:
-    """Return (further shapes to prepare, changes of the tensor's shape with them); larger shapes need fewer changes."""
+    """Return (further shapes to prepare, changes of the tensor's shape with them); larger shapes need fewer changes.
+
+    `room`: (most further shapes, most pixels of all of them together).
+    """
     most = budget.most_of(max(len(look.rects) for look in looks))
     larger = larger_shapes(shapes, most)
     while True:

@@ -250,7 +250,11 @@ class TriedPlacement(NamedTuple):
 
 
 class _BusyError(Exception):
-    """Other programs use too many of the cores to compare frame times. Its argument is the share that they use."""
+    """Other programs use too many of the cores to compare frame times. `share`: share of the cores that they use."""
+
+    def __init__(self, share: float) -> None:
+        super().__init__()
+        self.share = share
 
 
 def choice(
@@ -287,7 +291,7 @@ def choice(
     try:
         frame_ns = typical(kept(measured)["frame_ns"].tolist())
     except _BusyError as busy:
-        return TriedPlacement(0, f"{PREDICTED}; not tried while other programs have {busy.args[0]:.0%} of the cores")
+        return TriedPlacement(0, f"{PREDICTED}; not tried while other programs have {busy.share:.0%} of the cores")
     frame_ms = tuple(value / NS_PER_MS for value in frame_ns)
     return TriedPlacement(fastest(frame_ns), f"the fastest of {len(candidates)} that were tried", frame_ms)
 

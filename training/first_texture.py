@@ -250,7 +250,10 @@ def _pulled(total: F64, weight: F64) -> F64:
 
 
 def _barycentric(corners: F64, counts: Ints, x: Ints, y: Ints) -> tuple[F64, F64, F64]:
-    """Return the three barycentric weights, (N,) each, of points in their faces."""
+    """Return the three barycentric weights, (N,) each, of points in their faces.
+
+    `counts` (F,): number of successive points of each face.
+    """
     (bx, by), (cx, cy) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
     area = np.where(counts > 0, bx * cy - cx * by, 1.0)
     px, py = x - np.repeat(corners[:, 0, 0], counts), y - np.repeat(corners[:, 0, 1], counts)

@@ -144,6 +144,8 @@ def _placed(sheet: _Sheet, free: Mask) -> tuple[F64, Mask]:
     """Return (texture coordinates (T,2) of `sheet` in the largest free rectangle, `free` without this rectangle).
 
     The longer side of the sheet lies along the longer side of the rectangle. Raises BadInputError without enough room.
+
+    `free`: row 0 is at v = 0.
     """
     left, bottom, right, top = largest_rectangle(free)
     if min(right - left, top - bottom) <= 2 * MARGIN:

@@ -326,7 +326,10 @@ def _edges(triangles: I64) -> tuple[I64, NDArray[np.intp]]:
 
 
 def _neighbours(first: tuple[F64, F64], second: tuple[F64, F64]) -> tuple[I64, I64]:
-    """Return the boxes that share a cell of the texture: indices (M,) of `first`, indices (M,) of `second`."""
+    """Return the boxes that share a cell of the texture: indices (M,) of `first`, indices (M,) of `second`.
+
+    `first`, `second`: (lowest, highest) u and v, (K,2) each, of K boxes.
+    """
     row, cell = _cells(*first)
     other, its_cell = _cells(*second)
     order = np.argsort(its_cell, kind="stable")

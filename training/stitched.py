@@ -71,7 +71,10 @@ def _ring(foot: F64, height: float, margin: float) -> F64:
 
 
 def _stitch(rings: int, capped: bool) -> NDArray[np.int64]:
-    """Return the faces (F,3) between consecutive rings, and a fan that closes the first ring."""
+    """Return the faces (F,3) between consecutive rings, and a fan that closes the first ring.
+
+    The centres of the first and last ring follow the rings as two vertices.
+    """
     here = np.arange(ANGLES)
     after = (here + 1) % ANGLES
     faces = [_walls(rings)]

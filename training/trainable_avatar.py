@@ -445,7 +445,10 @@ class ByteGrid:
         return output
 
     def weights(self, network: UNet) -> dict[str, Tensor]:
-        """Return the rounded weights of all convolutions, by name."""
+        """Return the weights of all convolutions, by name.
+
+        They are changed so that their product with the norm's scale is rounded.
+        """
         rounded = {}
         for name, conv, norm in convolutions(network):
             scale = torch.ones(1, device=conv.weight.device)

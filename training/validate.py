@@ -348,7 +348,10 @@ def shown(image: U8, painted: Crop, seen: Crop) -> U8:
 
 
 def _read(rows: F64, painted: Crop, seen: Crop, element: int) -> F64:
-    """Return the lines of the crop `seen`, read from the lines `rows` of the crop `painted`."""
+    """Return the lines of the crop `seen`, read from the lines `rows` of the crop `painted`.
+
+    `element`: 0 for columns, 1 for rows.
+    """
     old, new = painted.projection, seen.projection
     scale = old[element, element] / new[element, element]
     shift = (old[element, 2] - scale * new[element, 2]) / old[3, 2] * (1 if element == 0 else -1)

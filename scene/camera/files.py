@@ -336,7 +336,8 @@ def _signs(matrices: F64, up_axis: str, times: F64 | None) -> dict[str, tuple[st
     along = _along(turns, places)
     is_upright = bool(abs(mean[:, 0] @ gravity) > max(UPRIGHT, *map(abs, own_up.values())))
     starts = np.abs(turns[0] - np.eye(3)).max() < EXACT and np.abs(places[0]).max() < EXACT
-    has_time, (least, most) = times is not None, OF_A_DEVICE_S
+    has_time = times is not None
+    least, most = OF_A_DEVICE_S
     is_up = has_time and own_up[ups[-1]] > LEAST_UP_COSINE
     # For a phone whose lower end points down, which is its X: how steeply the view along -Z goes down. The view along
     # +Z then goes up as steeply.
@@ -376,7 +377,10 @@ def _along(turns: F64, places: F64) -> float:
 
 
 def _missed(turns: F64, places: F64) -> float:
-    """Return by how much lines of sight miss the point that the cameras go round, as a share of its distance."""
+    """Return by how much lines of sight miss the point that the cameras go round, as a share of its distance.
+
+    The result is infinite if there is no such point. Axes are OpenGL's.
+    """
     point = meeting_point(turns, places) if len(turns) >= LEAST_ROWS else None
     if point is None:
         return math.inf
@@ -441,7 +445,10 @@ def _has_digits(numbers: F64) -> bool:
 
 
 def _astray(turns: F64, places: F64) -> float:
-    """Return how far cameras look away from where they go or from a point that they go round; below 1 they do not."""
+    """Return how far cameras look away from where they go, or from a point that they go round, whichever is less.
+
+    A result below 1 means that they look there; with too few cameras it is infinite. Axes are OpenGL's.
+    """
     if len(places) < LEAST_LED:
         return math.inf
     return min((1 + _along(turns, places)) / (1 - ALONG), _missed(turns, places) / MOST_MISSED)
@@ -475,7 +482,10 @@ OPENGL_KINDS = ("arkit", "nerf", "record3d")
 
 
 def _read(kind: str, path: Path, spec: CameraSpec) -> RawCamera:
-    """Return the content of `path`, a file of the format `kind`, in the axes of its poses. Raises BadInputError."""
+    """Return the content of `path`, a file of the format `kind`, in the axes of its poses.
+
+    Raises BadInputError, also when the scene states a unit of times for a file without times.
+    """
     if kind in _TABLES:
         return _TABLES[kind](path, TableClock(spec.rate_hz, spec.time_unit))
     if spec.time_unit != AUTO:

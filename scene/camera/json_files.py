@@ -176,7 +176,10 @@ def _is_singular(matrix: NDArray[np.float64]) -> bool:
 
 
 def _nerf_lens(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, str]:
-    """Return (lens of a view or of the file, its source in words)."""
+    """Return (lens of a view or of the file, its source in words).
+
+    `of`: prefix of keys in messages, such as `frames[3].`
+    """
     lens, source = _measured(path, content, of)
     return checked_lens(f"{path}: {of.rstrip('.')}" if of else path, lens), source
 
@@ -201,7 +204,10 @@ def _measured(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, st
 def _by_angle(
     width: float | None, height: float | None, angle_x: float | None, angle_y: float | None
 ) -> tuple[Lens, str]:
-    """Return (lens of a file without focal lengths, source of its angles in words); None is not stated."""
+    """Return (lens of a file without focal lengths, source of its angles in words).
+
+    `width`, `height`: pixels; angles: radians; None if the file does not state it.
+    """
     angles = {"camera_angle_x": angle_x, "camera_angle_y": angle_y}
     source = f"by {' and '.join(f'`{key}`' for key, value in angles.items() if value)}"
     if not (angle_x or angle_y):

@@ -253,6 +253,7 @@ def find_upright(turns: F64, usual: str, is_levelled: bool, stated: str = AUTO) 
         unknown = "usual for the format; the pictures show no horizon to tell it by"
         return Upright(np.array(UP[expected]), 0, f"{expected.upper()} up, {'as given' if stated != AUTO else unknown}")
     best = min(guesses, key=lambda guess: guess.price)
+    # As in the world of a SLAM map. The sign of Y is free: optical axes count too.
     first = turns[0]
     has_first_axes = min(first[0, 0], abs(first[1, 1]), first[:, 1] @ best.up) > AS_FIRST
     of_first = OF_FIRST if best.name and not is_levelled and len(turns) > 1 and has_first_axes else ""
@@ -300,7 +301,7 @@ def _guesses(turns: F64, expected: str, prices: _Prices, stated: str) -> list[_G
         if (price := _price(turns, np.array(up), quarter)) is not None
     ]
     looks_down = turns[:, :, 2].mean(axis=0) @ UP[expected] > np.cos(np.radians(prices.nadir_deg))
-    # A camera in whose map the first picture has the axes looks ahead along an axis.
+    # If the map has the axes of the first picture, such a camera looks ahead along an axis.
     if stated == AUTO and looks_down and np.abs(np.diag(turns[0])).min() <= AS_FIRST:
         guesses.append(_Guess(expected, np.array(UP[expected]), 0, prices.nadir, is_nadir=True))
     if stated != AUTO or prices.between is None:

@@ -94,7 +94,10 @@ def load_kitti(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
 
 
 def _kitti_times(path: Path, read: MatrixTable, clock: TableClock) -> tuple[F64, str]:
-    """Return (times of the poses (N,), seconds; their source in words). Raises BadInputError."""
+    """Return (times of the poses (N,), seconds; their source in words).
+
+    Raises BadInputError when `times.txt` has another number of times than there are poses.
+    """
     if read.times is not None and read.times.unit != FRAMES:
         return read.times.since_s, f"by the times of the file, in {read.times.unit}"
     beside = path.with_name(KITTI_TIMES)

@@ -332,7 +332,7 @@ def walk_wave_turn() -> Motion:
 def there_and_back() -> Motion:
     """Return the motion, fifteen seconds long, of a person who walks five metres along z, turns and walks back."""
     times = np.arange(int(FAR_PERIOD_S * RATE_HZ)) / RATE_HZ
-    walker = Walker(BUILD, lambda at: _along_z(at, -FAR_M / 2, FAR_WALKS, FAR_TURNS), far_swings(), FAR_PERIOD_S)
+    walker = Walker(BUILD, _far_route, far_swings(), FAR_PERIOD_S)
     left, right = walker.foot(1, times), walker.foot(-1, times)
     return _closed(times, *_body(times, left, right, wave=False), "walks five metres, turns and walks back")
 
@@ -389,6 +389,10 @@ def _closed(times: F64, poses: F64, places: F64, what: str) -> Motion:
 
 def _route(times: F64) -> tuple[F64, F64, F64]:
     return _along_z(times, START_Z_M, WALKS, TURNS)
+
+
+def _far_route(times: F64) -> tuple[F64, F64, F64]:
+    return _along_z(times, -FAR_M / 2, FAR_WALKS, FAR_TURNS)
 
 
 def _along_z(times: F64, start_m: float, walks: Changes, turns: Changes) -> tuple[F64, F64, F64]:
@@ -476,7 +480,10 @@ def _height_within_reach(side: int, foot: FootTrack, place: F64, pelvis: F64) ->
 
 
 def _trunk(poses: F64, times: F64, pelvis_yaw: F64, weight: F64, pace: F64) -> None:
-    """Set spine, neck and head: shoulders turn against the hips; the body leans with the pace and breathes."""
+    """Set spine, neck and head in `poses`.
+
+    The shoulders turn against the hips; the body leans with the pace and breathes.
+    """
     breath = np.sin(2 * np.pi * times / (times[-1] + times[1]) * round(times[-1] / 3.6))
     for name, share in (("spine1", 0.25), ("spine2", 0.35), ("spine3", 0.4)):
         joint = poses[:, JOINT_INDEX[name]]

@@ -91,7 +91,10 @@ class _Reader:
 
     def since_mark(self) -> list[Any]:
         """Remove the values above the last mark, and the mark, from the stack. Return the values."""
-        return list(iter(self.stack.pop, _MARK))[::-1]
+        values: list[Any] = []
+        while (value := self.stack.pop()) is not _MARK:
+            values.append(value)
+        return values[::-1]
 
     def bytes_of(self, raw: Any) -> bytes:
         """Return `raw` if it is bytes, or the bytes for which Python 2 and older protocols wrote the text `raw`.
@@ -182,6 +185,11 @@ def _extend(reader: _Reader, items: list[Any]) -> None:
         wanted(reader.stack[-1], list, "a list").extend(items)
 
 
+def _set_item(reader: _Reader, _value: Any) -> None:
+    value, key = reader.stack.pop(), reader.stack.pop()
+    _update(reader, [key, value])
+
+
 def _update(reader: _Reader, items: list[Any]) -> None:
     if not isinstance(reader.stack[-1], Foreign):
         wanted(reader.stack[-1], dict, "a dict").update(_dict_of(items))
@@ -197,6 +205,11 @@ def _put(reader: _Reader, value: Any) -> None:
     if not 0 <= value < MAX_INDEX:
         raise ValueError("an index of a value that no file needs")
     reader.memo[value] = reader.stack[-1]
+
+
+def _global(reader: _Reader, value: Any) -> None:
+    module, _, name = value.partition(" ")
+    reader.stack.append(_named(module, name))
 
 
 def _stack_global(reader: _Reader, _value: Any) -> None:
@@ -345,11 +358,11 @@ _OPERATIONS: dict[str, Callable[[_Reader, Any], object]] = {
     "TUPLE3": _tuple_of(3),
     "APPEND": lambda reader, _value: _extend(reader, [reader.stack.pop()]),
     "APPENDS": lambda reader, _value: _extend(reader, reader.since_mark()),
-    "SETITEM": lambda reader, _value: _update(reader, [reader.stack.pop(), reader.stack.pop()][::-1]),
+    "SETITEM": _set_item,
     "SETITEMS": lambda reader, _value: _update(reader, reader.since_mark()),
     "POP": lambda reader, _value: reader.stack.pop(),
     "POP_MARK": lambda reader, _value: reader.since_mark(),
-    "GLOBAL": lambda reader, value: reader.stack.append(_named(*value.partition(" ")[::2])),
+    "GLOBAL": _global,
     "STACK_GLOBAL": _stack_global,
     "REDUCE": _reduce,
     "NEWOBJ": _new_object,

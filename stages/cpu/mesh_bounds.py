@@ -89,7 +89,10 @@ class Outermost:
         return np.asarray(8 * U * (np.abs(camera[:, :3]).sum(axis=1) * furthest + np.abs(camera[:, 3]) + reach))
 
     def _side(self, row: F32, reach: float, sign: int, slack: float) -> I64 | None:
-        """Return the indices of the vertices that may be outermost on one side; None if one may be off the screen."""
+        """Return the indices of the vertices that may be outermost on one side; None if one may be off the screen.
+
+        `sign`: 1 for the lowest coordinates, -1 for the highest. `slack`: largest error of a quotient, twice.
+        """
         scratch, least, most = self._scratch
         place = np.subtract(row, np.float32(reach), out=scratch) if sign > 0 else np.negative(row, out=scratch)
         if sign < 0:
@@ -436,7 +439,10 @@ def _quotients(points: F64, radius: F64, view: _View) -> tuple[F64, F64]:
 
 
 def _clip_near(triangles: F64, slack: float) -> F64:
-    """Return the clip coordinates (N,4) of corners in front of the near plane, and of points where edges cross it."""
+    """Return the clip coordinates (N,4) of corners in front of the near plane, and of points where edges cross it.
+
+    `triangles`: (F,3,4). `slack`: how far the near plane is moved towards the camera, clip coordinates.
+    """
     near = triangles[:, :, 2] + triangles[:, :, 3] + slack
     points = [triangles[near > 0.0]]
     for a, b in ((0, 1), (1, 2), (2, 0)):

@@ -67,7 +67,7 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OpenvinoSession:
     }
     stored = cache_entry("openvino", f"{_key(network, settings)}.blob")
     if stored is not None:
-        with contextlib.suppress(OSError, RuntimeError):  # missing or damaged: it is compiled again
+        with contextlib.suppress(OSError, ValueError, RuntimeError):  # missing or damaged: it is compiled again
             content = stored.read_bytes()
             digest, blob = content[:DIGEST_BYTES], content[DIGEST_BYTES:]
             if hashlib.sha256(blob).digest() == digest:  # OpenVINO would not notice

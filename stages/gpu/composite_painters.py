@@ -193,7 +193,10 @@ def _triangles(turned: bool) -> NDArray[np.int64]:
 
 
 def _noise(rng: np.random.Generator, shape: tuple[int, int], length: tuple[float, float]) -> F64:
-    """Return periodic noise of `shape` with mean 0 and standard deviation 1."""
+    """Return periodic noise of `shape` with mean 0 and standard deviation 1.
+
+    `length`: correlation lengths in texels, horizontal and vertical.
+    """
     frequency = [np.fft.fftfreq(n)[:, None] if k == 0 else np.fft.fftfreq(n)[None] for k, n in enumerate(shape)]
     spread = (frequency[0] * length[1]) ** 2 + (frequency[1] * length[0]) ** 2
     field = np.fft.ifft2(np.fft.fft2(rng.normal(size=shape)) * np.exp(-2 * np.pi**2 * spread / 4)).real

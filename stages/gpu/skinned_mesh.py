@@ -271,7 +271,7 @@ class Mesh:
         raise NotImplementedError
 
     def bind_pose(self, program: Any) -> None:
-        """Make `program` read the uploaded pose."""
+        """Make `program` read the uploaded pose. Vertex attributes need nothing."""
 
 
 class PosedMesh(Mesh):

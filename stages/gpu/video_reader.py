@@ -118,7 +118,10 @@ def roll_off(light: F64) -> F64:
 
 @cache
 def _srgb() -> U8:
-    """Return the sRGB bytes of lights (STEPS,)."""
+    """Return the sRGB bytes of lights (STEPS,).
+
+    Entry i is for light (i / (STEPS - 1)) ** 2.
+    """
     light = (np.arange(STEPS) / (STEPS - 1)) ** 2
     curve = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.power(light, 1 / 2.4) - 0.055)
     return (curve * 255 + 0.5).astype(np.uint8)

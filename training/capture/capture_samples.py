@@ -110,10 +110,8 @@ class CaptureRenderer:
 
     def _drawn(self, rng: np.random.Generator, band: str, density: float) -> CaptureSample | None:
         number = self._numbers[int(rng.integers(len(self._numbers)))]
-        view, screen = (
-            self.capture.views[number],
-            (OUTPUT_ROWS, round(OUTPUT_ROWS * SCREENS[rng.integers(len(SCREENS))])),
-        )
+        view = self.capture.views[number]
+        screen = OUTPUT_ROWS, round(OUTPUT_ROWS * SCREENS[rng.integers(len(SCREENS))])
         posed = self._raster.posed(self.capture.fits[number])
         camera = SampleCamera(view, self._projection, self._lens)
         by = zoomed_view(rng, band, posed, camera, self._centres, self._rule, screen)

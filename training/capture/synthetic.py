@@ -185,7 +185,10 @@ def moved_outline(rng: np.random.Generator, mask: U8, most_px: float) -> U8:
 
 
 def _patches(rng: np.random.Generator, shape: Shape, side: int, channels: int) -> F64:
-    """Return random values (h,w,channels) in -1..1 that vary smoothly."""
+    """Return random values (h,w,channels) in -1..1 that vary smoothly.
+
+    `side`: pixels between independent values.
+    """
     coarse = rng.uniform(-1, 1, (channels, shape[0] // side + 2, shape[1] // side + 2)).astype(np.float32)
     planes = [np.asarray(Image.fromarray(plane).resize(shape[::-1], Image.Resampling.BILINEAR)) for plane in coarse]
     return np.stack(planes, axis=-1).astype(np.float64)
