@@ -13,7 +13,7 @@ from support.mutations import CHANGES, mutated
 from support.small_inputs import write_small_inputs
 from trilane.errors import BadInputError
 
-CASES = 60
+CASES = 240
 
 
 def tried(folder: Path, seed: int, seconds: float, count: int | None = None) -> str:
@@ -22,7 +22,7 @@ def tried(folder: Path, seed: int, seconds: float, count: int | None = None) -> 
 
 
 def test_a_few_changed_files(tmp_path: Path) -> None:
-    assert tried(tmp_path, seed=1, seconds=5, count=CASES) == ""
+    assert tried(tmp_path, seed=1, seconds=20, count=CASES) == ""
 
 
 @pytest.mark.slow

@@ -72,6 +72,24 @@ def test_the_newest_picture_is_shown(page: Page) -> None:
     page.until(both, "the other picture")
 
 
+def test_the_run_is_held_stepped_and_let_go(page: Page) -> None:
+    page.control("pause")
+    page.until(lambda: page.state == "paused", "the pause")
+    held = page.settle()
+    page.control("step")
+    page.until(lambda: page.presented == held + 1, "one frame")
+    assert page.settle() == held + 1
+    page.control("play")
+    page.until(lambda: page.presented > held + 5, "frames")
+
+
+def test_a_unit_is_killed_and_comes_back(page: Page) -> None:
+    page.control("kill", "writer")
+    page.until(lambda: page.told["figures"]["units"]["writer"].get("restarts") == 1, "the restart")
+    before = page.presented
+    page.until(lambda: page.presented > before + 5, "frames after it")
+
+
 def test_an_interrupt_ends_it_with_its_folder(served: tuple[Served, Path], page: Page) -> None:
     """All frames that were released are accounted for, though their number was not said."""
     server, folder = served

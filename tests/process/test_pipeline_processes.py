@@ -196,6 +196,7 @@ def test_a_unit_that_is_killed_again_is_restarted_each_time_and_the_run_goes_on(
     assert result.report.units[unit].restarts == len(victims) == 2
     assert result.pids[unit] not in victims
     assert any(unit in message for message in result.messages)
+    assert by_cause(result.dropped) == {}
     check_accounts(result)
 
 
@@ -207,6 +208,8 @@ def test_a_unit_that_is_stopped_for_less_than_it_may_be_silent_goes_on_and_nothi
 
     result = run(doubles(), 60, on_progress=When(10, stop))
     assert (result.presented, by_cause(result.lost), result.report.units["gpu"].restarts) == (60, {}, 0)
+    ends = sorted(job.end_ns for job in result.jobs if job.unit == "gpu")
+    assert max(after - before for before, after in pairwise(ends)) > 400_000_000
 
 
 def fork_server() -> psutil.Process:

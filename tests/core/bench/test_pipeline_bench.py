@@ -310,6 +310,17 @@ def test_only_the_time_in_which_both_ran_counts() -> None:
         pipeline.overlapping_ms([run_of(10).jobs, run_of(10, begin_ms=100).jobs])
 
 
+def test_the_command_asks_for_both_avatars(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pipeline, "measure_beside", lambda *asked: [asked])
+    result = pipeline.measure(
+        **{"size": ("256",), "frames": 30, "rounds": 2, "cores": (1,), "edge": ("single",), "video": False},
+        **{"beside": "default", "beside_size": "64"},  # type: ignore[arg-type]
+    )
+    asked = [Asked("default", size, 30, "auto", usable_cores()[:1], False, "single") for size in ("256", "64")]
+    assert result["rows"] == [(asked, 2)]
+    assert result["config"] == {"frames": 30, "rounds": 2, "runtime": "auto", "video": False, "cores": 1}
+
+
 JOBS = (JobRecord("pose", "cpu", 0, 1, 2, 3, 4), JobRecord("infer", "dsp", 0, 4, 5, 6, 7))
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from support.pipeline_files import additions
 from support.small_inputs import net
+from trilane.apps.cli import predict_output
 from trilane.apps.predict.asked_prediction import application_of
 from trilane.apps.predict.predict_options import PredictOptions
 from trilane.avatars.bundle import load_bundle
@@ -246,10 +247,27 @@ def test_a_drawing_has_the_usual_profiles_beside_the_one_asked_for(
     """It is of half an hour where no time is given."""
     drawn: list[Any] = []
     monkeypatch.setattr(governor, "plot_over_time", lambda *given: drawn.append(given))
-    command("predict", *CHIP, "--encoder", "resnet18", "--size", "64x32", "--plot", "heat.svg", *words)
+    real, asked = governor.over_time, list[Any]()
+    monkeypatch.setattr(governor, "over_time", lambda *given: asked.append(given) or real(*given))
+    drawing = ("--encoder", "resnet18", "--size", "64x32", "--plot", "heat.svg")
+    command("predict", *CHIP, *drawing, *words, "--governor", "power_allocator", "--policy", "sequential")
     ((runs, limit_c, title, path),) = drawn
     chip = load_profile(CHIP[1])
     assert list(runs) == names
     assert {round(moments[-1].t_s / 60) for moments in runs.values()} == {minutes}
     title_of = f"{chip.title}\nresnet18, batch, 64x32x16 on the dsp"
     assert (limit_c, title, path) == (chip.thermal.skin_limit_c.value, title_of, Path("heat.svg"))
+    assert {(each[1].variant.policy, each[4]) for each in asked} == {("sequential", "power_allocator")}
+
+
+def test_alternatives_are_of_the_performance_profile(command: Command) -> None:
+    words = ("predict", "--profile", "snapdragon-888", "--size", "512", "--what-if", "--json")
+    slow, fast = (
+        json.loads(command(*words, "--performance-profile", cap)[0])["alternatives"][0]["frame_ms"]
+        for cap in ("power_saver", BURST)
+    )
+    assert slow > fast
+
+
+def test_an_alternative_that_drops_frames() -> None:
+    assert predict_output._at_rate({"holds": False, "dropped": 0.25, "power_w": 2.5}) == ("no", "25 %", "2.50")

@@ -10,7 +10,7 @@ import pytest
 from trilane.pipeline.description import Pipeline, PipelineEdge, PipelineStage, UnitSettings
 from trilane.pipeline.job_times import lost_in_job
 from trilane.pipeline.journal import Begun, records_of
-from trilane.pipeline.reckoning import Reckoned, RunEfficiencies, places_of, reckoned
+from trilane.pipeline.reckoning import Reckoned, RunEfficiencies, WhatIf, places_of, reckoned
 from trilane.scheduler.events import Settings, chain
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.placement import Place
@@ -209,6 +209,27 @@ def test_the_bounds_share_has_an_interval_that_holds_it_and_short_runs_have_none
     short = ran(STAGE_NS, 50)[1].figures["bound"]["stage"]
     assert (short["share_low"], short["share_high"]) == (None, None)
     assert ran(STAGE_NS, 51)[1].figures["bound"]["stage"]["share_low"] is not None
+
+
+@pytest.mark.parametrize("replayed", [True, False], ids=["by cost", "by share"])
+def test_stages_that_may_bound_equally_are_rivals_and_a_surely_smaller_one_is_none(
+    replayed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """raster and composite take 5 and 7 us, and after ten frames the other way round, so 6 us each in the mean.
+
+    Replays tell what each stage costs. Without them, the shares of the path decide.
+    """
+    if not replayed:
+        monkeypatch.setattr(WhatIf, "close", lambda _: None)
+    turns = {"raster": (5000, 7000), "composite": (7000, 5000)}
+
+    def service(stage: str, _unit: str, frame: int, _begin_ns: int) -> int:
+        return turns.get(stage, (STAGE_NS[stage],) * 2)[frame // 10 % 2]
+
+    stage = found_of(simulate(GRAPH, SETTINGS, service, keep=True)).figures["bound"]["stage"]
+    assert {stage["name"], *stage["rivals"]} == {"raster", "composite"}
+    assert ran(STAGE_NS)[1].figures["bound"]["stage"]["rivals"] == []
+    assert ran(STAGE_NS, 50)[1].figures["bound"]["stage"]["rivals"] is None
 
 
 def test_time_that_another_stage_had_a_core_is_that_stages_and_the_rest_is_nobodys() -> None:

@@ -366,7 +366,12 @@ A_TIME = {
     "executorch": ("18.563,", FORWARD),
 }
 #: What stands in its place -> a word of the reason.
-NO_TIMES = {"-1": "negative", "NaN": "finite", '"1"': "a number", "true": "a number", "[]": "a number", "null": "no"}
+NO_TIMES = {
+    "-1": "negative",
+    "NaN": "finite",
+    **dict.fromkeys(('"1"', "true", "[]"), "a number was expected"),
+    "null": "nothing",
+}
 
 
 def changes(name: str) -> list[Change]:

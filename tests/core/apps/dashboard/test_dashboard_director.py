@@ -8,7 +8,7 @@ import pytest
 
 from trilane.apps.dashboard import live_run, run_facts
 from trilane.apps.dashboard.channel import ChangesAsked, ChangesRefused, ControlAsked, Message, StateIs
-from trilane.apps.dashboard.live_run import Director, _numbered, choices_of, reasons_against
+from trilane.apps.dashboard.live_run import Director, FileWatch, _numbered, choices_of, reasons_against
 from trilane.apps.run.run_job import Prepared
 from trilane.errors import BadInputError
 from trilane.pipeline.controls import RunControls
@@ -55,6 +55,13 @@ def test_a_unit_is_killed_and_nothing_else(run: tuple[Director, RunControls]) ->
     for value in ("gpu", "npu", None, 1.0):
         director.do(ControlAsked("kill", value))
     assert controls.taken() == ([], ["gpu"])
+
+
+def test_a_files_run_is_held_stepped_let_go_and_its_units_are_killed() -> None:
+    watch = FileWatch(None)  # type: ignore[arg-type]
+    for control, value in (("pause", None), ("step", None), ("play", None), ("kill", "writer")):
+        watch.do(ControlAsked(control, value))
+    assert watch.controls.taken() == ([Hold(0), Hold(1), Hold(-1)], ["writer"])
 
 
 def test_a_new_configuration_is_checked_and_then_the_run_stops(
