@@ -116,7 +116,10 @@ class WorstView(_Model):
 
 
 class SeedFigures(_Model):
-    """Figures of the views of one seed, in dB: the mean PSNR, the mean PSNR on the body, and the least PSNR."""
+    """Figures of the views of one seed, in dB.
+
+    `psnr_db`, `least_psnr_db`: mean and least PSNR in the bounding box. `body_psnr_db`: mean PSNR on the body.
+    """
 
     psnr_db: Finite
     body_psnr_db: Finite

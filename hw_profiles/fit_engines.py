@@ -260,7 +260,7 @@ class Fitted:
         return min((float(np.abs(shares - others).sum()) / 2 for others in self.seen.values()), default=1.0)
 
     def rates_of(self, chip: str) -> dict[str, Prior]:
-        """Return the six rates of `chip` and their spreads, by the key and in the unit of a profile."""
+        """Return (value in the unit of a profile, relative spread) of the six rates of `chip`, by key of a profile."""
         row = self.chips.index(chip)
         values, spreads = self.numbers.rates[row], self.spreads.rates[row]
         return {

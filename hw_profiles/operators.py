@@ -477,7 +477,11 @@ def _padding(count: int, block: int) -> float:
 
 
 def _convolution(node: Any, source: Shape, weight: Shape, out: Shape, moved: int) -> Iterator[tuple[str, float]]:
-    """Yield (term, amount) of a convolution, which reads and writes `moved` elements."""
+    """Yield (term of `TERMS`, amount) of a convolution: elements moved, and products with channels in whole blocks.
+
+    `source`, `out`: shapes (N, C, ...). `weight`: shape with the kernel's sides from axis 2 on.
+    `moved`: elements read and written, with channels in whole blocks.
+    """
     attributes = {a.name: a for a in node.attribute}
     groups = attributes["group"].i if "group" in attributes else 1
     yield "moved_depthwise" if groups == source[1] > 1 else "moved", moved

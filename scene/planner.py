@@ -297,7 +297,11 @@ def foreseen_changes(
 def _cheapest_way(
     shape: Shape, costs: Mapping[Shape, float], fits: Mapping[Shape, DenseLayout], price: float
 ) -> tuple[float, Shape]:
-    """Return the cost of the cheapest sequence that ends with `shape`, and the shape before `shape` in it."""
+    """Return the least cost, in pixels, of a sequence of shapes that ends with `shape`, and the shape before it.
+
+    Pixels of the frames after this look do not count yet. `costs`: the least cost up to the look before, by last shape.
+    `fits`: layout of each shape with room for the avatars. `price`: least cost of a change of shape, in pixels.
+    """
 
     def change(origin: Shape) -> float:
         if origin == shape:

@@ -148,7 +148,7 @@ class _Waits:
 
 
 def _periods(graph: Graph) -> dict[str, int]:
-    """Return the distance between the frames that each stage takes, in frames, by the stage's name."""
+    """Return the period of each stage, by its name. A stage of period n takes every n-th frame."""
     found: dict[str, int] = {}
     for index, stage in enumerate(graph.stages):
         found[stage.name] = lcm(stage.every, *(found[one.stage] for one in graph.inputs_of(index) if not one.latest))

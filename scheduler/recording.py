@@ -141,7 +141,10 @@ def replay(recording: Recording) -> Iterator[str]:
 
 
 def row_of(item: Event | Action) -> list[Any]:
-    """Return an event or action as a row: its name, then the values of its fields."""
+    """Return an event or action as a row: its name, then the values of its fields.
+
+    For `Dispatch` and `Finish`, these are the fields of the job and of the outcome.
+    """
     row: Any = item
     return [type(item).__name__, *(row[0] if type(item) in CARRIED else row)]
 

@@ -509,10 +509,11 @@ def convolutions(network: UNet) -> Iterator[tuple[str, nn.Conv2d, nn.BatchNorm2d
 
 
 def _places(network: UNet) -> Iterator[str]:
-    """Yield the names of the places that store bytes.
+    """Yield the names of the places of `network`: activation tensors that the exported network stores as bytes.
 
-    These are the input, inputs of the decoder's levels, outputs of ReLUs, outputs of norms without ReLU, and outputs of
-    the heads.
+    A place has the name of the module that reads or makes the tensor; the network's input is `INPUT`. Places are the
+    input, concatenated inputs of decoder levels, outputs of ReLUs, outputs of norms without ReLU, and outputs of the
+    heads.
     """
     yield INPUT
     yield from list(JOINED.values())[: len(DECODER) - (not network.input_skip)]

@@ -172,8 +172,10 @@ def port_types(file: PipelineFile, networks: Mapping[str, GraphFile]) -> PortTyp
 def _check_bypass(file: PipelineFile, types: PortTypes) -> None:
     """Raise BadInputError if the first stage of the bypass lacks a port that the last stage of the bypass reads.
 
-    A port of the right name and another type counts as lacking. No port is needed if the last stage is Python code, a
-    stage with a set time, or a block `busy` or `discard`. `file`: pipeline file. `types`: types of all known ports.
+    A port of the right name and another type counts as lacking. A port is not checked if its type is unknown, or if
+    all types of the first stage are unknown. Of a block `overlay`, only the frame is checked. No port is needed if the
+    last stage is Python code, a stage with a set time, or a block `busy` or `discard`. `file`: pipeline file.
+    `types`: types of all known ports.
     """
     if file.bypass is None:
         return

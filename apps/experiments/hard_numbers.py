@@ -371,9 +371,9 @@ def time_cases() -> Iterator[HardNumber]:
     """Yield rows about the built-in walk and camera at each rate of `RATES`, after 23 to 58 hours of media time.
 
     Frame 5,000,000 must show the same as the same moment in the first period of the motion. The reference reduces the
-    frame's time by the period in fractions, which are exact. The tested time t = frame / fps is off by at most U t, and
-    its remainder is exact. The error of a shown value has two parts: a few roundings, and the error of the time
-    multiplied by the value's largest change in a second.
+    frame's time by the period in fractions, which are exact. The tested time t = frame / fps is rounded once, so it is
+    off by at most U t (U: unit roundoff of float64). Reducing t by the period is exact. The error of a shown value has
+    two parts: a few roundings, and the error of t multiplied by the value's largest change in a second.
     """
     motion, camera = walk_wave_turn(), load_builtin("orbit", CameraSpec())
     assert camera is not None

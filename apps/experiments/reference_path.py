@@ -397,7 +397,7 @@ class ReferenceMoment:
     def _once(self, key: Hashable, make: Callable[[], Any]) -> Any:
         """Return the result of `make`, which is called once for each `key`.
 
-        Therefore a cause without effect costs nothing.
+        A cause of error that changes no input leaves the key the same. Then nothing is computed again.
         """
         if key not in self._made:
             self._made[key] = make()

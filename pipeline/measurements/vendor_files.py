@@ -424,7 +424,10 @@ def is_mlperf_app(document: object) -> bool:
 
 
 def _results(documents: Sequence[Any]) -> Iterator[tuple[str, Any]]:
-    """Yield (place in the file, table) of each benchmark. `documents`: results of the app."""
+    """Yield (place in the file, value) of each benchmark; in a wrong file, the value may be no table.
+
+    `documents`: results of MLPerf's mobile app.
+    """
     for number, each in enumerate(documents):
         results = each.get("results") if isinstance(each, dict) else None
         for index, result in enumerate(results if isinstance(results, list) else []):

@@ -475,7 +475,8 @@ def turns_of_collars(tracks: Tracks, rest: Tracks, chest: F64, stands: NDArray[n
 def with_shoulders_on(across: F64, turns: dict[str, F64], rest: Tracks) -> dict[str, F64]:
     """Return `turns` with chest and collars turned by the least angle that lays the shoulder line along `across`.
 
-    `across` (T, 3): vector from the right to the left recorded shoulder. `rest`: the avatar at rest.
+    `across` (T, 3): vector from the right to the left recorded shoulder. `turns`: global rotations (T, 3, 3), by joint
+    name. `rest`: the avatar at rest.
     """
     ends = []
     for side in SIDES:

@@ -213,7 +213,8 @@ def power_of_two_weights(model: onnx.ModelProto, ranges: Any, reduce_range: bool
     result has, by the name of the weights, a scale for each output channel, as ONNX Runtime's `TensorQuantOverrides`.
 
     `ranges`: ranges from `power_of_two_ranges`.
-    `reduce_range`: whether weights have 7 bits instead of 8.
+    `reduce_range`: whether weights have one bit less than 8. If all runtimes round alike, weights are even numbers of
+    steps, which takes one more bit.
 
     Raises CannotRoundAlikeError if a layer's weights are too large.
     """

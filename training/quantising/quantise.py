@@ -100,7 +100,8 @@ def quantise(
     `model`: network with one float32 input (1, C, H, W), and one output (1, 4, H, W) in 0..1 from a Sigmoid.
     `frames`: real inputs (H, W, C) float32 for the calibration; 1 to 1000 frames.
     `method`: calibration method, a name of `CALIBRATION_METHODS`.
-    `reduce_range`: whether weights have 7 bits instead of 8.
+    `reduce_range`: whether weights have one bit less than 8. If all runtimes round alike, weights are even numbers of
+    steps, which takes one more bit.
     `keep_float`: names of nodes that stay in float.
 
     Raises BadInputError for wrong frames, an unknown method or layer, or a network that is not finite.
@@ -311,7 +312,8 @@ def insert_scales_and_zero_points(
     `model`: float network.
     `ranges`: ranges of the model's tensors, ONNX Runtime's TensorsData.
     `overrides`: scales of weights by name, ONNX Runtime's `TensorQuantOverrides`.
-    `reduce_range`: whether weights have 7 bits instead of 8.
+    `reduce_range`: whether weights have one bit less than 8. If all runtimes round alike, weights are even numbers of
+    steps, which takes one more bit.
     `keep_float`: names of nodes that stay in float.
     """
     quantiser = QDQQuantizer(
