@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
-from typing import IO, Any, Final, NamedTuple, NoReturn, Self
+from typing import IO, Any, Final, NamedTuple, NoReturn, Self, TypeGuard
 
 import msgpack
 
@@ -336,11 +336,23 @@ def config_of(begun: Begun) -> Mapping[str, Any]:
     Raises BadInputError for a configuration of a form that no run writes.
     """
     config = begun.facts.get("config", {})
-    if not isinstance(config, Mapping) or not all(
-        isinstance(config.get(key, {}), Mapping) for key in ("units", "scene", "pace_ns")
-    ):
+    if not _has_form_of_a_run(config):
         raise BadInputError("the journal: facts", "a configuration of another form", "one as a run writes it")
     return config
+
+
+def _has_form_of_a_run(config: Any) -> TypeGuard[Mapping[str, Any]]:
+    """Return whether the tables of a configuration, and the values in them that readers compute with, have a type."""
+    names = ("units", "scene", "pace_ns", "pipeline")
+    if not isinstance(config, Mapping) or not all(isinstance(config.get(name, {}), Mapping) for name in names):
+        return False
+    units, scene = config.get("units", {}).values(), config.get("scene", {})
+    return (
+        all(isinstance(unit, Mapping) and isinstance(unit.get("cores", ()), list | tuple) for unit in units)
+        and isinstance(scene.get("output", {}), Mapping)
+        and isinstance(scene.get("fps", 0), int | float)
+        and isinstance(config.get("pipeline", {}).get("run", {}), Mapping)
+    )
 
 
 def target_period_ns(begun: Begun) -> int:

@@ -361,7 +361,8 @@ def _answer(result: Mapping[str, Any]) -> Mapping[str, Any]:
     This part is the whole result. For a prediction of a pipeline file, it is the last of the predicted variants.
     """
     pipelines = result.get("pipelines")
-    return pipelines[-1] if pipelines and "what_if" in pipelines[-1] else result
+    last = pipelines[-1] if isinstance(pipelines, list) and pipelines else None
+    return last if isinstance(last, dict) and "what_if" in last else result
 
 
 def marked(word: str, record: TrialRecord) -> str:

@@ -234,8 +234,8 @@ def _trial(sweep: str, record: TrialRecord) -> ComparedRun:
     `sweep`: folder of the sweep. `record`: line of the trial.
     Raises BadInputError if the trial is not a run or a prediction.
     """
-    name, folder = record.id, record.folder
-    if folder and Path(folder).name == folder and (Path(sweep, folder) / "report.json").is_file():
+    name, folder = record.id, record.folder or ""
+    if folder not in ("", "..") and folder == Path(folder).name and (Path(sweep, folder) / "report.json").is_file():
         return read_told(str(Path(sweep, folder)))
     document = record.result or {}
     if "expected_error" in document and "frame_time_ms" in document:

@@ -175,7 +175,10 @@ def _video(folder: Path, name: str | None) -> Path | None:
     """
     if name is None:
         return None
-    place = (folder / name).resolve()
+    try:
+        place = (folder / name).resolve()
+    except ValueError:  # a name with a NUL
+        return None
     return place / VIDEO if place.is_relative_to(folder.resolve()) else None
 
 
@@ -270,8 +273,8 @@ def entry_of(
         _time(document.get("fps")),
         _time(_mapping(document, "latency_ms").get("mean")),
         psnr_db,
-        _number(check.get("worst_psnr_db")),
-        _number(check.get("p1_psnr_db")),
+        number_of(check.get("worst_psnr_db")),
+        number_of(check.get("p1_psnr_db")),
         error_source=_text(source),
         facts=machine,
         video=video if video is not None and video.is_file() else None,
@@ -280,7 +283,7 @@ def entry_of(
         interval="" if low is None else BY_SCATTER if "mean_low" in times else BY_MODEL,
         error_of=error_of,
         shows=_shows(_mapping(config, "scene")),
-        other_programs=_number(document.get("other_programs")),
+        other_programs=number_of(document.get("other_programs")),
     )
 
 
@@ -293,7 +296,7 @@ def _verdict(verdict: Mapping[str, Any]) -> dict[str, str]:
         return {}
     bound = _mapping(verdict, "bound")
     named = f"{bound.get('unit')}: {' + '.join(map(str, _sequence(bound.get('stages'))))}" if bound else ""
-    passed = f"{'PASS' if verdict.get('pass') is True else 'FAIL'} at {_number(verdict.get('target_fps')) or 0:g} fps"
+    passed = f"{'PASS' if verdict.get('pass') is True else 'FAIL'} at {number_of(verdict.get('target_fps')) or 0:g} fps"
     trust = "sure" if verdict.get("trusted") is True else "UNSURE"
     return {"verdict": _text(passed), "bound": _text(named), "trust": trust}
 
@@ -343,13 +346,13 @@ def _error(document: Mapping[str, Any]) -> tuple[float | None, str, str]:
     `document`: report or prediction.
     """
     check = _mapping(document, "check")
-    if (own := _number(check.get("psnr_db"))) is not None:
+    if (own := number_of(check.get("psnr_db"))) is not None:
         against = f"against {str(check.get('against')).partition(':')[0]}"
         return own, f"{MEASURED}, {check.get('frames')} frames {against}", _text(f"{OF_RUN} {against}")
     avatars = [facts for facts in _mapping(document, "accuracy").values() if isinstance(facts, Mapping)]
     if not avatars:
         return None, NO_FIGURES, ""
-    known = [(_number(facts.get("psnr_db")), str(facts.get("source", ""))) for facts in avatars]
+    known = [(number_of(facts.get("psnr_db")), str(facts.get("source", ""))) for facts in avatars]
     if any(value is None for value, _ in known):
         why = next((str(facts["why"]) for facts in avatars if facts.get("why")), "")
         return None, f"{NO_FIGURES}: {why}" if why else NO_FIGURES, ""
@@ -396,7 +399,7 @@ def _text(value: Any) -> str:
     return str(value).encode("utf-8", "replace").decode("utf-8")
 
 
-def _number(value: Any) -> float | None:
+def number_of(value: Any) -> float | None:
     """Return `value` as a finite float.
 
     None is returned for a value that is no number, not finite, or too large for a float.
@@ -412,7 +415,7 @@ def _number(value: Any) -> float | None:
 
 def _time(value: Any) -> float | None:
     """Return `value` as a float if it is a finite number above 0, otherwise None."""
-    number = _number(value)
+    number = number_of(value)
     return number if number is not None and number > 0 else None
 
 

@@ -71,7 +71,7 @@ class RunKind(StrEnum):
 Statistics = dict[str, float | None]
 
 
-class ComparedCounts(Record, extra="ignore"):
+class ComparedCounts(Record, extra="ignore", allow_inf_nan=False):
     """Counts of a run's frames. The fields here and in the classes below have the names of a report's keys."""
 
     requested: int
@@ -80,7 +80,7 @@ class ComparedCounts(Record, extra="ignore"):
     dropped: dict[str, int] = Field(default={})
 
 
-class ComparedStage(Record, extra="ignore"):
+class ComparedStage(Record, extra="ignore", allow_inf_nan=False):
     """Unit and times of a stage."""
 
     unit: str
@@ -89,7 +89,7 @@ class ComparedStage(Record, extra="ignore"):
     cpu_ms: Statistics | None = None
 
 
-class ComparedUnit(Record, extra="ignore"):
+class ComparedUnit(Record, extra="ignore", allow_inf_nan=False):
     """Shares and cores of a unit."""
 
     busy: float
@@ -97,7 +97,7 @@ class ComparedUnit(Record, extra="ignore"):
     cores: tuple[int, ...] = ()
 
 
-class ComparedFigures(Record, extra="ignore"):
+class ComparedFigures(Record, extra="ignore", allow_inf_nan=False):
     """What a comparison reads of a report, a prediction or imported times, besides the settings.
 
     `deviation`: only of imported times: relative standard error of every figure; None if it is unknown.
@@ -259,7 +259,7 @@ def _document(path: Path) -> Mapping[str, Any]:
     try:
         if (size := require_file(path, EXPECTED)) > MAX_REPORT_BYTES:
             raise BadInputError(path, f"{size} bytes", f"at most {MAX_REPORT_BYTES}")
-        document = from_json(path.read_bytes())
+        document = from_json(path.read_bytes(), allow_inf_nan=False)
     except OSError as error:
         raise BadInputError.of_os_error(path, error, EXPECTED) from None
     except ValueError as error:

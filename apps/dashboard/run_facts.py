@@ -159,7 +159,7 @@ def facts_of_report(name: str, report: Report) -> RunFacts:
     return replace(
         facts_of_config(name, report.config, document["machine"], {**document.get("options", {}), **document["caps"]}),
         clock=report.clock,
-        plan={**document.get("plan", {}), "notes": list(report.notes)},
+        plan={**(document.get("plan") or {}), "notes": list(report.notes)},
         placement=document.get("placement"),
         accuracy=report.accuracy,
         bound={key: document.get(key) for key in BOUND} if report.bound is not None else None,

@@ -19,7 +19,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, StrictFloat, StrictInt
+from pydantic_core import from_json
 
 from trilane.apps.sweep.definition import Trial
 from trilane.errors import BadInputError, reason
@@ -35,7 +36,7 @@ TRIES = 3
 ROW = ("id", "command", "options", "repeat", "status", "exit_code", "error", "seconds", "repeated", "unsure")
 
 
-class TrialRecord(Record, extra="ignore"):
+class TrialRecord(Record, extra="ignore", allow_inf_nan=False):
     """A line of `trials.jsonl`; docs/sweeps.md describes its keys. Lines of other versions may have other keys.
 
     In answers, `status` may also be `planned`, for a trial that was not tried, or `pruned`, after a short run.
@@ -45,19 +46,19 @@ class TrialRecord(Record, extra="ignore"):
     id: str
     command: tuple[str, ...] = ()
     options: dict[str, Any] = Field(default={})
-    repeat: int = 1
+    repeat: StrictInt = 1
     clock: str = HOST_CLOCK
     status: Literal["planned", "done", "failed", "lost", "pruned"]
-    exit_code: int | None = None
+    exit_code: StrictInt | None = None
     error: str | None = None
     result: dict[str, Any] | None = None
-    repeated: int = 0
+    repeated: StrictInt = 0
     unsure: tuple[str, ...] = ()
     began_at: str | None = None
-    seconds: float | None = None
+    seconds: StrictFloat | None = None
     host: dict[str, Any] | None = None
     folder: str | None = None
-    tries: int = 1
+    tries: StrictInt = 1
 
     @property
     def is_ended(self) -> bool:
@@ -119,16 +120,13 @@ def whole_lines(text: bytes, where: str | Path) -> tuple[list[TrialRecord], int]
 
 def _record(line: bytes) -> TrialRecord | None:
     try:
-        return TrialRecord.model_validate(json.loads(line))
+        return TrialRecord.model_validate(from_json(line))
     except ValueError:
         return None
 
 
 def _is_object(line: bytes) -> bool:
-    try:
-        return isinstance(json.loads(line), dict)
-    except ValueError:
-        return False
+    return line.lstrip()[:1] == b"{" and line.rstrip()[-1:] == b"}"
 
 
 def latest(records: Sequence[TrialRecord]) -> dict[str, TrialRecord]:

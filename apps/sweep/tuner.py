@@ -16,7 +16,7 @@ from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-from trilane.apps.compare.overview import entry_of
+from trilane.apps.compare.overview import entry_of, number_of
 from trilane.apps.sweep.definition import METRICS, Definition, Options, SweepKind, Trial, Value, trials_of, value_at
 from trilane.apps.sweep.store import TrialRecord, of_trial, planned
 from trilane.errors import BadInputError, MissingPartError, did_you_mean
@@ -136,7 +136,8 @@ def figures_of(record: TrialRecord, names: Sequence[str] = ()) -> dict[str, floa
     if record.status != "done" or record.result is None:
         return {}
     several = record.result.get("pipelines")
-    document = several[0] if isinstance(several, list) and several else record.result
+    first = several[0] if isinstance(several, list) and several else None
+    document = first if isinstance(first, dict) else record.result
     paths = {name: METRICS[name].path if name in METRICS else tuple(name.split(".")) for name in (*METRICS, *names)}
     found = {name: _at(document, path) for name, path in paths.items() if path}
     found["psnr"] = entry_of("", document).psnr_db
@@ -146,9 +147,7 @@ def figures_of(record: TrialRecord, names: Sequence[str] = ()) -> dict[str, floa
 
 
 def _at(document: Any, path: Sequence[str]) -> float | None:
-    found = value_at(document, path)
-    is_number = isinstance(found, int | float) and not isinstance(found, bool) and math.isfinite(found)
-    return float(found) if is_number else None
+    return number_of(value_at(document, path))
 
 
 class Space:

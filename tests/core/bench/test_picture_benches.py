@@ -17,6 +17,7 @@ import pytest
 from trilane.avatars.bundle import load_bundle
 from trilane.bench import filters, several
 from trilane.bench.lib import fixture
+from trilane.bench.lib.interleaved_processes import INPUTS, SLOTS
 from trilane.body.joints import JOINT_INDEX
 from trilane.errors import BadInputError, MissingPartError
 
@@ -50,10 +51,10 @@ def test_the_standing_body_is_held(held: Held) -> None:
         held(name, getattr(found, name))
     held("joints", found.joints(0))
     places = [posed.joints[JOINT_INDEX["left_wrist"]] for posed in found.poses]
-    assert len(places) == fixture.INPUTS and (np.diff([place[1] for place in places]) > 0.01).all()
-    assert found.joints(fixture.INPUTS + 1) is found.joints(1) is not found.joints(0)
-    assert {(n % fixture.INPUTS, n % fixture.SLOTS) for n in range(fixture.INPUTS * fixture.SLOTS)} == {
-        (number, slot) for number in range(fixture.INPUTS) for slot in range(fixture.SLOTS)
+    assert len(places) == INPUTS and (np.diff([place[1] for place in places]) > 0.01).all()
+    assert found.joints(INPUTS + 1) is found.joints(1) is not found.joints(0)
+    assert {(n % INPUTS, n % SLOTS) for n in range(INPUTS * SLOTS)} == {
+        (number, slot) for number in range(INPUTS) for slot in range(SLOTS)
     }
     held("weights", found.arrays.weight)
     clip = found.projection @ found.view

@@ -23,9 +23,7 @@ def unknown() -> Profile:
             return {"kind": "unknown", "source": "s"}
         return {key: emptied(value) for key, value in table.items()} if isinstance(table, dict) else table
 
-    data = emptied(data)
-    data["thermal"]["skin_limit_c"] = {"kind": "assumed", "source": "s", "value": 45.0}
-    return parse_profile(data, path)
+    return parse_profile(emptied(data), path)
 
 
 def test_unknown_heat_is_that_of_a_usual_phone() -> None:

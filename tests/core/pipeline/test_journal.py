@@ -26,6 +26,7 @@ from trilane.pipeline.journal import (
     Stepped,
     Stopped,
     Worked,
+    config_of,
     journal_of,
     read_journal,
 )
@@ -255,3 +256,16 @@ def test_a_journal_of_before_jobs_had_their_cpu_time_is_read() -> None:
     assert RunValues(TWO).job((*row, 4)).cpu_ns == 4
     with pytest.raises(UnexpectedValue, match="texts and whole numbers"):
         RunValues(TWO).job(row[:-1])
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        *(5, {"units": 5}, {"units": {"cpu": 5}}, {"units": {"cpu": {"cores": 5}}}, {"scene": {"fps": "x"}}),
+        *({"scene": {"output": 5}}, {"pipeline": 5}, {"pipeline": {"run": 5}}, {"scene": None}),
+    ],
+    ids=str,
+)
+def test_a_configuration_of_another_form_is_refused(config: object) -> None:
+    with pytest.raises(BadInputError, match="found a configuration of another form"):
+        config_of(BEGUN._replace(facts={"config": config}))

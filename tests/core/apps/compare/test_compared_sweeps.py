@@ -118,6 +118,15 @@ def test_of_runs_that_are_too_short_it_cannot_be_told(tmp_path: Path) -> None:
     assert found.notes[-1].startswith("20 frames at the least")
 
 
+def test_a_trial_names_no_folder_above_its_sweep(tmp_path: Path) -> None:
+    sweep = write_run(tmp_path / "run", simulated(1, frames=20)) / "sweep"
+    sweep.mkdir()
+    record = {"id": "run", "status": "done", "command": ["trilane", "run"], "folder": "..", "result": {}}
+    (sweep / "trials.jsonl").write_text(json.dumps(record) + "\n")
+    with pytest.raises(BadInputError, match="no run"):
+        compared(sweep, sweep)
+
+
 def test_without_run_folders_the_results_are_compared(sweep: SweepOf) -> None:
     base, other = sweep("base", {64: SAME}), sweep("other", {64: {"infer": 1.5}}, folders=False)
     (pair,) = compared(base, other).pairs

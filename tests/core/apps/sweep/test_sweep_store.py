@@ -63,6 +63,26 @@ def test_a_wrong_last_line_is_torn_and_a_wrong_one_before_it_is_named() -> None:
             whole_lines(good + wrong + good, "trials.jsonl")
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [{"repeat": True}, {"exit_code": "5"}, {"unsure": None}, {"seconds": float("nan")}, {"result": [[]] * 3}],
+    ids=str,
+)
+def test_a_last_line_with_a_wrong_value_is_named_and_not_cut_off(wrong: dict[str, Any]) -> None:
+    bad = json.dumps({"id": "a", "status": "done", **wrong}).encode() + b"\n"
+    with pytest.raises(BadInputError, match=r"trials.jsonl, line 2: found no trial"):
+        whole_lines(line(record(FIRST)) + bad, "trials.jsonl")
+
+
+def test_a_short_line_has_the_words_and_options_of_its_trial(tmp_path: Path) -> None:
+    with opened(tmp_path / "s"):
+        pass
+    (tmp_path / "s" / "trials.jsonl").write_text(json.dumps({"id": FIRST.id, "status": "done"}) + "\n")
+    with opened(tmp_path / "s", resume=True) as store:
+        (first, *_) = store.summary(set()).trials
+    assert (first.status, first.command, first.options) == ("done", planned(FIRST).command, FIRST.options)
+
+
 def test_the_last_word_on_a_trial_counts() -> None:
     assert latest([record(FIRST, "lost"), record(SECOND), record(FIRST)]) == {
         FIRST.id: record(FIRST),

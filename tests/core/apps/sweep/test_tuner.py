@@ -284,6 +284,7 @@ def test_figures_are_finite_numbers_of_a_trial_that_is_done() -> None:
     assert figures_of(done(trial, result), ["units.a", "units"]) == {"latency": 3.0, "psnr": 40.5, "units.a": 1.0}
     assert figures_of(done(trial, result).model_copy(update={"status": "failed"})) == {}
     assert figures_of(done(trial, {"pipelines": [{"fps": 30.0}, {"fps": 10.0}]})) == {"fps": 30.0}
+    assert figures_of(done(trial, {"pipelines": [5], "fps": 10**400})) == {}
 
 
 def test_a_latency_of_0_is_no_figure() -> None:
