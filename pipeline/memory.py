@@ -16,10 +16,12 @@ through the memories. A stage that copies nothing between its input and its outp
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import json
 import mmap
 import os
+import time
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -83,6 +85,7 @@ Assets = Mapping[str, NDArray[Any]]
 
 _F_SEAL_WRITE = 0x8  # <linux/fcntl.h>
 _LENGTH_BYTES = 8
+SEAL_TRIES, SEAL_PAUSE_S = 10, 0.05
 _KINDS = "?biufcmMSU"  # kinds of NumPy types whose values contain no Python objects
 
 
@@ -103,13 +106,28 @@ def share_assets(assets: Assets) -> int:
         os.pwrite(fd, len(head).to_bytes(_LENGTH_BYTES, "little") + head, 0)
         for name, array in assets.items():
             _write_all(fd, np.ascontiguousarray(array), start + index[name]["offset"])
-        # Sealed, so that no unit can change what another one reads.
-        fcntl.fcntl(fd, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW | _F_SEAL_WRITE)
+        _seal(fd)
     except OSError as error:
         os.close(fd)
         why = "; ".join(filter(None, (reason(error), remedy(error, ""))))
         raise TrilaneError(f"assets: no room for {(start + end) >> 20} MiB: {why}") from None
     return fd
+
+
+def _seal(fd: int) -> None:
+    """Seal the memory `fd`, so that no unit can change what another one reads. Raises OSError.
+
+    Linux refuses to seal with EBUSY while it holds a page of the memory itself, for example to move the page
+    (`memfd_wait_for_pins` in mm/memfd.c). Therefore the call is repeated for a while.
+    """
+    for left in reversed(range(SEAL_TRIES)):
+        try:
+            fcntl.fcntl(fd, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW | _F_SEAL_WRITE)
+            return
+        except OSError as error:
+            if error.errno != errno.EBUSY or not left:
+                raise
+        time.sleep(SEAL_PAUSE_S)
 
 
 def map_assets(fd: int) -> dict[str, NDArray[Any]]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import errno
+import fcntl
 import mmap
 import os
 from collections.abc import Mapping
@@ -15,6 +17,7 @@ from numpy.typing import NDArray
 
 from trilane import machine
 from trilane.errors import TrilaneError
+from trilane.pipeline import memory
 from trilane.pipeline.memory import map_assets, share_assets
 
 ASSETS: dict[str, NDArray[Any]] = {
@@ -97,3 +100,28 @@ def test_assets_that_find_no_room_leave_no_file(monkeypatch: pytest.MonkeyPatch)
     with pytest.raises(TrilaneError, match=r"^assets: no room for 3 MiB: no space left on device$"):
         share_assets({"a": np.zeros(3 << 20, np.uint8)})
     assert open_assets() == before
+
+
+@pytest.mark.parametrize(
+    ("refusals", "is_sealed"), [(0, True), (memory.SEAL_TRIES - 1, True), (memory.SEAL_TRIES, False)]
+)
+def test_a_page_that_the_kernel_holds_for_a_moment_does_not_end_the_run(
+    refusals: int, is_sealed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real, calls = fcntl.fcntl, iter(range(refusals))
+
+    def sometimes_busy(fd: int, command: int, argument: int) -> int:
+        if next(calls, None) is not None:
+            raise OSError(errno.EBUSY, "busy")
+        return real(fd, command, argument)
+
+    monkeypatch.setattr(fcntl, "fcntl", sometimes_busy)
+    monkeypatch.setattr(memory, "SEAL_PAUSE_S", 0.0)
+    if not is_sealed:
+        with pytest.raises(TrilaneError, match="no room"):
+            share_assets({"a": np.zeros(3)})
+        return
+    fd = share_assets({"a": np.zeros(3)})
+    with pytest.raises(PermissionError):
+        os.pwrite(fd, b"x", 0)
+    os.close(fd)
