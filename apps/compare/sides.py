@@ -259,7 +259,7 @@ def _document(path: Path) -> Mapping[str, Any]:
     try:
         if (size := require_file(path, EXPECTED)) > MAX_REPORT_BYTES:
             raise BadInputError(path, f"{size} bytes", f"at most {MAX_REPORT_BYTES}")
-        document = from_json(path.read_bytes(), allow_inf_nan=False)
+        document = from_json(path.read_bytes())
     except OSError as error:
         raise BadInputError.of_os_error(path, error, EXPECTED) from None
     except ValueError as error:
