@@ -125,7 +125,7 @@ class ComparedRun:
     `kind`: kind of its data.
     `figures`: figures of the run.
     `settings`: settings and facts of the machine, by dotted key, without keys that always differ.
-    `unknown`: those of `PARTS` that nobody knows.
+    `unknown`: names in `PARTS` whose values nobody knows.
     `trust`: whether the times can be trusted. Predictions and imported times are not judged.
     `frames`: frames from the journal; None for a run without a journal.
     `remark`: remark for the user on a run without a report, "" for a run with a report.

@@ -136,7 +136,7 @@ def facts_of_checked(name: str, checked: Checked, options: RunOptions, machine: 
 def facts_of_config(
     name: str, config: Mapping[str, Any], machine: Mapping[str, Any], options: Mapping[str, Any]
 ) -> RunFacts:
-    """Return the facts of a run that begins, without those of its avatars.
+    """Return the facts of a run that begins, without the facts of its avatars.
 
     `name`: name of the run folder.
     `config`, `machine`: blocks of report.json.

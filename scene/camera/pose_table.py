@@ -404,7 +404,7 @@ class PoseTable:
     `turns` (N, 3, 3), `places` (N, 3): rotations and positions, with the file's axes and unit.
     `order`: source of the order of columns, in words.
     `names`: content of each column of `table`.
-    `began_s`: time 0 in seconds since 1970; None if the file's times are not those of a clock.
+    `began_s`: time 0 in seconds since 1970; None if no clock gave the file's times.
     `lengths`: unit of the positions by the column names; "" if they state no unit.
     """
 
@@ -516,7 +516,7 @@ def _worst_step(column: F64) -> float:
 
 
 def _began(times: F64, unit: str) -> float | None:
-    """Return the first finite time of `times` in seconds since 1970; None if the times are not those of a clock."""
+    """Return the first finite time of `times` in seconds since 1970; None if no clock gave the times."""
     finite = times[np.isfinite(times)]
     if unit not in TIME_UNITS or not len(finite) or not _since_1970(float(finite[0]), unit):
         return None

@@ -38,7 +38,7 @@ def told(run: Simulation, name: str = "run", **changes: Any) -> ComparedRun:
 
 
 def reported(name: str = "run", **changes: Any) -> ComparedRun:
-    """A run of which only the report is there."""
+    """A run that has only its report."""
     return compared_run(name, RunKind.REPORT, make_report(**changes))
 
 

@@ -233,7 +233,7 @@ def test_at_every_step_frames_are_where_the_scheduler_has_them(case: str) -> Non
         if core.outcome is None:
             assert_frames(figures.now(), core)
     report = core.report(clock="virtual")
-    figures.add(Ended(driver.core.now_ns + S, report))  # what is measured after the last frame is no time of the units
+    figures.add(Ended(driver.core.now_ns + S, report))  # the units do no work after the last frame
     now = figures.now()
     assert_shares(now, report)
     frames = report["frames"]
