@@ -279,7 +279,7 @@ class Prediction:
     @property
     def is_display_capped(self) -> bool:
         """Return whether the frame rate is limited by the display or by the requested rate, and not by the chip."""
-        return isinstance(self.answer, ApplicationPrediction) and self.answer.display_capped
+        return isinstance(self.answer, ApplicationPrediction) and self.answer.is_capped_throughout
 
     @property
     def units(self) -> Mapping[str, Any]:

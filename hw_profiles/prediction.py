@@ -5,13 +5,16 @@ Rule: fields stand in the order of the document of `trilane predict --json`. A f
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from pydantic import Field
 
 from trilane.hw_profiles.rates import DevicePower, FrameInterval, HeldRate, PowerLimit
 from trilane.pipeline.run_metrics import Record, Temperature, TimeSummary
 from trilane.units import UnitName
+
+#: Relative error by which two computations of the same rate may differ.
+ROUNDED: Final = 1e-6
 
 
 class ChipName(Record):
@@ -118,8 +121,8 @@ class ApplicationPrediction(Record):
     `frame_time_ms`, `fps`, `power_w`: with a course over minutes, means over it. `latency_ms`, `stages`, `units`,
     `efficiency`: at the corners of the performance profile.
     `fps_start`, `fps_settled`: rate at the first moment, and in the last fifth of the moments.
-    `display_capped`: whether the display or the wanted rate limits the rate. `stages`, `units`: by name.
-    `efficiency`: time of the slowest unit's stages, divided by the frame time.
+    `display_capped`: whether the display or the wanted rate limits the rate at the first moment.
+    `stages`, `units`: by name. `efficiency`: time of the slowest unit's stages, divided by the frame time.
     `power_w`: power of the device, watts. `base_power_w`: part of it for all but the units.
     `base_power_kind`: kind of the profile's number. `power`: power of the settled device.
     `temperature_c`, `caps`, `timeline`: course over minutes; without one, no temperature is set.
@@ -165,6 +168,11 @@ class ApplicationPrediction(Record):
     def frame(self) -> FrameInterval:
         """The mean frame time, with its interval."""
         return FrameInterval(self.frame_time_ms.mean, self.frame_time_ms.low, self.frame_time_ms.high)
+
+    @property
+    def is_capped_throughout(self) -> bool:
+        """Whether the display or the wanted rate limits the rate at every moment, so that heat takes nothing of it."""
+        return self.display_capped and self.fps > self.fps_start * (1 - ROUNDED)
 
 
 class OperatorRow(Record):

@@ -249,7 +249,7 @@ def _print_network(console: Console, answer: ApplicationPrediction) -> None:
 def _print_times(console: Console, answer: ApplicationPrediction) -> None:
     frame, latency_ms = answer.frame_time_ms, answer.latency_ms.mean
     held = "the rate that was asked for" if answer.rate and answer.rate.holds else "the display"
-    capped = f", held by {held}" if answer.display_capped else ""
+    capped = f", held by {held}" if answer.is_capped_throughout else ""
     stray = f"averages over 20 frames {frame.ema20_min:.1f} to {frame.ema20_max:.1f} ms"
     means = f"{frame.mean:.1f} ms{_span(frame.low, frame.high, '.1f')}, {answer.fps:.1f} fps{capped}"
     console.print(f"{'over all' if answer.config.minutes else 'application':<16}{means}; {stray}")

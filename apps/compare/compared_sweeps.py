@@ -235,7 +235,7 @@ def _trial(sweep: str, record: TrialRecord) -> ComparedRun:
     Raises BadInputError if the trial is not a run or a prediction.
     """
     name, folder = record.id, record.folder or ""
-    if folder not in ("", "..") and folder == Path(folder).name and (Path(sweep, folder) / "report.json").is_file():
+    if folder not in ("", "..") and folder == Path(folder).name and _has_report(Path(sweep, folder)):
         return read_told(str(Path(sweep, folder)))
     document = record.result or {}
     if "expected_error" in document and "frame_time_ms" in document:
@@ -244,6 +244,13 @@ def _trial(sweep: str, record: TrialRecord) -> ComparedRun:
         return compared_run(name, RunKind.REPORT, Report.model_validate(document).as_json())
     except ValidationError:
         raise BadInputError(f"{sweep}: trial {name}", "no run", "a sweep of `run` or `predict`") from None
+
+
+def _has_report(folder: Path) -> bool:
+    try:
+        return (folder / "report.json").is_file()
+    except OSError:  # a name that is too long
+        return False
 
 
 def _notes(figures: Sequence[ComparedFigures]) -> Iterator[str]:

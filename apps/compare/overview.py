@@ -167,19 +167,19 @@ def _trial(folder: Path, trial: TrialRecord, name: str) -> Entry:
 
 
 def _video(folder: Path, name: str | None) -> Path | None:
-    """Return the path of the video in a trial's run folder; the file may not exist.
+    """Return the path of the video in a trial's run folder.
 
-    None is returned without a run folder, or if its name leads out of the sweep's folder.
+    None is returned without a run folder or a video, or if its name leads out of the sweep's folder.
     `folder`: folder of the sweep.
     `name`: name of the run folder from the trial's record.
     """
     if name is None:
         return None
     try:
-        place = (folder / name).resolve()
-    except ValueError:  # a name with a NUL
+        place = (folder / name).resolve() / VIDEO
+        return place if place.is_relative_to(folder.resolve()) and place.is_file() else None
+    except (OSError, ValueError):  # a name that is too long, or with a NUL
         return None
-    return place / VIDEO if place.is_relative_to(folder.resolve()) else None
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ from trilane.apps.compare.difference import (
     settled,
     unsure,
 )
+from trilane.apps.compare.overview import number_of
 from trilane.apps.compare.run_frames import CPU, INSTRUCTION_TIME, INSTRUCTIONS, Key
 from trilane.apps.compare.sides import ComparedFigures, ComparedRun, RunKind, Side, Statistics, changes
 from trilane.apps.run.verdict import MOST_OTHERS
@@ -321,8 +322,8 @@ def _numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
         for key, inner in value.items():
             if key not in ("by_seed", "worst", "samples"):
                 yield from _numbers(f"{name} {key}".strip(), inner)
-    elif isinstance(value, int | float) and not isinstance(value, bool):
-        yield name, float(value)
+    elif (number := number_of(value)) is not None:
+        yield name, number
 
 
 class Noise(NamedTuple):

@@ -20,7 +20,7 @@ from pathlib import Path
 from statistics import stdev
 from typing import Annotated, Any, Final, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 from pydantic_core import from_json, to_json
 
 from trilane.apps.compare.difference import COMPARED, STATISTICS
@@ -115,6 +115,13 @@ class ComparedFigures(Record, extra="ignore", allow_inf_nan=False):
     accuracy: dict[str, Any] = Field(default={})
     check: dict[str, Any] | None = None
     deviation: float | None = None
+
+    @field_validator("frame_time_ms")
+    @classmethod
+    def _takes_time(cls, times: Statistics) -> Statistics:
+        if (mean := times.get("mean")) is not None and mean <= 0:
+            raise ValueError(f"its mean is {mean:g} ms, and a frame takes more than 0")
+        return times
 
 
 @dataclass(frozen=True)

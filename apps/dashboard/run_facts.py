@@ -98,7 +98,8 @@ def config_in_force(config: Mapping[str, Any], options: Mapping[str, Any]) -> di
     if "pipeline" in config:  # a pipeline file has no controls that need a new run
         return {name: str(config[name]) for name in ("policy", "edge")}
     scene = config["scene"]
-    chosen = {**config, "size": scene["size"], "avatar": scene["avatars"][0]["bundle"]}
+    avatar = next((avatar["bundle"] for avatar in scene.get("avatars", ())), None)
+    chosen = {**config, "size": scene.get("size"), "avatar": avatar}
     values = {name: options.get(name) if chosen.get(name) is None else chosen[name] for name in OF_A_NEW_RUN}
     return {name: NOTHING if value is None else str(value) for name, value in values.items()}
 
@@ -144,7 +145,7 @@ def facts_of_config(
     """
     scene, values = config["scene"], config_in_force(config, options)
     line, output = _machine_line(machine), _output(scene)
-    return RunFacts(name, scene["name"], "host", line, scene["fps"], output, values, {}, None, {})
+    return RunFacts(name, scene["name"], "host", line, scene.get("fps", TARGET_FPS), output, values, {}, None, {})
 
 
 def facts_of_report(name: str, report: Report) -> RunFacts:

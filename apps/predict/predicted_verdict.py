@@ -12,13 +12,11 @@ from typing import Any, Final
 
 from trilane.apps.run.verdict import COMPUTED, DISPLAY, Facts, LateFrames, NamedBound, Rate, Trust, Verdict, judged
 from trilane.apps.run.verdict_facts import NO_TRUTH
-from trilane.hw_profiles.prediction import ApplicationPrediction, NetworkPrediction
+from trilane.hw_profiles.prediction import ROUNDED, ApplicationPrediction, NetworkPrediction
 from trilane.hw_profiles.rates import FrameInterval, HeldRate, wanted_drops
 from trilane.hw_profiles.schema import SHARE_TEXT
 from trilane.units import TARGET_FPS
 
-#: Relative error by which two computations of the same rate may differ.
-ROUNDED: Final = 1e-6
 NO_PICTURES: Final = "trilane quality measures it here: a prediction has no pictures"
 OVER_MINUTES: Final = "--minutes 30: what heat leaves of it"
 
@@ -37,7 +35,7 @@ def predicted_verdict(prediction: ApplicationPrediction | NetworkPrediction) -> 
         bound = NamedBound(prediction.unit, network, 1.0, of_unit=frozenset(network))
         return _judged(needs, target, bound, _less_work(prediction.precision), "", image=NO_PICTURES)
     target = rate.fps if rate else prediction.config.fps
-    is_held = prediction.display_capped and (rate is None or prediction.fps < rate.fps * (1 - ROUNDED))
+    is_held = prediction.is_capped_throughout and (rate is None or prediction.fps < rate.fps * (1 - ROUNDED))
     stages = {name: (stage.unit, stage.service_ms.mean or 0.0) for name, stage in prediction.stages.items()}
     return _judged(
         needs,

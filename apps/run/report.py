@@ -8,15 +8,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator, model_validator
 from pydantic_core import from_json
 
 from trilane.arrays import Shape
 from trilane.errors import BadInputError
 from trilane.files import require_file
+from trilane.pipeline.description import Model
 from trilane.pipeline.run_metrics import Caps, PolicyMetrics, Record, RunMetrics, Temperature
+from trilane.units import NO_FIGURES, TARGET_FPS
 
 SCHEMA = 1
 MAX_REPORT_BYTES = 64 << 20
@@ -295,6 +297,46 @@ class VerdictFacts(Record):
 OptionValue = str | int | float | bool | tuple[str, ...] | None
 
 
+class _Avatar(Model, extra="allow"):
+    bundle: str
+
+
+class _Scene(Model, extra="allow"):
+    """The keys of a scene that a verdict and the dashboard read."""
+
+    name: str
+    fps: float = Field(default=TARGET_FPS, gt=0, allow_inf_nan=False)
+    avatars: tuple[_Avatar, ...] = ()
+
+
+class _WorstView(Model, extra="allow"):
+    psnr_db: float | None = None
+
+
+class _Accuracy(Model, extra="allow", allow_inf_nan=False):
+    """The keys of an avatar's accuracy that a verdict reads."""
+
+    source: str = NO_FIGURES
+    psnr_db: float | None = None
+    psnr_db_by_band: dict[str, float] = Field(default={})
+    worst: _WorstView | None = None
+
+    @model_validator(mode="after")
+    def _has_a_figure(self) -> Self:
+        if self.source != NO_FIGURES and self.psnr_db is None and not self.psnr_db_by_band:
+            raise ValueError(f"no psnr_db and no psnr_db_by_band, although its source is {self.source!r}")
+        return self
+
+
+def _refuse_other(model: type[Model], key: str, value: Any) -> None:
+    """Raise ValueError, which names the key inside `key`, if `value` does not have the form of `model`."""
+    try:
+        model.model_validate(value)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise ValueError(f"{'.'.join(map(str, (key, *first['loc'])))}: {first['msg']}") from None
+
+
 class Preamble(Record):
     """The first keys of a report.
 
@@ -312,6 +354,13 @@ class Preamble(Record):
     config: dict[str, Any]
     plan: WorkPlan | None = None
     caps: Caps
+
+    @field_validator("config")
+    @classmethod
+    def _has_what_is_read(cls, config: dict[str, Any]) -> dict[str, Any]:
+        if "pipeline" not in config:
+            _refuse_other(_Scene, "scene", config.get("scene"))
+        return config
 
 
 class Report(RunMetrics, Preamble):
@@ -362,6 +411,13 @@ class Report(RunMetrics, Preamble):
     notes: tuple[str, ...] = ()
     video: Video | None
     checksum: str | None
+
+    @field_validator("accuracy")
+    @classmethod
+    def _has_figures(cls, accuracy: dict[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
+        for avatar, facts in accuracy.items():
+            _refuse_other(_Accuracy, avatar, facts)
+        return accuracy
 
 
 def write_report(report: Report, target: Path) -> None:

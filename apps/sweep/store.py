@@ -31,6 +31,7 @@ from trilane.writing import WRITABLE, write_bytes
 SWEEP, TRIALS, LOCK = "sweep.json", "trials.jsonl", ".lock"
 #: Seconds for the trials of a killed sweep to end; they hold its lock until then.
 LOCK_S = 15.0
+MAX_TRIALS_BYTES = 256 << 20
 TRIES = 3
 #: Keys of a trial in the answers of `trilane sweep` and `trilane tune`, in their order.
 ROW = ("id", "command", "options", "repeat", "status", "exit_code", "error", "seconds", "repeated", "unsure")
@@ -118,6 +119,13 @@ def whole_lines(text: bytes, where: str | Path) -> tuple[list[TrialRecord], int]
     return records, size
 
 
+def _whole(file: int, path: Path) -> bytes:
+    """Return the content of the open file `file`. Raises BadInputError, which names `path`, if it is too large."""
+    if (size := os.fstat(file).st_size) > MAX_TRIALS_BYTES:
+        raise BadInputError(path, f"{size} bytes", f"at most {MAX_TRIALS_BYTES}")
+    return os.pread(file, size, 0)
+
+
 def _record(line: bytes) -> TrialRecord | None:
     try:
         return TrialRecord.model_validate(from_json(line))
@@ -141,7 +149,8 @@ def read_trials(folder: Path) -> dict[str, TrialRecord]:
     """
     path = folder / TRIALS
     try:
-        return latest(whole_lines(path.read_bytes(), path)[0])
+        with path.open("rb") as file:
+            return latest(whole_lines(_whole(file.fileno(), path), path)[0])
     except OSError as error:
         raise BadInputError.of_os_error(path, error, "the trials of a sweep") from error
 
@@ -269,7 +278,7 @@ class Store:
             ]
             document = {"schema": 1, **self._about, "inputs": inputs, "trials": listed}
             write_bytes(path, json.dumps(document, indent=1).encode() + b"\n")
-        records, size = whole_lines(os.pread(self._file, os.fstat(self._file).st_size, 0), self.folder / TRIALS)
+        records, size = whole_lines(_whole(self._file, self.folder / TRIALS), self.folder / TRIALS)
         os.ftruncate(self._file, size)
         os.lseek(self._file, 0, os.SEEK_END)
         self.done = latest(records)

@@ -118,10 +118,11 @@ def test_of_runs_that_are_too_short_it_cannot_be_told(tmp_path: Path) -> None:
     assert found.notes[-1].startswith("20 frames at the least")
 
 
-def test_a_trial_names_no_folder_above_its_sweep(tmp_path: Path) -> None:
+@pytest.mark.parametrize("folder", ["..", "x" * 300])
+def test_a_trial_names_no_folder_above_its_sweep(tmp_path: Path, folder: str) -> None:
     sweep = write_run(tmp_path / "run", simulated(1, frames=20)) / "sweep"
     sweep.mkdir()
-    record = {"id": "run", "status": "done", "command": ["trilane", "run"], "folder": "..", "result": {}}
+    record = {"id": "run", "status": "done", "command": ["trilane", "run"], "folder": folder, "result": {}}
     (sweep / "trials.jsonl").write_text(json.dumps(record) + "\n")
     with pytest.raises(BadInputError, match="no run"):
         compared(sweep, sweep)

@@ -312,6 +312,12 @@ def test_drops_and_errors_are_named() -> None:
     )
 
 
+def test_a_number_of_400_digits_is_no_error() -> None:
+    run = simulated(1)
+    base, other = (told(run, accuracy={"someone": {"psnr_db": db, "iou": 0.9}}) for db in (10**400, 30.0))
+    assert "someone psnr_db" not in pair(base, other).verdict
+
+
 def test_a_report_without_a_journal_has_summaries(make: Make) -> None:
     base, other = make("a"), make("b", policy="sequential", seed=2)
     (base / NAME).unlink()
@@ -335,6 +341,8 @@ def test_predictions_of_one_chip_share_the_models_error(tmp_path: Path) -> None:
         path.write_text(json.dumps(answer), encoding="utf-8")
         return read_told(str(path))
 
+    with pytest.raises(BadInputError, match=r"frame_time_ms: found .* its mean is 0 ms, and a frame takes more than 0"):
+        prediction("none", 0.0, "one")
     base = prediction("a", 20.0, "one")
     assert pair(base, prediction("b", 20.5, "one")).verdict == "frame time +2.5 %"
     assert pair(base, prediction("d", 400.0, "one")).verdict == "frame time +1900 %"

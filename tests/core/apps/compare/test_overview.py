@@ -204,6 +204,16 @@ def test_what_is_no_document_is_named(tmp_path: Path, content: str, found: str) 
         read_entries([tmp_path])
 
 
+@pytest.mark.parametrize("folder", ["x" * 300, "a\0b", ".."])
+def test_a_trial_whose_folder_cannot_be_has_no_video(tmp_path: Path, folder: str) -> None:
+    (tmp_path / "video.mp4").touch()
+    sweep = _sweep(tmp_path / "sweep")
+    trial = {"id": "ab", "status": "done", "result": REPORT, "folder": folder}
+    (sweep / "trials.jsonl").write_text(json.dumps(trial) + "\n")
+    (entry,) = read_entries([sweep])
+    assert (entry.video, entry.frame_ms) == (None, 20.0)
+
+
 def test_one_damaged_run_of_many_is_a_row(tmp_path: Path) -> None:
     for name, text in {"bad": "{", "good": json.dumps(REPORT)}.items():
         (tmp_path / name).mkdir()

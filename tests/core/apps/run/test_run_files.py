@@ -223,6 +223,30 @@ def test_what_is_no_report_is_named_word_by_word(tmp_path: Path) -> None:
     assert not said(json.dumps(make_report(schema=0))).endswith(newer)
 
 
+SCENE = make_report()["config"]["scene"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"config": {}}, "config: found value error, scene: input should be a valid dictionary or instance of _scene"),
+        ({"config": {"scene": {}}}, "config: found value error, scene.name: field required"),
+        ({"config": {"scene": {**SCENE, "avatars": [{}]}}}, "scene.avatars.0.bundle: field required"),
+        ({"config": {"scene": {**SCENE, "fps": "fast"}}}, "scene.fps: input should be a valid number"),
+        ({"accuracy": {"hiker": {"source": "validation"}}}, "hiker: value error, no psnr_db and no psnr_db_by_band"),
+        ({"accuracy": {"hiker": {"psnr_db_by_band": {"far": "good"}}}}, "hiker.psnr_db_by_band.far: input should be"),
+        ({"accuracy": {"hiker": {"psnr_db": 10**400}}}, "hiker.psnr_db: input should be a valid number"),
+    ],
+)
+def test_what_is_read_of_a_scene_and_of_an_accuracy_is_checked(
+    tmp_path: Path, change: dict[str, Any], said: str
+) -> None:
+    (tmp_path / "report.json").write_text(json.dumps(make_report(**change)))
+    with pytest.raises(BadInputError) as refused:
+        read_report(tmp_path)
+    assert said in str(refused.value)
+
+
 def test_a_file_that_is_too_large_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "any.json"
     write_report(Report.model_validate(make_report()), file)

@@ -113,6 +113,7 @@ def predicted(frame_ms: tuple[float, ...], fps: float = 30.0, /, **ms: Any) -> A
         SimpleNamespace(fps=fps),
         {"latency_ms": MeanTime(mean=20.0), "units": {}, "display_capped": False, "timeline": ()},
     )
+    known["fps_start"] = ms.get("fps", 0.0)
     return ApplicationPrediction.model_construct(frame_time_ms=times, config=config, stages=stages, **known | ms)
 
 
@@ -131,6 +132,14 @@ def test_what_the_display_holds_back_is_bound_by_it() -> None:
     left = holding(30.0, FrameInterval(9.0, 8.0, 10.0))
     quick = predicted_verdict(predicted((33.3, 33.3, 33.3), **{**held, "fps": 30.0}, rate=left))
     assert (quick.passed, quick.as_json()["bound"]["unit"]) == (True, "gpu")
+
+
+def test_the_display_is_no_bound_where_heat_takes_frames() -> None:
+    """At first the display shows 60.2 fps. Over all minutes the mean is 50 fps: the hot gpu is slower than it."""
+    hot = predicted((20.0, 20.0, 20.0), gpu=19.0, display_capped=True, fps=50.0, fps_start=1e3 / 16.6)
+    found = predicted_verdict(hot)
+    assert found.as_json()["bound"]["unit"] == "gpu"
+    assert not dict(found.lines())["TRUST"].startswith("computed; the display")
 
 
 def test_frames_that_gave_way_to_newer_ones_are_told_beside_the_rate() -> None:

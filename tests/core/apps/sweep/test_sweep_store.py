@@ -103,6 +103,19 @@ def test_a_torn_line_is_cut_off_and_its_trial_done_again(tmp_path: Path) -> None
     assert list(read_trials(tmp_path / "s")) == [FIRST.id, THIRD.id]
 
 
+def test_trials_that_are_too_large_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with opened(tmp_path / "s") as store:
+        store.add(record(FIRST))
+    size = (tmp_path / "s" / TRIALS).stat().st_size
+    monkeypatch.setattr(module, "MAX_TRIALS_BYTES", size)
+    assert list(read_trials(tmp_path / "s")) == [FIRST.id]
+    monkeypatch.setattr(module, "MAX_TRIALS_BYTES", size - 1)
+    with pytest.raises(BadInputError, match=f"found {size} bytes, expected at most {size - 1}"):
+        read_trials(tmp_path / "s")
+    with pytest.raises(BadInputError, match=f"found {size} bytes"), opened(tmp_path / "s", resume=True):
+        pytest.fail("a file that is too large was read")
+
+
 def test_what_a_folder_is_taken_up_for(tmp_path: Path) -> None:
     folder = tmp_path / "a" / "s"
     with pytest.raises(BadInputError, match="no sweep, expected one to go on with"):
