@@ -175,7 +175,7 @@ def _untrained(
     """Return a float network with random weights, and the number of its parameters.
 
     `encoder`, `norm`, `width`, `channels`: as the options of these names. `shape`: (height, width) of the input.
-    `seed`: seed of the weights. Raises MissingPartError without PyTorch.
+    `seed`: seed of the weights. Raises MissingPartError if PyTorch is missing, and BadInputError for a wrong option.
     """
     try:
         import torch
@@ -193,7 +193,7 @@ def _untrained(
 def _write_parts(whole: NetworkFile, at: list[str], folder: Path) -> list[Path]:
     """Cut the network `whole` at the tensors `at`, write the parts to `folder`, and return their files.
 
-    The files are in the order in which the parts run. Raises BadInputError if `folder` cannot be made.
+    The files are in the order in which the parts run. Raises BadInputError for a wrong tensor or `folder`.
     """
     from trilane.avatars.network_split import split as cut_at
     from trilane.writing import write_bytes
@@ -320,7 +320,7 @@ def _material(source: Path | None, frames: Path | None, avatar: str | None) -> t
     `avatar`: avatar whose float network is used, on views drawn as in training. Either `avatar` or both files are
     given; the others are None.
 
-    Raises BadInputError for any other choice and for a bad file, MissingPartError if a part for drawing is missing.
+    Raises BadInputError for any other choice and for a bad file, and MissingPartError if a part for drawing is missing.
     """
     from trilane.avatars.network_file import parse_network
     from trilane.training.quantising.calibration_table import COUNTS, EVALUATED

@@ -1,8 +1,8 @@
 """`trilane bench`: measurements of this machine's speed and exactness, by name.
 
 Rule: a bench is a line of `BENCHES` and a module with a function `measure`. The parameters of `measure` are the
-command's options, whose types follow from their defaults. The docstrings of the module and of `measure` are the help.
-`MEANINGS` explains an option once for all benches. A line for one bench and option takes precedence.
+command's options, whose types follow from their defaults. The docstrings of the module and of `measure` give the help.
+`MEANINGS` explains each option for all benches. If a bench has an entry of its own for an option, this entry is used.
 """
 
 from __future__ import annotations

@@ -144,7 +144,7 @@ def _write_vertices(out: Path, shaped: ShapedBody, frames: NDArray[np.float64]) 
 
 
 def _check_place(path: Path, size: int) -> None:
-    """Raise BadInputError if `path` is a folder, or if its own folder is absent or lacks space for `size` bytes."""
+    """Raise BadInputError if `path` is a folder, or if its parent folder is absent or lacks space for `size` bytes."""
     if path.is_dir():
         raise BadInputError(path, "a folder", "a file in a folder", OTHER_OUT)
     if not path.parent.is_dir():

@@ -24,7 +24,7 @@ from trilane.options import EMPTY_PATH, Options, element_of, expected, kind_of, 
 from trilane.stages.run_options import PROFILE_HELP, WIDTH_HELP, RunOptions
 from trilane.units import AVATARS_HELP, CALIBRATION_METHODS, MAX_CHANNELS, either
 
-#: Attribute of a command's function, with the class of the command's options.
+#: Name of the attribute of a command's function that holds the class of the command's options.
 OPTIONS = "options_model"
 #: Pydantic's name of a kind of number -> plain name.
 IN_PLAIN_WORDS = {"a valid number": "a number", "a valid integer": "a whole number"}
@@ -40,7 +40,7 @@ PortOption = Annotated[
 
 
 class OnceCommand(TyperCommand):
-    """A command that refuses an option given twice, unless the option collects several values."""
+    """A command that refuses an option with one value if the option is given twice."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse `args` as Typer does. Raises BadInputError for an option that is given twice or has a wrong value.
@@ -102,7 +102,7 @@ def _wrong_value(parameter: Any, error: ValidationError, model: type[Options] | 
 
 
 def _may_be_repeated(option: TyperOption) -> bool:
-    """Return whether `option` may be repeated: an option that collects or counts values, or a flag without opposite."""
+    """Return whether `option` may be repeated: whether it collects or counts values, or is a flag without opposite."""
     return option.multiple or option.count or (option.is_flag and not option.secondary_opts)
 
 

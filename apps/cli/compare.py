@@ -123,7 +123,7 @@ def compare(
         write_to_github(judged, document["verdict"])
     _say(judged)
     if json:
-        with suppress(BrokenPipeError):  # the gate has the exit code
+        with suppress(BrokenPipeError):  # the exit code must say the gate's outcome even if nobody reads the document
             print_json(document)
     else:
         print_kept(shown)
@@ -207,7 +207,7 @@ def _are_sweeps(names: list[str]) -> bool:
     return bool(sweeps)
 
 
-#: Measures that are shown even if they do not differ, with a statistic in ALWAYS_STATISTICS.
+#: Measures whose statistics in ALWAYS_STATISTICS are shown even if they do not differ.
 ALWAYS = ("frame time", "latency", "instructions", "time of an instruction", "work", "busy")
 ALWAYS_STATISTICS = ("mean", "typical", "share")
 MOST_CHANGES = 12

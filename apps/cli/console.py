@@ -30,7 +30,7 @@ _WRITTEN_OUT = {code: repr(chr(code))[1:-1] for code in (*range(0x20), *range(0x
 class _Kept:
     """A wrapper around `stream`. After the terminal was closed, a write raises no error, and its text is lost.
 
-    `lost`: error numbers of a write that are ignored too, besides EIO, which a closed terminal gives.
+    `lost`: further error numbers that a write ignores. It always ignores EIO, the error for a closed terminal.
     """
 
     def __init__(self, stream: IO[str], *lost: int) -> None:
@@ -89,7 +89,7 @@ def note(text: str) -> None:
 
 @contextmanager
 def stdout_kept() -> Iterator[None]:
-    """Redirect file descriptor 1 to stderr inside the `with` block, so that the output of libraries is no result."""
+    """Redirect file descriptor 1 to stderr in the `with` block, to keep the output of libraries out of the result."""
     sys.stdout.flush()
     stdout_copy = os.dup(1)
     os.dup2(2, 1)

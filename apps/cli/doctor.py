@@ -1,6 +1,6 @@
 """`trilane doctor`: the parts that this machine has, the missing parts, and the commands that install them.
 
-Rule: a part counts as working only after it has been tried here.
+Rule: shared memory, OpenGL and runtimes are tried here. A Python package counts as working if it is installed.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ EPILOG = "\b\nExamples:\n  trilane doctor\n  trilane doctor --json"
 class PartCheck:
     """The check of one part that a run uses.
 
-    `name`: name of the part. `found`: finding in words. `works`: whether the part was tried and works.
+    `name`: name of the part. `found`: finding in words. `works`: whether the part works; a package works if installed.
     `needed`: whether every run needs the part. `install`: command or advice that makes the part work; may be empty.
     """
 
@@ -117,7 +117,7 @@ def _dev_shm() -> PartCheck:
 
 
 def _wakeup() -> PartCheck:
-    """Check whether a run can keep idle cores awake. It is optional: a message to a sleeping core takes 50 us more."""
+    """Check whether a run can keep idle cores awake. Otherwise, a message to a sleeping core takes 50 us more."""
     from trilane.machine import AWAKE, LATENCY_FILE, awake
 
     install = f'apt-get install acl; setfacl -m "u:$USER:w" {LATENCY_FILE}'

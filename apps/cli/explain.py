@@ -409,7 +409,7 @@ def _image(image: ImageSize) -> str:
 def _modelled(rows: Sequence[ModelledAvatar]) -> str:
     """Return a text with a line for each level of detail among the avatars of a phase.
 
-    The line ends with the largest bound of the error, and the largest measured error, of these avatars, in pixels.
+    The line ends with the largest bound of these avatars' errors and the largest measured error, both in pixels.
     """
     lines = []
     for modelled in dict.fromkeys(_model(row) for row in rows):

@@ -248,7 +248,7 @@ def _show(read: Measurements) -> None:
 def _table(kind: str, measurements: Sequence[Measurement]) -> Table:
     """Return a table with a row for each of the `measurements`, without empty columns.
 
-    `kind`: kind of all these measurements, as title of the first column: run, wall or layer.
+    `kind`: kind of all these measurements: run, wall or layer. It is the title of the first column.
     """
     from rich.markup import escape
     from rich.table import Table

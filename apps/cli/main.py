@@ -49,7 +49,7 @@ COMMANDS = {
     "doctor": ("trilane.apps.cli.doctor", "Say what this machine has, what is missing and how to install it."),
 }
 
-FAILED, MISSING_PART, INTERRUPTED = 1, 3, 130  # Typer itself exits with 2 for wrong usage, and with 130
+FAILED, MISSING_PART, INTERRUPTED = 1, 3, 130  # Typer itself exits with 2 for wrong usage, and with 130 if interrupted
 
 #: Exceptions that libraries raise if they get no memory or no thread. They can have other causes.
 OF_MEMORY = (MemoryError, ImportError, RuntimeError)
@@ -183,7 +183,7 @@ def _is_of_stdout(error: OSError) -> bool:
 def _call(arguments: list[str]) -> None:
     """Run the command line `arguments`, and flush stdout when the command ends. Ends with the command's SystemExit.
 
-    Raises OSError if the flush fails, such as on a full disk. A pipe whose reader has left is no error.
+    Raises OSError if the flush fails, such as on a full disk. A pipe that its reader has closed is no error.
     """
     try:
         app(args=arguments, prog_name="trilane")

@@ -141,7 +141,7 @@ def _units(answer: Mapping[str, Any]) -> Table:
 
 
 def _what_ifs(answers: list[dict[str, Any]]) -> Table:
-    """Return a table with a row for the file as it is, and a row for each --set."""
+    """Return a table with a row for each --set. If the file has all times, the file itself has the first row."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -191,7 +191,7 @@ def _write_beside(
 ) -> None:
     """Simulate the pipelines `found` on the shared `chip`, and write their runs as one trace to the file `target`.
 
-    `options`: options of the prediction. `answer`: its document, from which the trace takes `machine` and `config`.
+    `options`: options of the prediction. `answer`: prediction, whose `machine` and `config` the trace gets.
     """
     from trilane.apps.explain.trace import write_predicted
     from trilane.hw_profiles.schema import corners_of
@@ -368,7 +368,7 @@ def _write_trace(
     """Simulate the run behind the predicted busy and idle shares again, and write its trace to the file `target`.
 
     `chip`: hardware profile. `plan`: application on the chip. `options`: options of the prediction.
-    `answer`: prediction, from which the trace takes `machine` and `config`.
+    `answer`: prediction, whose `machine` and `config` the trace gets.
     """
     from trilane.apps.explain.trace import write_predicted
     from trilane.hw_profiles.predict import predicted_run

@@ -189,7 +189,7 @@ def _next_command(result: ProfileFit | Calibrated, profile: Path, networks: Path
 
 
 def _beside(base: str, write: Path) -> str:
-    """Return the value of `extends` for the profile `base`: a name, or a path relative to the new file `write`."""
+    """Return the value of `extends` for the profile `base`: a name, or a path relative to the folder of `write`."""
     return os.path.relpath(base, write.absolute().parent) if base.endswith(".toml") else base
 
 

@@ -240,7 +240,7 @@ def _pace(pace: PaceComparison) -> str:
 
 
 def _check(check: Check) -> list[str]:
-    """Return a line with the image errors that `check` measured against the truth or, if unknown, the float path.
+    """Return a line with the image errors against the truth or, if the truth is unknown, against the float path.
 
     If `check` compared with both, a second line has the errors against the float path.
     """
@@ -266,7 +266,7 @@ def _caps(caps: Caps, temperature: Temperature) -> str:
 
 
 def accuracy_line(name: str, facts: Mapping[str, Any]) -> str:
-    """Return a line with the image error of an avatar and the error's source. If the error is unknown, say why.
+    """Return a line with the image error of an avatar and the error's source, or the reason why the error is unknown.
 
     Older reports do not state the source of the error, which then counts as unknown. `name`: name of the avatar.
     `facts`: value for this avatar in the report's `accuracy`.

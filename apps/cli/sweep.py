@@ -45,7 +45,7 @@ ENDING = ".toml"
 SOME_FAILED, INTERRUPTED = 1, 130
 #: Column of the summary -> keys that lead to its figure in a trial's result.
 FIGURES = {"fps": ("fps",), "frame ms": ("frame_time_ms", "mean")}
-#: The same for columns that a sweep with `--check` has too.
+#: The same for the further columns of a sweep with `--check`.
 ERRORS = {"PSNR, dB": ("check", "psnr_db"), "worst": ("check", "worst_psnr_db"), "1st pct.": ("check", "p1_psnr_db")}
 
 
@@ -312,10 +312,7 @@ def _line(record: TrialRecord) -> str:
 
 
 def _disturbed(record: TrialRecord) -> str:
-    """Return a text that says how often a trial was repeated, and one reason why its result is still unsure.
-
-    The text is empty if the trial was not repeated and its result is sure.
-    """
+    """Return how often a trial was repeated, and one reason why its result is unsure; "" if neither applies."""
     times = record.repeated
     again = f"; done again {times} {'time' if times == 1 else 'times'}, as the machine was not quiet" if times else ""
     return again + "".join(f"; UNSURE: {reason}" for reason in record.unsure[:1])
@@ -326,7 +323,9 @@ def words_text(options: Mapping[str, Any]) -> str:
 
 
 def print_summary(ended: SweepSummary, definition: Definition, clock: str) -> None:
-    """Print a table with a row for each trial, a line of counts, and a line for each error of failed trials.
+    """Print a table with a row for each trial, a line of counts, and a line for each error.
+
+    If trials were repeated because the machine was not quiet, a line counts them.
 
     `definition`: definition of the sweep, with the axes. `clock`: clock of its trials.
     """
@@ -358,7 +357,7 @@ def print_summary(ended: SweepSummary, definition: Definition, clock: str) -> No
 def _answer(result: Mapping[str, Any]) -> Mapping[str, Any]:
     """Return the part of a trial's `result` that has the figures, such as `fps`.
 
-    This part is the whole result. For a prediction of a pipeline file, it is the last of the predicted variants.
+    For a prediction of a pipeline file, this part is the last predicted variant. Otherwise, it is the whole result.
     """
     pipelines = result.get("pipelines")
     last = pipelines[-1] if isinstance(pipelines, list) and pipelines else None

@@ -97,7 +97,7 @@ class SweptCommand:
             raise BadInputError(place, repr(value), f"a value that {' '.join(self.words)} takes", str(error)) from None
 
     def words_of(self, options: Options) -> tuple[str, ...]:
-        """Return the words of a command line that give the command these `options`, a mapping from names to values."""
+        """Return `options`, values by name, as the words of a command line."""
         words: list[str] = []
         for name, value in options.items():
             words += self._typed(self._named(name), value)

@@ -1,8 +1,8 @@
 """`trilane tune`: finds the fastest configuration of a grid within given limits, in few trials.
 
 Rule: this file reads options and shows results; `trilane.apps.sweep.tuner` searches. A search has the same folder,
-trials and engines as a sweep. With the engine `local`, predictions for a chip are computed in this
-process. Every other trial has its own process.
+trials and engines as a sweep. With the engine `local`, predictions for a chip are computed in this process. Every
+other trial has its own process.
 """
 
 from __future__ import annotations
@@ -283,7 +283,7 @@ def _called(words: list[str]) -> tuple[int, str, str]:
 
 
 def _print_answer(found: Answer, keeps: Sequence[str], axes: Sequence[str]) -> None:
-    """Print the best configuration, or else the nearest one, and its command.
+    """Print the best configuration and its command. If none keeps the limits, print the one nearest to the limits.
 
     `keeps`: limits as texts. `axes`: names of the axes.
     """

@@ -259,7 +259,7 @@ def heading(look: RunLook) -> str:
 
 
 def ending(look: RunLook) -> str:
-    """Return a sentence that says how a run has ended. `look`: first figures since the end of the run."""
+    """Return a sentence that says how a run has ended. `look`: look at the run after its end."""
     return f"run {look.name}: {ENDINGS[look.state]}"
 
 
@@ -409,7 +409,7 @@ def _percent(share: float) -> str:
 def _short_bound(figures: MomentFigures) -> str:
     """Return the unit that is the bound, and the cost of slowing this unit; "" if the bound is unknown.
 
-    Without a known cost, the text has the unit's share of the critical path.
+    If the cost is unknown, the text has the unit's share of the critical path.
     """
     if figures.bound is None:
         return ""
@@ -418,9 +418,9 @@ def _short_bound(figures: MomentFigures) -> str:
 
 
 def _short_error(figures: MomentFigures) -> str:
-    """Return a text with each avatar's lowest PSNR in dB over the bands of distances, or that the error is unknown.
+    """Return a text with each avatar's lowest PSNR over the bands of distances, in dB, from the avatar's validation.
 
-    The PSNR comes from the avatar's validation.
+    If no PSNR is known, the text says so.
     """
     known = {
         name: min(facts["psnr_db_by_band"].values())

@@ -16,7 +16,7 @@ from trilane.apps.run.verdict import Verdict
 from trilane.pipeline.run_metrics import Bound
 from trilane.units import NS_PER_S
 
-#: Upper bounds in seconds: dense for rates from 200 to 10 frames a second, sparse outside.
+#: Upper bounds of a histogram's bins in seconds: dense for rates from 200 to 10 frames a second, sparse outside.
 BOUNDS_S = (
     *(0.001, 0.002, 0.003, 0.004, 0.005, 0.006, 0.008),
     *(0.01, 0.0125, 0.015, 0.0175, 0.02, 0.025, 0.03, 0.035, 0.04, 0.05, 0.06, 0.075),
@@ -147,15 +147,15 @@ class MomentFigures:
     `t_ms`: time since the first step.
     `window_s`: length of the window, which ends at the moment; it equals `run_s` at the beginning of a run.
     `run_s`: length of the run until the moment.
-    `clock`: "host" or "virtual".
+    `clock`: "host" or "virtual"; "" if the journal does not say.
     `is_over`: whether the journal has the run's end.
     `state`: "goes on", "finished", "killed" if the process died and left a partial folder, or "removed" if the run
     folder is gone.
     `fps`: `run_fps` for a finished run; otherwise presented frames a second in the window.
     `run_fps`: presented frames a second, from the first presented frame to the last, as in report.json; None for fewer
     than two.
-    `frame_time_ms`, `latency_ms`: mean, p50, p90, p95, p99 and max of the times in the window, all exact. The key
-    `samples` has the number of these times.
+    `frame_time_ms`, `latency_ms`: mean, p50, p90, p95, p99 and max of the times in the window, all exact; 0 without
+    times. The key `samples` has the number of these times.
     `frames`: numbers of frames of the run, by what became of them.
     `units`, `stages`: figures by name, in the order of the pipeline.
     `temperature_c`: last temperatures by place. `duty`: last duties by unit, from 0 to 1.

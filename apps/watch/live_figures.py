@@ -1,9 +1,9 @@
 """Computes the figures of a run at any moment, from its growing journal.
 
-Rule: pure, with bounded memory. All times of the last `WINDOW_NS` are kept, so that their percentiles are exact. For
-the whole run, only sums and counts are kept. The time of a unit is divided as in the ledger (scheduler/ledger.py). Time
-in which a job was assigned, but neither ran nor was preempted, is overhead. `looks` yields the figures repeatedly until
-a live run ends, and once for a finished run.
+Rule: `LiveFigures` reads neither files nor clocks. All times of the last `WINDOW_NS` are kept, so that their
+percentiles are exact. For the whole run, only sums and counts are kept. The time of a unit is divided as in the ledger
+(scheduler/ledger.py). Time in which a job was assigned, but neither ran nor was preempted, is overhead. `looks` yields
+the figures repeatedly until a live run ends, and once for a finished run.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ MOST_NOTES = 5
 BYTES, LEAST = "bytes_", "least"  # prefix of a stage's metrics of bytes moved; the kind of the least bytes
 LEAST_KEY = f"stages.*.bytes.{LEAST}"
 TEMPERATURE, DUTY, MEMORY = "temperature_c.", "duty.", "memory_bytes."
-SENSOR = "sensor"  # place with this machine's measured temperature; those of other places are modelled
+SENSOR = "sensor"  # place with this machine's measured temperature; the temperatures of other places are modelled
 #: Keys that are measured in a run on the host clock, and computed on the virtual clock.
 OF_THE_RUN = (
     "fps",
@@ -141,8 +141,8 @@ class LiveFigures:
     def now(self, now_ns: int | None = None, state: RunState | None = None) -> MomentFigures:
         """Return the figures at a time of the run's clock.
 
-        `now_ns`: the time. If `now_ns` is None or earlier than the last record, the time of the last record is used.
-        Once the run is over, a later `now_ns` counts as the time of the run's last step.
+        `now_ns`: the time; None for `last_ns`. A time before `last_ns` counts as `last_ns`. A time after the step that
+        finished the run counts as the time of this step.
         `state`: state of the run, because the journal of a killed run does not show it; None to take the state from the
         journal.
         """
@@ -350,11 +350,11 @@ class _Span(NamedTuple):
 
 
 class _UnitTime:
-    """Where the time of one unit goes: sums over all time, and spans of the newest `window_ns`.
+    """Counts where the time of one unit goes: as sums over the run, and as spans of the newest `window_ns`.
 
     `begin_ns`: time at which the count begins.
     `window_ns`: length of the window.
-    `account`: account of the ledger that is charged at the begin.
+    `account`: account of the ledger that is charged from `begin_ns` on.
     """
 
     def __init__(self, begin_ns: int, window_ns: int, account: int = STARVED) -> None:
@@ -423,7 +423,7 @@ def _shares(sums: Mapping[str, int], total_ns: int) -> Shares:
 
 
 class _Work(NamedTuple):
-    """A job of a stage that has ended: its end, its service time, and its moved bytes by kind."""
+    """An ended job of a stage: time of its end, service time, and moved bytes by kind."""
 
     end_ns: int
     service_ns: int
@@ -433,7 +433,7 @@ class _Work(NamedTuple):
 class _StageBook:
     """The jobs of one stage.
 
-    `recent`: jobs that ended within `WINDOW_NS` before the end of the latest one, in the order of adding.
+    `recent`: jobs that ended at most `WINDOW_NS` before the last added job, in the order of adding.
     `bytes`: bytes that all jobs of the run moved, by kind.
     """
 

@@ -1,8 +1,9 @@
 """The metrics of a run: a table of name, unit, meaning, labels and values, written as OpenMetrics text.
 
 Rule: base units. No label names a frame, a job or a process number, so the number of rows does not grow with the run.
-Busy and idle shares cover the last `WINDOW_NS` (live_figures.py), all other gauges the moment. Histograms and counters
-cover the whole run. The metric `trilane_source` names the source of each metric. docs/metrics.md has the same table.
+Busy and idle shares cover the last `WINDOW_NS` (live_figures.py). All other gauges are values of the moment. Histograms
+and counters cover the whole run. The metric `trilane_source` names the source of each metric.
+docs/metrics.md has the same table.
 https://prometheus.io/docs/specs/om/open_metrics_spec/
 """
 
@@ -21,7 +22,7 @@ from trilane.apps.watch.followed_run import RunState
 from trilane.apps.watch.live_figures import LEAST, LEAST_KEY, WINDOW
 
 CONTENT_TYPE: Final[str] = CONTENT_TYPE_LATEST
-#: Values of the labels of a row, and its value.
+#: Values of a row's labels, and the row's value.
 Row = tuple[tuple[str, ...], float]
 
 
