@@ -1,8 +1,8 @@
 """Many runs, predictions and trials as one table: options, speed, error, and the source of each.
 
-Rule: figures are copied from documents, never measured or guessed. Beside every speed stands the error, or a note that
-the error is unknown. Page, CSV and Parquet have the same columns and numbers. The size of each file is checked before
-the file is read. An unreadable file is refused by name before anything is written.
+Rule: figures are copied from documents, never measured or guessed. Every speed has its image error beside it, or a note
+that the error is unknown. Page, CSV and Parquet have the same columns and numbers. The size of a file is checked before
+the file is read. A file that cannot be read is refused by name before anything is written.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from trilane.writing import write_atomically
 OF_RUN, OF_AVATAR = "errors of the runs themselves", "errors of the avatars' validations"
 #: Kinds of an interval of the frame time.
 BY_SCATTER, BY_MODEL = "95 %, scatter of the run's frames", f"{SHARE_TEXT}, of the model"
-#: Keys of a scene that do not change its content. Another bundle may be another network of the same person.
+#: Keys of a scene that do not change its content. Bundles are here because they may be networks of the same person.
 HOW_DRAWN = (
     *("size", "plan", "texture_filter", "error_budget_px", "error_budget_db", "most_side", "memory_mb"),
     *("avatars[0].bundle", "avatars[0].name"),
