@@ -163,8 +163,8 @@ def is_sweep(name: str) -> bool:
 def compare_sweeps(base: str, other: str) -> SweepComparison:
     """Compare two sweeps. `base`, `other`: their folders.
 
-    Raises BadInputError if the sweeps cannot be read, if no configuration has a repeat that is done in both, or if a
-    trial is no run and no prediction.
+    Raises BadInputError if a sweep cannot be read, or if a trial is no run and no prediction. Raises it also if no
+    configuration has a repeat that is done in both sweeps.
     """
     first, second = (_configurations(Path(name)) for name in (base, other))
     found: list[TrialPair] = []
@@ -214,7 +214,7 @@ def _pair(name: str, base: Side, other: Side) -> GatedPair:
 def _configurations(folder: Path) -> dict[str, dict[int, TrialRecord]]:
     """Return the trials of the sweep in `folder`, as {configuration: {number of the repeat: record of the trial}}.
 
-    A configuration is the command and the options as JSON text. The order is that in which the trials first ended.
+    A configuration is the command and the options as JSON text. Records are in the order in which trials first ended.
     Raises BadInputError for a trial without a command.
     """
     found: dict[str, dict[int, TrialRecord]] = {}
@@ -232,7 +232,7 @@ def _is_done(record: TrialRecord | None) -> bool:
 
 
 def _trial(sweep: str, record: TrialRecord) -> ComparedRun:
-    """Return the run of a trial, from its run folder or, if this has no report, from the result in its record.
+    """Return the run of a trial, from the report in its run folder or, without a report, from the result in its record.
 
     `sweep`: folder of the sweep. `record`: record of the trial.
     Raises BadInputError if the trial is no run and no prediction.

@@ -317,7 +317,7 @@ def _common(runs: Sequence[Series]) -> I64 | None:
 
 
 def _left_out(series: Series, reduce: Reduce, is_ratio: bool) -> F64:
-    """Return a statistic of all frames, then without each stretch of the frames in turn, (1 + `STRETCHES`,) float64.
+    """Return a statistic of all frames, then of the frames without each stretch in turn, (1 + `STRETCHES`,) float64.
 
     `series`: figure of each frame.
     `reduce`: function that computes the statistic.

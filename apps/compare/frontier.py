@@ -52,9 +52,8 @@ def frontier(entries: Sequence[Scored]) -> list[bool]:
     """Return for each entry whether it is on the frontier: no other entry of its group beats it.
 
     Entry A beats entry B in either of two cases. In the first case, the PSNR of A is larger by more than `SAME_DB`, and
-    its mean frame time is not larger. In the second case, the PSNR of A is not smaller by more than `SAME_DB`, and the
-    interval of its frame time ends before the interval of B begins. An entry without a frame time or a PSNR is not on
-    the frontier.
+    its mean frame time is not larger. In the second case, the PSNR of A is larger or at most `SAME_DB` smaller, and its
+    interval ends before the interval of B begins. An entry without a frame time or a PSNR is not on the frontier.
     """
     on = [False] * len(entries)
     for points in _groups(entries).values():

@@ -4,9 +4,9 @@ Rule: a pass needs proof. A limit is broken if a figure surely became worse, and
 A limit is kept if the whole interval lies within the limit, on a quiet machine. Otherwise, the outcome is unknown, and
 the gate states how many runs would decide, if more runs can decide.
 
-The limit `slower` judges three kinds of figures: the frame time, without the share of other programs; each stage's time
-and CPU time; each stage's counted instructions. Counts of instructions repeat to 0.1 %. The counts alone decide this
-limit if every stage has counts, no setting changed, and the frame time does not contradict the counts.
+The limit `slower` judges the frame time without the share of other programs, and the time, CPU time and counted
+instructions of each stage. Counts of instructions repeat to 0.1 %. The counts alone decide this limit if every stage
+has counts, no setting changed, and the frame time does not contradict the counts.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ from trilane.writing import write_atomically
 OF_RUN, OF_AVATAR = "errors of the runs themselves", "errors of the avatars' validations"
 #: Kinds of an interval of the frame time.
 BY_SCATTER, BY_MODEL = "95 %, scatter of the run's frames", f"{SHARE_TEXT}, of the model"
-#: Keys of a scene that do not change its content. Bundles are here because they may be networks of the same person.
+#: Keys of a scene that do not change its content. Another bundle may be another network of the same person.
 HOW_DRAWN = (
     *("size", "plan", "texture_filter", "error_budget_px", "error_budget_db", "most_side", "memory_mb"),
     *("avatars[0].bundle", "avatars[0].name"),

@@ -58,7 +58,7 @@ UNITS: Final = {
     INSTRUCTIONS: "",
     INSTRUCTION_TIME: NS,
 }
-#: Statistics of a summary whose uncertainty is about that of a mean.
+#: Statistics of a summary that are about as uncertain as a mean.
 LIKE_THE_MEAN: Final = ("mean", "p50")
 #: Standard deviations between runs of one kind (docs/decisions/comparing-runs.md): for the logarithm of a stage's
 #: typical time on its core, the logarithm of other times, a share, and the logarithm of counted instructions.
@@ -336,8 +336,8 @@ class Noise(NamedTuple):
     [2] Kalibera and Jones, "Rigorous benchmarking in reasonable time", ISMM 2013.
 
     `is_real`: whether a run was on the host clock.
-    `others`: three changes that different shares of other programs explain: of times on the clock and of a stage's time
-    on its core, both as logarithms, and of shares of the time.
+    `others`: changes that different shares of other programs explain: of times on the clock, of a stage's time on its
+    core, of shares of time. The first two are logarithms.
     `slower`: change that the speed of a stage's cores explains, by stage, as a logarithm.
     `held`: stages whose jobs have a set length in all runs.
     """

@@ -100,7 +100,7 @@ class ComparedUnit(Record, extra="ignore", allow_inf_nan=False):
 class ComparedFigures(Record, extra="ignore", allow_inf_nan=False):
     """What a comparison reads of a report, a prediction or imported times, besides the settings.
 
-    `deviation`: standard error of each imported time, as a share of the time; None if unknown, and for other documents.
+    `deviation`: for imported times, the standard error of every figure, as a share of the figure; None if unknown.
     """
 
     clock: str
@@ -200,7 +200,7 @@ def read_told(name: str) -> ComparedRun:
     """Read a run, report, prediction or imported times.
 
     `name`: path of a file or run folder, or name of a run as `trilane watch` accepts it.
-    Raises BadInputError for a name that leads to no data, and for data that are broken or cannot be compared.
+    Raises BadInputError for a name that leads to no run or file, and for content that is broken or cannot be compared.
     """
     try:
         path = folder_of(Path(name)) or Path(name)
@@ -448,8 +448,8 @@ def imported(document: Mapping[str, Any], path: Path) -> dict[str, Any]:
 
     `document`: content of the file with imported times.
     `path`: path of the file.
-    Raises BadInputError for a key with a wrong value, for a file without a time, for times of several files, and for a
-    name that occurs twice.
+    Raises BadInputError for a wrong value, for no time at all, for times of several files, and for a name that occurs
+    twice.
     """
     rows = [_imported_time(row, f"{path}: {MEASUREMENTS}.{place}") for place, row in enumerate(document[MEASUREMENTS])]
     rows = [row for row in rows if row.ms >= SHORTEST_MS]
@@ -487,7 +487,7 @@ def _imported_time(row: Any, where: str) -> ImportedTime:
 
 
 def _told_apart(rows: Sequence[ImportedTime]) -> list[ImportedTime]:
-    """Return `rows` with the kind added to each name that several of them have."""
+    """Return `rows`, with the kind added to each name that several rows have."""
     counts = Counter(row.name for row in rows)
     longer = [row.model_copy(update={"name": f"{row.name} ({row.kind})"}) for row in rows]
     return [long if counts[row.name] > 1 else row for row, long in zip(rows, longer, strict=True)]

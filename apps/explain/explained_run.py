@@ -90,8 +90,7 @@ class ExplainedRun:
     `remark`: sentence on a journal that ends before the run; empty for a whole journal.
     `messages`: messages of the run. `frames`: number of presented frames.
     `frame_ms`: mean frame time; None for fewer than two frames.
-    `left`: numbers of dropped and lost frames, by kind, then by cause.
-    `figures`: `bottleneck`, `bound` and efficiencies, as in a report.
+    `left`: numbers of dropped and lost frames by kind and cause. `figures`: `bottleneck`, `bound` and efficiencies.
     `cores`: use of the cores; None if the mean frame time, the efficiency or a unit's cores are unknown.
     `budget`: parts of the critical path, the largest first.
     `taken`: for each stage whose jobs lacked a core, the time without a core, and which stages had the core.

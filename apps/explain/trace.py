@@ -96,10 +96,7 @@ class RunTracks:
                 self._end_ns = record.now_ns
 
     def close(self) -> None:
-        """Write the last idle slices, the slices that still wait, and the last counters.
-
-        End the slice of the whole run.
-        """
+        """Write the last idle slices, the slices that still wait, and the last counters. End the run's own slice."""
         for piece in self._timeline.end():
             self._units.idle(piece)
         self._units.close()

@@ -23,7 +23,7 @@ from trilane.errors import BadInputError, MissingPartError, did_you_mean
 
 #: Number of random proposals before the search learns from results.
 DRAWN_FIRST = 10
-#: After so many known proposals in a row, the search takes an untried configuration itself.
+#: After so many repeated proposals in a row, the search itself chooses an untried configuration.
 MOST_KNOWN = 3
 #: Number of finished trials before a short run may end a trial.
 RUNS_BEFORE_PRUNING = 4
