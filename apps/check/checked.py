@@ -56,7 +56,7 @@ class CheckedFile:
     `name`: file or scene, as it was named. `types`: types of the ports.
     `prices`: time of each stage, by name; a stage without a known time is absent.
     `bound`: lower bound on the period; None if the time of a stage is not known.
-    `rules`, `memory`: rule and bytes of each stream's slots, by the stage that writes the stream; the bytes are None if
+    `rules`, `memory`: rule and bytes of each stream's slots, by the stage that writes the stream. The bytes are None if
     a type is not known.
     `past`: stages that a frame on the bypass skips. `imports`: factories in Python that a run imports.
     `notes`: sentences about a scene; None for a pipeline file.
@@ -131,7 +131,7 @@ class CheckedFile:
 
 
 def check_file(file: PipelineFile) -> CheckedFile:
-    """Check the networks and ports of a pipeline file. Raises BadInputError for the first fault in them."""
+    """Check the networks, ports and slots of a pipeline file. Raises BadInputError for the first fault in them."""
     types = port_types(file, read_networks(file))
     prices = {name: price for name in file.stages if (price := given_price(file, name)) is not None}
     rules = edge_rules(file)

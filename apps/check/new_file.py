@@ -108,7 +108,7 @@ def _free_name(stem: str, endings: Sequence[str], names: set[str]) -> str:
     """Return a free name for the stage of a network, and add the names of its branch to `names`.
 
     The name is `stem`, with a number if a name of the branch is taken. `stem`: name of the network file without ending.
-    `endings`: one text for each stage of the branch; the stage is called by the returned name and this text.
+    `endings`: for each stage of the branch, the text that follows the returned name in the stage's name.
     `names`: names that are taken.
     """
     head = re.sub(r"[^\w-]", "-", stem, flags=re.ASCII) or "network"

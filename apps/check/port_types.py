@@ -140,10 +140,9 @@ def _check_fixed(where: str, stage: OnnxStage, graph: onnx.GraphProto) -> None:
 
 
 def _check_output(file: PipelineFile, name: str, each: PortInput, outputs: list[str]) -> None:
-    """Raise BadInputError if an input of stage `name` reads a port, and the network has no output of this name.
+    """Raise BadInputError if an input of stage `name` reads an output that the network of another stage lacks.
 
-    `file`: pipeline file. `each`: input that reads from the stage of a network. `outputs`: names of the outputs of this
-    network.
+    `file`: pipeline file. `each`: the input. `outputs`: names of the network's outputs.
     """
     where = f"{file.path}: stages.{name}.in" + (f".{each.port}" if each.port else "")
     if each.from_port and each.from_port not in outputs:
@@ -157,7 +156,7 @@ def port_types(file: PipelineFile, networks: Mapping[str, GraphFile]) -> PortTyp
 
     `file`: pipeline file. `networks`: result of `read_networks`.
 
-    Raises BadInputError if a stage cannot read the type of a port that it reads.
+    Raises BadInputError if a stage cannot read a port of this type, or if a bypass lacks a port that its end reads.
     """
     found: PortTypes = {}
     for name, stage in file.stages.items():

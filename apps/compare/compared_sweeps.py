@@ -1,7 +1,8 @@
 """Compares two sweeps: the trials of each configuration with each other, and the change over all configurations.
 
-Rule: a pair has the same configuration on both sides. A configuration without finished trials on both sides is counted
-and named. A trial is compared by its run folder or, without a run folder, by the result in its line.
+Rule: a pair has the same configuration on both sides. Only a repeat that is done in both sweeps counts. Configurations
+without such a repeat are named. The report in a trial's run folder is compared. Without a report, the result in the
+trial's record is compared.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ METHOD: Final = (
 class TrialPair:
     """One configuration in both sweeps.
 
-    `sides`: figures of both sides; the name is the name of the first trial in the base.
+    `sides`: figures of both sides, under the id of the configuration's first trial in the base.
     `options`: options of the configuration, by name.
     `differs`: whether the frame times differ, by a test of all pairs together.
     """
@@ -87,9 +88,10 @@ class SweepComparison:
     """The comparison of the sweep `other` with the sweep `base`.
 
     `base`, `other`: folders of the sweeps, as the user gave them.
-    `pairs`: configurations with finished trials in both sweeps.
+    `pairs`: configurations with a repeat that is done in both sweeps.
     `over_all`: difference of the mean frame times over all pairs.
-    `left_out`: names of the configurations that are not compared, by reason: `not_done`, `base_alone`, `other_alone`.
+    `left_out`: ids of trials of configurations that are not compared. The keys are `not_done`, for configurations
+    without a repeat that is done in both sweeps, and `base_alone` and `other_alone`, for those in only one sweep.
     `changes`: changes of settings and machine that all pairs have.
     `notes`: facts that make the comparison less sure.
     """
@@ -119,7 +121,7 @@ class SweepComparison:
 
     @property
     def bound(self) -> str:
-        """The number of runs that each unit bounded, for each sweep, in words; "" if no run names a bound."""
+        """For each sweep, how many runs each unit bounded, in words; "" if no run names a bound."""
         base = [bound for pair in self.pairs for bound in pair.bounds.base]
         other = [bound for pair in self.pairs for bound in pair.bounds.other]
         if not any((*base, *other)):
@@ -161,7 +163,8 @@ def is_sweep(name: str) -> bool:
 def compare_sweeps(base: str, other: str) -> SweepComparison:
     """Compare two sweeps. `base`, `other`: their folders.
 
-    Raises BadInputError if the sweeps have no finished trial of the same configuration, or if trials are not runs.
+    Raises BadInputError if a sweep cannot be read, or if a trial is no run and no prediction. Raises it also if no
+    configuration has a repeat that is done in both sweeps.
     """
     first, second = (_configurations(Path(name)) for name in (base, other))
     found: list[TrialPair] = []
@@ -211,7 +214,7 @@ def _pair(name: str, base: Side, other: Side) -> GatedPair:
 def _configurations(folder: Path) -> dict[str, dict[int, TrialRecord]]:
     """Return the trials of the sweep in `folder`, as {configuration: {number of the repeat: record of the trial}}.
 
-    A configuration is the command and the options as JSON text. The records are in the order in which the trials ended.
+    A configuration is the command and the options as JSON text. Records are in the order in which trials first ended.
     Raises BadInputError for a trial without a command.
     """
     found: dict[str, dict[int, TrialRecord]] = {}
@@ -229,10 +232,10 @@ def _is_done(record: TrialRecord | None) -> bool:
 
 
 def _trial(sweep: str, record: TrialRecord) -> ComparedRun:
-    """Read the trial with the record `record`, with every frame if its run folder exists.
+    """Return the run of a trial, from the report in its run folder or, without a report, from the result in its record.
 
-    `sweep`: folder of the sweep. `record`: line of the trial.
-    Raises BadInputError if the trial is not a run or a prediction.
+    `sweep`: folder of the sweep. `record`: record of the trial.
+    Raises BadInputError if the trial is no run and no prediction.
     """
     name, folder = record.id, record.folder or ""
     if folder not in ("", "..") and folder == Path(folder).name and _has_report(Path(sweep, folder)):

@@ -68,8 +68,8 @@ class Bounds(NamedTuple):
     """The bounds of the runs on both sides; None for a run with an unknown bound.
 
     `base`, `other`: bounds on each side, in the order of the runs.
-    `outcome`: finding whether the bounding unit changed. A change is certain only if no bound has rivals. If a report
-    lacks the key `rivals`, its bound is certain if the unit has more than half of the path.
+    `outcome`: finding whether the bounding unit changed. A change is certain only if each side has one bounding unit,
+    and no bound has rivals. If a report lacks the key `rivals`, the unit must surely have more than half of the path.
     """
 
     base: tuple[Bound | None, ...]
@@ -88,7 +88,7 @@ class Bounds(NamedTuple):
         return Finding.DIFFERS if len(base) == len(other) == 1 and is_sure else Finding.UNKNOWN
 
     def as_json(self) -> dict[str, Any]:
-        """Return the key `bound` for an entry of `comparisons` in the JSON or, for two sweeps, of `trials`."""
+        """Return the value of `bound` in an entry of `comparisons` in the JSON or, for two sweeps, of `trials`."""
         sides = {name: [bound and bound.as_json() for bound in side] for name, side in self._asdict().items()}
         return {**sides, "outcome": str(self.outcome)}
 
@@ -107,9 +107,9 @@ class Comparison:
     """The comparison of the side `other` with the side `base`.
 
     `rows`: difference of each figure.
-    `differing`: figures that differ significantly, corrected for testing all figures at once.
+    `differing`: figures that differ significantly, by tests of many figures together.
     `changes`: settings and facts of the machine that changed.
-    `verdict`: as `verdict` returns it.
+    `verdict`: verdict in words, as the function `verdict` returns it.
     `bounds`: bounds of the runs on both sides.
     `notes`: remarks for the user.
     """
@@ -431,10 +431,10 @@ def _between(row: Difference, sign: int) -> str:
 
 
 def _amount(value: float, row: Difference, unit: str, sign: str = "") -> str:
-    """Return a part of a change as text with its unit: a ratio in percent, a share in percentage points.
+    """Return a change as text with its unit: a ratio in percent, a share in percentage points.
 
-    `value`: the part, in the unit of `row.change`.
-    `row`: difference to which the part belongs.
+    `value`: the change of `row`, or the opposite change.
+    `row`: difference with the change.
     `unit`: unit of the figure.
     `sign`: `+` to write a sign before positive numbers too, "" for a minus only.
     """

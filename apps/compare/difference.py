@@ -2,9 +2,8 @@
 
 Two things make runs of one kind differ by chance. First, frames scatter and drift within a run. A jackknife over
 stretches of frames measures this scatter [1]. Second, the state of the machine differs from run to run. Several runs on
-each side show this, and the deviations in `rows.py` count as further runs. A conjugate normal prior joins both, so
-Student's t applies [2, 3]. If a known cause explains a change of some size, a change up to that size does not count as
-a difference.
+each side show these differences, and the deviations in `rows.py` count as further runs. Both are joined as a conjugate
+normal prior and its data, so Student's t applies [2, 3]. A change that a known cause explains is no difference.
 
 [1] Künsch, Annals of Statistics 17 (1989).
 [2] Gelman et al., Bayesian Data Analysis, section 3.2.
@@ -75,7 +74,7 @@ class Chance(NamedTuple):
     In virtual time, runs do not differ, and the defaults hold.
     `relative`, `absolute`: two parts of the standard deviation of one run's figure. `relative` is a share of the
     figure, `absolute` is in its unit.
-    `freedom`: number of runs that would give equal knowledge.
+    `freedom`: degrees of freedom: the deviation counts as if it were the scatter of so many further runs.
     `explained`: largest change that a known cause explains, as a logarithm for a ratio, otherwise in the figure's unit.
     """
 
@@ -89,9 +88,9 @@ class Difference(NamedTuple):
     """How far a statistic has changed from the base to the other side.
 
     `base`, `other`: value of each side, over all frames; for several runs, their arithmetic mean.
-    `change`: change from `base` to `other`. If the runs show the same frames, it covers only the frames that all runs
-    have. If `is_ratio`, it is a share of the base. For several runs, it compares geometric means, so it may differ from
-    `other` / `base` - 1. Without `is_ratio`, it is in the statistic's unit.
+    `change`: change from `base` to `other`, as a share of the base if `is_ratio`, otherwise in the statistic's unit. If
+    the runs show the same frames, it covers only the frames that all runs have. A ratio of several runs compares
+    geometric means, so it may differ from `other` / `base` - 1.
     `low`, `high`: ends of the 95 % interval of `change`.
     `probability`: probability that runs of one kind differ by at least `change`.
     `is_ratio`: whether `change` is a share of the base.
@@ -169,7 +168,7 @@ def difference(
 ) -> Difference:
     """Return the change of a statistic between two sides, over the last `MOST_FRAMES` frames of each run.
 
-    If the runs show the same frames (see `ALIKE`), each frame is compared with itself. The differences between frames
+    If the runs show the same frames (see `ALIKE`), each frame is compared with itself. Differences between the frames
     of a scene are then no scatter. If a run has too few frames for the statistic, the uncertainty is unknown.
     `base`, `other`: series of the figure in each run of a side.
     `statistic`: key of `STATISTICS`.
@@ -223,8 +222,8 @@ def combined(pairs: Sequence[Difference]) -> Difference:
 
     `base` and `other` are arithmetic means. The change is the mean of the effects: for ratios, the geometric mean. The
     deviation of this mean follows from the pairs' deviations, as if the pairs were independent. If the scatter of the
-    pairs gives a larger deviation (Birge's ratio above 1), the larger deviation counts. If only some pairs are ratios,
-    the deviation is unknown.
+    pairs gives a larger deviation (Birge's ratio above 1), the larger deviation counts. The deviation is unknown if a
+    pair has none, or if only some pairs are ratios.
     """
     base, other = (sum(getattr(pair, side) for pair in pairs) / len(pairs) for side in ("base", "other"))
     is_ratio = all(pair.is_ratio for pair in pairs)
@@ -309,7 +308,7 @@ def _value(series: Series, reduce: Reduce) -> float:
 def _common(runs: Sequence[Series]) -> I64 | None:
     """Return the numbers of the frames that all `runs` have.
 
-    None is returned if these are less than the share `ALIKE` of the frames of the longest run.
+    The result is None if these are fewer than the share `ALIKE` of the frames of the longest run.
     """
     common = runs[0].frames
     for each in runs[1:]:
@@ -318,7 +317,7 @@ def _common(runs: Sequence[Series]) -> I64 | None:
 
 
 def _left_out(series: Series, reduce: Reduce, is_ratio: bool) -> F64:
-    """Return a statistic of all frames, then of all frames without each stretch in turn, (1 + `STRETCHES`,) float64.
+    """Return a statistic of all frames, then of the frames without each stretch in turn, (1 + `STRETCHES`,) float64.
 
     `series`: figure of each frame.
     `reduce`: function that computes the statistic.

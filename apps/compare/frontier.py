@@ -1,6 +1,7 @@
 """Finds the best entries: the frontier of frame time against PSNR, and its knee.
 
-Rule: pure. Only a sure difference counts: intervals decide for times, `SAME_DB` decides for pictures.
+Rule: this module reads and writes no file. Pictures differ if their PSNRs differ by more than `SAME_DB`. A time is
+surely shorter if its interval lies below the interval of the other time.
 """
 
 from __future__ import annotations
@@ -50,10 +51,9 @@ class _Point(NamedTuple):
 def frontier(entries: Sequence[Scored]) -> list[bool]:
     """Return for each entry whether it is on the frontier: no other entry of its group beats it.
 
-    An entry A beats an entry B in either of two cases. In the first case, A has a PSNR that is larger by more than
-    `SAME_DB`, and its mean frame time is not larger. In the second case, A has a PSNR that is larger, or smaller by at
-    most `SAME_DB`, and A is surely quicker. "Surely" means: the interval of A ends below the begin of the interval of
-    B. An entry without a frame time or a PSNR is not on the frontier.
+    Entry A beats entry B in either of two cases. In the first case, the PSNR of A is larger by more than `SAME_DB`, and
+    its mean frame time is not larger. In the second case, the PSNR of A is larger or at most `SAME_DB` smaller, and its
+    interval ends before the interval of B begins. An entry without a frame time or a PSNR is not on the frontier.
     """
     on = [False] * len(entries)
     for points in _groups(entries).values():
@@ -72,9 +72,9 @@ def frontier(entries: Sequence[Scored]) -> list[bool]:
 def knees(entries: Sequence[Scored]) -> dict[Hashable, int]:
     """Return the index of the entry at the knee, by group. Beyond a knee, more time improves pictures only a little.
 
-    Only points count that have a better picture than all quicker points, with both axes scaled to 0..1. The knee is the
-    point farthest above the straight line from the first point to the last. A group with fewer than `LEAST_OF_A_KNEE`
-    such points, or without a point above the line, has no knee.
+    Only points with a better picture than all quicker points count. Both axes are scaled to 0..1. The knee is the point
+    farthest above the straight line from the first point to the last. A group with fewer than `LEAST_OF_A_KNEE` such
+    points, or without a point above the line, has no knee.
     Satopaa et al., "Finding a Kneedle in a Haystack", 2011.
     """
     found = {}

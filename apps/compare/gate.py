@@ -4,9 +4,9 @@ Rule: a pass needs proof. A limit is broken if a figure surely became worse, and
 A limit is kept if the whole interval lies within the limit, on a quiet machine. Otherwise, the outcome is unknown, and
 the gate states how many runs would decide, if more runs can decide.
 
-Three kinds of figures are judged: the frame time, without the share of other programs; each stage's time and CPU time;
-each stage's counted instructions. Counts of instructions repeat to 0.1 %. The counts alone decide the limit `slower`
-under three conditions: every stage has counts, no setting changed, and the frame time does not contradict the counts.
+The limit `slower` judges the frame time without the share of other programs, and the time, CPU time and counted
+instructions of each stage. Counts of instructions repeat to 0.1 %. The counts alone decide this limit if every stage
+has counts, no setting changed, and the frame time does not contradict the counts.
 """
 
 from __future__ import annotations
@@ -38,12 +38,12 @@ from trilane.apps.compare.sides import Change, ComparedRun, Side
 from trilane.errors import BadInputError, did_you_mean
 from trilane.scheduler.stats import student_quantile, student_tails
 
-#: Largest number of runs on each side for which is computed whether they would decide.
+#: Largest number of runs on each side that `runs_needed` considers.
 MOST_RUNS: Final = 200
 PERCENT, DECIBELS = "%", "dB"
 #: A stage's CPU time and its time on the core count as equal if they differ by at most this share.
 SAME_TIME: Final = 0.05
-#: Measures that are judged with other programs' share taken out.
+#: Measures that are judged without the share of other programs.
 WALL: Final = (FRAME_TIME, LATENCY)
 MOST_SAID: Final = 4
 
@@ -288,10 +288,10 @@ def _weighed(gate: Gate, pair: GatedPair) -> Iterator[Weighed]:
 def _is_said(figure: Figure, row: Difference, work: Difference | None, metric: GateMetric, is_quiet: bool) -> bool:
     """Return whether `figure` adds nothing to `work`, so that the figure is not judged.
 
-    Service time adds nothing if it did not grow more than `work`; CPU time, if it is as long as `work`. If few jobs
-    take much longer, the typical time does not show it, but the mean service time does. On a machine that is not quiet,
-    other programs make few jobs longer. Service time is not judged there, and no limit is kept anyway. If the metric
-    does not judge `work`, every figure adds something.
+    Service time adds nothing if it did not grow more than `work`. CPU time adds nothing if it is as long as `work`. The
+    mean service time shows if a few jobs take much longer; the typical time does not. On a machine that is not quiet,
+    other programs may be the cause. Therefore service time is not judged there. If the metric does not judge `work`,
+    every figure adds something.
     `row`: difference of the figure.
     `work`: difference of the stage's typical time on its core; None if it is unknown.
     `metric`: metric with the limit.

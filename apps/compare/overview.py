@@ -1,8 +1,8 @@
 """Many runs, predictions and trials as one table: options, speed, error, and the source of each.
 
-Rule: figures are copied from documents, never measured or guessed. Beside every speed stands the error, or a note that
-the error is unknown. Page, CSV and Parquet have the same columns and numbers. The size of each file is checked before
-the file is read. An unreadable file is refused by name before anything is written.
+Rule: figures are copied from documents, never measured or guessed. Every speed has its image error beside it, or a note
+that the error is unknown. Page, CSV and Parquet have the same columns and numbers. The size of a file is checked before
+the file is read. A file that cannot be read is refused by name before anything is written.
 """
 
 from __future__ import annotations

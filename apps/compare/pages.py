@@ -1,8 +1,8 @@
 """The overview and the comparison, each as one self-contained HTML file that loads nothing. All text is escaped.
 
-The overview has a drawing, the table, and stills of the videos. The drawing shows the table's numbers. An unreadable
-video gives no still. No two things differ by colour alone. The only script of the page is a file of this folder, and
-the page's policy allows only this script, by its digest.
+The overview has a drawing, the table, and stills of the videos. The drawing shows the table's numbers. A video that
+cannot be read gives no still. No two things differ by colour alone. The page has one script, a file of this folder. The
+page's policy allows only this script, by its digest.
 
 The comparison runs no script. Each change is also drawn: a dot with its 95 % interval, on one scale for figures of the
 same kind.
@@ -166,7 +166,7 @@ def _cell(name: str, value: Any) -> str:
 
 
 def _stills(entries: Sequence[Entry]) -> Iterator[str]:
-    """Yield the section of stills: a left and a right still to select and compare, then all stills.
+    """Yield the section of stills: two stills side by side, which the reader selects, then all stills.
 
     Nothing is yielded if no entry has a readable video.
     """
@@ -317,7 +317,7 @@ def _grid(across: _Axis, up: _Axis) -> Iterator[str]:
 
 
 def _steps(dots: Sequence[Dot], across: _Axis, up: _Axis) -> Iterator[str]:
-    """Yield, for each group, its frontier as an SVG path with steps: the best PSNR up to each frame time.
+    """Yield the frontier of each group as an SVG path with steps: the best PSNR up to each frame time.
 
     `dots`: dots of all groups.
     `across`, `up`: axes of the frame time and of the PSNR.
@@ -459,7 +459,7 @@ def _scale_of(row: Difference, unit: str) -> tuple[bool, str]:
 def _scales(comparison: Comparison) -> dict[tuple[bool, str], float]:
     """Return the change at the right edge of the drawing, for each kind of change (`_scale_of`).
 
-    Every change fits in, and so do the intervals of figures that differ. Other intervals may be cut.
+    Every change and the intervals of figures that differ fit in. Other intervals may be cut.
     """
     scales: dict[tuple[bool, str], float] = {}
     for figure, row in comparison.rows.items():

@@ -59,26 +59,26 @@ UNITS: Final = {
     INSTRUCTIONS: "",
     INSTRUCTION_TIME: NS,
 }
-#: Statistics of a summary whose uncertainty is about that of a mean.
+#: Statistics of a summary that are about as uncertain as a mean.
 LIKE_THE_MEAN: Final = ("mean", "p50")
-#: Standard deviations between runs of one kind, as measured in docs/decisions/comparing-runs.md. For the logarithm of a
-#: stage's typical time on its core, of other times on the clock, and of counted instructions; for a share itself.
+#: Standard deviations between runs of one kind (docs/decisions/comparing-runs.md): for the logarithm of a stage's
+#: typical time on its core, the logarithm of other times, a share, and the logarithm of counted instructions.
 WORK_DEVIATION, WALL_DEVIATION, SHARE_DEVIATION, COUNT_DEVIATION = 0.042, 0.03, 0.015, 0.001
-#: Number of runs whose scatter gives equal knowledge.
+#: These deviations count as if they were the scatter of so many further runs.
 FREEDOM = 5
 #: Standard deviation of the logarithm of a held stage's time, assumed: a sleep may end a little late.
 HELD_DEVIATION = 0.002
-#: Change that other programs explain, per share of the cores that they had more on one side: in the logarithm of a
-#: stage's time on its core, and in a share of the time.
+#: Change that other programs explain if they had all cores on one side and none on the other: of the logarithm of a
+#: stage's time on its core, and of a share of the time. Smaller differences explain proportionally less.
 WORK_BESIDE_OTHERS, SHARE_BESIDE_OTHERS = 0.3, 0.5
-#: The least share of the cores that is taken as left to a run.
+#: A run is taken to have had at least this share of the cores.
 LEAST_LEFT = 0.01
-#: Deviation of a percentile as a multiple of the mean's: rare events decide it.
+#: Deviation of a percentile, as a multiple of the deviation of the mean: rare events decide a percentile.
 TAILS: Final = {"p90": 1.5, "p99": 4.0}
-WAIT_FLOOR_MS: Final = 0.05  # deviation of any wait: the time of a message varies by so much
+WAIT_FLOOR_MS: Final = 0.05  # least deviation of a wait: the time of a message varies by so much
 #: Settings that do not change the speed of a core.
 SAME_CORES: Final = ("policy", "edge", "made.", "config.pace_ns", "config.scene", "idle_cores")
-#: Begin of the keys of settings that hold the jobs of a stage to a time.
+#: Prefix of the settings' keys that give a stage's jobs a set length.
 PACE: Final = "config.pace_ns."
 Runs = Sequence[ComparedRun]
 
@@ -87,10 +87,9 @@ class Figure(NamedTuple):
     """The subject of one row of a comparison.
 
     `measure`: what is measured.
-    `of`: stage, unit, or avatar with the key of its accuracy. For lost and dropped frames, it is the cause; "" means
-    the whole run.
+    `of`: stage, unit, avatar with the key of its accuracy, or cause of lost or dropped frames; "" for the whole run.
     `cause`: cause of idle time, "" for other measures.
-    `statistic`: as in `MEASURES`.
+    `statistic`: as in `MEASURES`; for `check`, the key in the report; "" for an accuracy.
     `unit`: unit of the value, such as ms or share.
     """
 
@@ -115,10 +114,10 @@ def rows_of(base: Side, other: Side) -> Rows:
 
 
 def named(rows: Rows) -> list[Figure]:
-    """Return the figures that decide a verdict, without those that only explain it.
+    """Return the figures that decide a verdict, without the figures that only explain it.
 
     For a stage, the number of instructions and the time of one instruction decide. If instructions are not counted, the
-    stage's time on its core decides. If this time is unknown too, the service time decides.
+    stage's typical time on its core decides. If this time is unknown too, the mean service time decides.
     """
     counted, worked = ({figure.of for figure in rows if figure.measure == each} for each in (INSTRUCTION_TIME, WORK))
 
@@ -152,7 +151,7 @@ def _noise(base: Side, other: Side) -> Noise:
 
 
 def _shared(base: Side, other: Side) -> list[Key]:
-    """Return the keys of the series that all runs of both sides have; none if a run has no frames."""
+    """Return the keys of the series that all runs of both sides have; empty if a run has no frames."""
     first, *rest = [told.frames.series if told.frames else {} for side in (base, other) for told in side.runs]
     return [key for key in first if all(key in each for each in rest)]
 
@@ -210,11 +209,11 @@ def _of_summaries(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figur
 
 
 def _relative_variance(base: Side, other: Side) -> float | None:
-    """Return the variance of log(other / base), where `other` and `base` stand for the mean frame times of both sides.
+    """Return the variance of the logarithm of the ratio of the two sides' mean frame times, due to scatter within runs.
 
-    Only scatter within runs counts. The variance comes from the intervals in the documents. It is 0 for predictions of
-    one chip, because they share the model's error. A run in virtual time without an interval adds 0. None is returned
-    if any other document has no interval.
+    The variance comes from the intervals in the documents or, for imported times, from the standard errors. It is 0 for
+    predictions of one chip, because they share the model's error. A run in virtual time without an interval adds 0. The
+    result is None if any other document has no interval or standard error.
     """
     runs = [*base.runs, *other.runs]
     if all(told.kind == RunKind.PREDICTION and told.figures.machine == runs[0].figures.machine for told in runs):
@@ -294,8 +293,8 @@ def _of_errors(base: Side, other: Side) -> Iterator[tuple[Figure, Difference]]:
 def check_rows(base: Side, other: Side) -> Rows:
     """Return the differences of the float values under `check` of the reports, without scatter within a run.
 
-    The result is empty if a report lacks the key. It is also empty if the reports differ in integers, lists and texts
-    under the key, such as the checked frames.
+    The result is empty if a report lacks the key, or if integers, lists or texts under the key differ, such as the
+    checked frames.
     `base`, `other`: runs of each side.
     """
     sides = [[told.figures.check or {} for told in side.runs] for side in (base, other)]
@@ -327,7 +326,7 @@ def _numbers(name: str, value: Any) -> Iterator[tuple[str, float]]:
 
 
 class Noise(NamedTuple):
-    """The noise: how runs of one kind differ in addition to what their frames show.
+    """The noise: how much runs of one kind differ in addition to what their frames show.
 
     Times on the host clock depend on facts that a process cannot see [1, 2]. Examples are the place of its memory, the
     state of caches, other programs on its cores, and other machines on the same hardware. In virtual time, this noise
@@ -338,8 +337,8 @@ class Noise(NamedTuple):
     [2] Kalibera and Jones, "Rigorous benchmarking in reasonable time", ISMM 2013.
 
     `is_real`: whether a run was on the host clock.
-    `others`: three changes that different shares of other programs explain. The first is for times on the clock and the
-    second for a stage's time on its core, both as logarithms. The third is for shares of the time.
+    `others`: changes that different shares of other programs explain: of times on the clock, of a stage's time on its
+    core, of shares of time. The first two are logarithms.
     `slower`: change that the speed of a stage's cores explains, by stage, as a logarithm.
     `held`: stages whose jobs have a set length in all runs.
     """
@@ -357,7 +356,7 @@ class Noise(NamedTuple):
         return self._chance(TAILS.get(statistic, 1.0) * WALL_DEVIATION, explained=self.others[0])
 
     def of_wait(self, statistic: str) -> Chance:
-        """Return the `Chance` of a wait in ms, which may be almost 0. No change is explained.
+        """Return the `Chance` of a wait in ms, which may be almost 0. No known cause explains a change of it.
 
         `statistic`: as in `MEASURES`.
         """
@@ -379,7 +378,7 @@ class Noise(NamedTuple):
         return self._chance(tail * WORK_DEVIATION, explained=max(self.others[1], self.slower.get(stage, 0.0)))
 
     def of_count(self) -> Chance:
-        """Return the `Chance` of a stage's number of instructions. No change is explained."""
+        """Return the `Chance` of a stage's number of instructions. No known cause explains a change of it."""
         return self._chance(COUNT_DEVIATION)
 
     def _chance(self, relative: float, absolute: float = 0.0, explained: float = 0.0) -> Chance:
@@ -404,10 +403,10 @@ def noise_between(base: Runs, other: Runs, effects: Mapping[str, float]) -> Nois
 
 
 def relief_of(base: Side, other: Side) -> float:
-    """Return the largest change that other programs explain in the ratio of times, `other` to `base`, as a logarithm.
+    """Return by how much, at most, the ratio of times, `other` to `base`, would change without other programs.
 
-    The result is negative if other programs had more of the cores in `other`: without these programs, frames would take
-    less time there. It is 0 if a side has no run on the host clock.
+    The result is a logarithm. It is negative if other programs had more of the cores in `other`: frames would take less
+    time there without these programs. It is 0 if a side has no run on the host clock.
     `base`, `other`: runs of each side.
     """
     sides = [[told for told in side.runs if told.figures.clock == HOST_CLOCK] for side in (base, other)]
@@ -437,10 +436,9 @@ def _held(run: ComparedRun) -> frozenset[str]:
 def _slower_cores(base: ComparedRun, other: ComparedRun, effects: Mapping[str, float]) -> dict[str, float]:
     """Return, by stage, the change that the speed of the stage's cores explains, as a logarithm.
 
-    If all stages on the same cores changed in one direction, it is the smallest of their changes. Possible causes are
+    If all stages on the same cores changed in one direction, this is the smallest of their changes. Possible causes are
     the clock, the temperature, or another machine on the same hardware. For a single stage on its cores, and for
-    changes in both directions, it is 0. If a setting changed that may change the speed of the cores, the result is
-    empty.
+    changes in both directions, it is 0. The result is empty if a setting differs that may change the cores' speed.
     `base`, `other`: first run of each side.
     `effects`: as in `noise_between`.
     """

@@ -27,7 +27,7 @@ INSTRUCTIONS, INSTRUCTION_TIME, CPU = "instructions", "time of an instruction", 
 #: Metric of a stage in the journal -> measure of a series.
 REPORTED = {f"bytes_{name}": f"bytes {name.replace('_', ' ')}" for name in ("read", "written", "uploaded", "read_back")}
 REPORTED["instructions"] = INSTRUCTIONS
-#: Number of further frames that are kept, because they may be in flight when the first compared frame begins.
+#: Number of frames kept before the first compared frame: they may be in flight when that frame begins.
 IN_FLIGHT = 100
 
 
@@ -184,10 +184,9 @@ def _stage(name: str, jobs: Sequence[JobRecord]) -> dict[Key, Series]:
 def _unit(
     unit: str, jobs: Sequence[JobRecord], idle: Sequence[IdleSlice], frames: I64, end_ns: I64
 ) -> dict[Key, Series]:
-    """Return the busy time and the idle time by cause of a unit, as series over the presented frames without the first.
+    """Return the busy time of a unit, and its idle time by cause, as series over all presented frames but the first.
 
-    The series are shares: `values` are the times in the frame time of each frame, `weights` the frame times, both in
-    ms.
+    Each series is a share: `values` are the busy or idle times within the frame times, `weights` the frame times, ms.
     `unit`: name of the unit.
     `jobs`: jobs of the unit.
     `idle`: idle slices of all units.
@@ -214,11 +213,11 @@ def _unit(
 
 
 def _within(pieces: Sequence[tuple[int, int, Mapping[str, int]]], state: str, edges_ns: I64) -> F64:
-    """Return the time of `state` between neighbouring edges in ms, (n - 1,) float64.
+    """Return the time in `state` between each time in `edges_ns` and the next, in ms, (n - 1,) float64.
 
     The time of a state in a piece counts as spread evenly over the piece.
     `pieces`: begin, end, and time by state of each piece, all in ns.
-    `edges_ns`: (n,) edges, ascending.
+    `edges_ns`: (n,) times, ascending.
     """
     places, totals, total = [0.0], [0.0], 0
     for begin_ns, end_ns, states in pieces:

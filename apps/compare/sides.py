@@ -3,9 +3,9 @@
 Rule: an error names what cannot be compared. A run folder with a journal has every frame; a report alone, or a
 prediction, has summaries. A run that was killed has no report. Its journal gives the keys that a comparison reads.
 
-An imported time is compared with the imported time, or the stage of a run, that has the same name. If a file has
-exactly one wall time, this is used as the frame time. The state of the machine is not known. Therefore two imported
-times scatter like any two runs on the host clock.
+An imported time is compared with the imported time or the stage of the same name. If a file has exactly one wall time,
+this time is the frame time. The state of the machine is not known. Therefore two imported times count as differing by
+chance as much as any two runs on the host clock.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from trilane.units import HOST_CLOCK
 EXPECTED: Final = (
     "a run folder, its report.json, what `trilane predict --json` printed, or a JSON file with `measurements`"
 )
-#: Keys that a prediction of the application has and a report lacks.
+#: A document with all these keys is a prediction of the application.
 OF_A_PREDICTION: Final = ("expected_error", "network", "frame_time_ms", "units", "stages")
 #: Facts in the first record of a journal that a report has too.
 FACTS: Final = ("config", "machine", "made", "accuracy")
@@ -100,7 +100,7 @@ class ComparedUnit(Record, extra="ignore", allow_inf_nan=False):
 class ComparedFigures(Record, extra="ignore", allow_inf_nan=False):
     """What a comparison reads of a report, a prediction or imported times, besides the settings.
 
-    `deviation`: only of imported times: relative standard error of every figure; None if it is unknown.
+    `deviation`: for imported times, the standard error of every figure, as a share of the figure; None if unknown.
     """
 
     clock: str
@@ -132,7 +132,7 @@ class ComparedRun:
     `kind`: kind of its data.
     `figures`: figures of the run.
     `settings`: settings and facts of the machine, by dotted key, without keys that always differ.
-    `unknown`: names in `PARTS` whose values nobody knows.
+    `unknown`: names in `PARTS` whose values are not known.
     `trust`: whether the times can be trusted. Predictions and imported times are not judged.
     `frames`: frames from the journal; None for a run without a journal.
     `remark`: remark for the user on a run without a report, "" for a run with a report.
@@ -158,7 +158,7 @@ def compared_run(
 ) -> ComparedRun:
     """Return the run of a `document`, which is JSON with the keys of a report. Parameters: see `ComparedRun`.
 
-    Raises BadInputError for a document without the keys that a comparison reads.
+    Raises BadInputError if a key that a comparison reads is missing or wrong.
     """
     try:
         figures = ComparedFigures.model_validate(document)
@@ -207,7 +207,7 @@ def read_told(name: str) -> ComparedRun:
     """Read a run, report, prediction or imported times.
 
     `name`: path of a file or run folder, or name of a run as `trilane watch` accepts it.
-    Raises BadInputError for a file that is missing, cut off or of another schema.
+    Raises BadInputError for a name that leads to no run or file, and for content that is broken or cannot be compared.
     """
     try:
         path = folder_of(Path(name)) or Path(name)
@@ -277,10 +277,10 @@ def _document(path: Path) -> Mapping[str, Any]:
 
 
 def _journal_document(frames: RunFrames, path: Path) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Return those keys of a report that a comparison reads, from a run's journal alone, and the unknown `PARTS`.
+    """Return (keys of a report that a comparison reads, unknown names in `PARTS`) for a run without a report.
 
-    Settings come from the first record, and figures from the frames. If the run has ended, its last record gives all
-    other keys. Otherwise, only the bound and the efficiencies so far are known.
+    Settings come from the journal's first record, and figures from the frames. If the run has ended, the figures in the
+    last record replace these figures. Otherwise, the bound and the efficiencies so far are added.
     `frames`: frames of the journal.
     `path`: path of the journal.
     Raises BadInputError for facts of a wrong form.
@@ -318,7 +318,7 @@ def _journal_document(frames: RunFrames, path: Path) -> tuple[dict[str, Any], tu
 def _at_the_end(frames: RunFrames, path: Path) -> dict[str, Any]:
     """Return the figures of the whole run from the last record of a journal.
 
-    Without a last record, return only the bound and the efficiencies so far.
+    If the run has not ended, return only the bound and the efficiencies so far.
     `frames`: frames of the journal.
     `path`: path of the journal.
     Raises BadInputError for figures of a wrong form.
@@ -370,7 +370,7 @@ class Change(NamedTuple):
 
 
 def changes(base: ComparedRun, other: ComparedRun) -> list[Change]:
-    """Return the settings and facts of the machine that differ between two runs."""
+    """Return the settings and facts of the machine that differ between two runs, without parts unknown for a run."""
     first, second = base.settings, other.settings
     found = dict.fromkeys([*first, *second])
     known = [part for part in PARTS if part not in (*base.unknown, *other.unknown)]
@@ -409,7 +409,7 @@ EXPECTED_TIMES: Final = "imported times: JSON with `measurements`, each with `na
 WALL: Final = "wall"
 #: Name of the unknown unit of imported stages.
 UNIT: Final = "imported"
-#: Longest and shortest plausible time, ms: an hour, and a millionth of a nanosecond.
+#: Shortest plausible time, ms: a millionth of a nanosecond.
 SHORTEST_MS = 1e-12
 Ms = Annotated[float, Field(ge=0, le=LONGEST_MS)]
 
@@ -439,7 +439,7 @@ class ImportedTime(BaseModel):
 
     @property
     def ms(self) -> float:
-        """The mean or, without a mean, the median, in ms; 0 for a measurement in another unit, such as cycles."""
+        """The mean in ms or, without a mean, the median; 0 for a measurement in another unit, such as cycles."""
         return self.mean_ms or self.p50_ms or 0.0
 
     @property
@@ -455,8 +455,8 @@ def imported(document: Mapping[str, Any], path: Path) -> dict[str, Any]:
 
     `document`: content of the file with imported times.
     `path`: path of the file.
-    Raises BadInputError for a wrong key, for a file without a time, for times of several files, and for a name that
-    occurs twice.
+    Raises BadInputError for a wrong value, for no time at all, for times of several files, and for a name that occurs
+    twice.
     """
     rows = [_imported_time(row, f"{path}: {MEASUREMENTS}.{place}") for place, row in enumerate(document[MEASUREMENTS])]
     rows = [row for row in rows if row.ms >= SHORTEST_MS]
@@ -481,7 +481,7 @@ def imported(document: Mapping[str, Any], path: Path) -> dict[str, Any]:
         "machine": {},
         "frame_time_ms": _imported_statistics(frames) if frames else {},
         "latency_ms": {},
-        # Taken for every figure: the largest known standard error.
+        # The largest known standard error counts for every figure.
         "deviation": max((error for row in rows if (error := row.error) is not None), default=None),
     }
 
@@ -494,7 +494,7 @@ def _imported_time(row: Any, where: str) -> ImportedTime:
 
 
 def _told_apart(rows: Sequence[ImportedTime]) -> list[ImportedTime]:
-    """Return the measurements `rows`. If several have the same name, their kinds are added to their names."""
+    """Return `rows`, with the kind added to each name that several rows have."""
     counts = Counter(row.name for row in rows)
     longer = [row.model_copy(update={"name": f"{row.name} ({row.kind})"}) for row in rows]
     return [long if counts[row.name] > 1 else row for row, long in zip(rows, longer, strict=True)]

@@ -70,7 +70,11 @@ def open_journal(folder: Path) -> tuple[Begun, Iterator[Record]]:
 
 
 class CoreTime(NamedTuple):
-    """The use of a run's cores: their `numbers`, the CPU time of all jobs of a mean frame, and the time they had."""
+    """The use of a run's cores.
+
+    `numbers`: numbers of the cores. `cpu_ms`: CPU time of all jobs, for a mean frame. `had_ms`: mean frame time, times
+    the number of cores.
+    """
 
     numbers: list[int]
     cpu_ms: float
@@ -86,10 +90,11 @@ class ExplainedRun:
     `remark`: sentence on a journal that ends before the run; empty for a whole journal.
     `messages`: messages of the run. `frames`: number of presented frames.
     `frame_ms`: mean frame time; None for fewer than two frames.
-    `left`: numbers of dropped and lost frames, by cause. `figures`: `bottleneck`, `bound` and efficiencies of a report.
+    `left`: numbers of dropped and lost frames by kind and cause. `figures`: `bottleneck`, `bound` and efficiencies.
     `cores`: use of the cores; None if the mean frame time, the efficiency or a unit's cores are unknown.
-    `budget`: parts of the critical path, the largest first. `taken`: jobs without a core, by stage.
-    `unit_of`, `jobs`: unit and number of jobs of each stage.
+    `budget`: parts of the critical path, the largest first.
+    `taken`: for each stage whose jobs lacked a core, the time without a core, and which stages had the core.
+    `unit_of`, `jobs`: unit and number of jobs of each stage. `joins`: as `Joins.rows` returns them.
     `slowest`, `usual`: slowest frames, the slowest first, and medians over the run.
     """
 
@@ -348,7 +353,7 @@ def job_rows(folder: Path, figures: Sequence[str]) -> Iterator[tuple[Any, ...]]:
 
     A row has the values of COLUMNS, then the values of `figures`. If the job's stage lacks a metric, its value is None.
 
-    `figures`: names of metrics of the stages. Raises BadInputError as `open_journal` does.
+    `figures`: names of metrics, as from `figure_names`. Raises BadInputError as `open_journal` does.
     """
     values = [value for _, value in COLUMNS.values()]
     begun, records = open_journal(folder)
@@ -367,8 +372,8 @@ def check_ending(target: Path) -> None:
 def write_jobs(folder: Path, target: Path) -> int:
     """Write every job of the run in `folder` to `target`, a .csv or .parquet file, and return the number of jobs.
 
-    Raises BadInputError for a folder that is no run folder, and for a file that cannot be written. Raises
-    MissingPartError for .parquet if PyArrow is not installed.
+    Raises BadInputError as `open_journal` does, and for a file that cannot be written. Raises MissingPartError for
+    .parquet if PyArrow is not installed.
     """
     figures = figure_names(folder)
     write = _write_parquet if target.suffix.lower() == ".parquet" else _write_csv

@@ -48,7 +48,7 @@ class ShownFrame(NamedTuple):
     """A presented frame, and the frame that was presented before it.
 
     `now`, `before`: these two frames. `frame_ns`: time between their presentations. `parts_ns`: parts of this time.
-    `longest`: for each part, the job that has the longest piece of it.
+    `longest`: for each part, the job with the longest piece of this part.
     """
 
     now: Presented
@@ -187,7 +187,7 @@ def _median(values: Sequence[int]) -> float:
 def reasons(shown: ShownFrame, usual: Usual) -> list[Reason]:
     """Return why a frame took longer than the median, the most important reason first.
 
-    If the frame took hardly longer, return no reason. `shown`: the frame. `usual`: medians over the run.
+    If the frame hardly took longer, return no reason. `shown`: the frame. `usual`: medians over the run.
     """
     longer_ns = shown.frame_ns - usual.frame_ns
     found = [
@@ -204,7 +204,7 @@ def reasons(shown: ShownFrame, usual: Usual) -> list[Reason]:
 
 
 def notes(shown: ShownFrame) -> list[str]:
-    """Return, in words, the differences from the frame before: frames missing between the two, rung and bypass.
+    """Return, in words, how a frame differs from the frame before: rung, bypass, and frames missing between the two.
 
     `shown`: both frames.
     """

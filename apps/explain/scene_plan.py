@@ -1,9 +1,9 @@
 """The plan that a run makes for each frame of a scene: in words and figures, with costs and savings, and as a drawing.
 
 Rule: the run's own pose stage decides. `ScenePlan` measures how far a level of detail moves vertices on the picture,
-against the whole body in float64. Costs are computed, never measured, by the same model as `trilane predict`. In this
-model, joints count for each avatar in view, and vertices for the level of its mesh. Every figure says whether it is a
-bound, measured or computed.
+against the whole body in float64. Costs are computed, never measured, by the model of `trilane predict`. In this model,
+the cost of an avatar in view depends on its joints and on the vertices that its mesh level keeps. Every figure says
+whether it is a bound, measured or computed.
 
 The drawing shows the plan for a frame of each phase, not the painted frame. Its parts are the vertices of the bodies,
 the bodies' rectangles and the tensor's crop rectangles.
@@ -315,8 +315,8 @@ class PlanExplanation:
     units.
 
     `plan`: plan that decided the frames. `skinned_on`, `detail`: unit that skins, and how levels of detail are chosen.
-    `planned`, `fixed`: costs of all frames, by the plan and with tensors of the shape `FIXED`: sums, but of `frame_ms`
-    the mean.
+    `planned`, `fixed`: cost of all frames, by the plan and with tensors of the shape `FIXED`. Its `frame_ms` is a mean;
+    its other fields are sums. `placement`: as `CostModel.placement` returns it.
 
     Raises BadInputError for an unknown profile, and for cores that were chosen for another chip than this machine.
     """
@@ -415,7 +415,7 @@ class PlanExplanation:
 def _image(checked: Checked, is_limited: bool) -> ImageSize:
     """Return the size of planned tensors.
 
-    `is_limited`: whether `most_side` limits the tensor of a frame, so that its loss was not measured.
+    `is_limited`: whether `most_side` limits the tensor of any frame. The loss is then not known.
     """
     if not checked.config.scene.plans_tensor:
         return ImageSize(None, None, "the scene fixes the tensor's size")
@@ -437,7 +437,7 @@ def _total(costs: Sequence[FrameCost]) -> FrameCost:
 
 
 def _tolerance(config: RunConfig) -> str:
-    """Return the tolerance by which the tables in the manifests give sizes; empty if sizes do not follow tables."""
+    """Return, in words, the PSNR that a planned size may lose; "" if no tables in manifests give the sizes."""
     if not config.size_curves:
         return ""
     sharing = Counter(config.networks or [0] * len(config.avatar_dirs))
@@ -500,8 +500,8 @@ class FrameCost(NamedTuple):
 def least_frame_ms(chip: Profile, times: Mapping[tuple[str, UnitName], float]) -> float:
     """Return the least frame time of pipelined frames in ms: the time of the busiest core, or of the display if longer.
 
-    A unit without a core counts as a core of its own. `chip`: hardware profile. `times`: time of each stage's job in
-    ms, by (stage, unit).
+    A unit without a core counts as a core. `chip`: hardware profile. `times`: time of each stage's job, in ms, by
+    (stage, unit).
     """
     worker = workers_of(chip)
     busy = (sum(ms for (_, unit), ms in times.items() if worker[unit] == one) for one in set(worker.values()))

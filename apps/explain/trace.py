@@ -29,7 +29,7 @@ NAME: Final = "trace.pftrace"
 CHROME_NAME: Final = "trace.json"
 #: Ranks of tracks within the group of a run: a viewer shows them in this order.
 RUN_RANK, MESSAGE_RANK, FRAME_RANK, UNIT_RANK, SAMPLE_RANK = 0, 1, 2, 10, 1000
-#: How many numbers of arrows each run in a trace has: one for each of its frames.
+#: Numbers that each run in a trace has for its arrows; each frame takes one.
 FLOWS_PER_PIPELINE: Final = 1 << 40
 #: First part of a sampled value's name -> title, unit.
 SAMPLED: Final = {"temperature_c": ("temperature", "°C"), "duty": ("duty", ""), "memory_bytes": ("memory", "B")}
@@ -47,7 +47,7 @@ FIGURE_COUNTERS: Final = {
     "cache_misses": ("cache misses", ""),
 }
 WAITING: Final = "frames that wait"
-#: Slices of a track that may wait for an earlier slice. With more, the earlier slice is taken as missing.
+#: Largest number of slices of a track that wait for an earlier slice. If more wait, the earlier slice is missing.
 MOST_WAITING: Final = 256
 Item = TypeVar("Item")
 
@@ -96,10 +96,7 @@ class RunTracks:
                 self._end_ns = record.now_ns
 
     def close(self) -> None:
-        """Write the last idle slices, the slices that still wait, and the last counters.
-
-        End the slice of the whole run.
-        """
+        """Write the last idle slices, the slices that still wait, and the last counters. End the run's own slice."""
         for piece in self._timeline.end():
             self._units.idle(piece)
         self._units.close()
@@ -233,11 +230,12 @@ class _FrameTracks:
             self._sink.count(self._in_flight, at_ns, self._flying)
 
     def _expect(self, frame: int, release_ns: int, before_ns: int | None) -> int:
-        """Write the slice of time in which a frame is expected, and return its end in ns, when the frame is due.
+        """Write the slice in which a frame is expected, and return the time in ns at which the frame is due.
 
-        If nothing says when the frame is due, write nothing and return NEVER.
+        The slice ends at this time. If nothing says when the frame is due, write nothing and return NEVER.
 
-        `frame`: number of the frame. `release_ns`: time of its release. `before_ns`: as for `due_ns`.
+        `frame`: number of the frame. `release_ns`: time of its release. `before_ns`: time at which the frame before it
+        was presented; None if the time since then is no frame time.
         """
         until_ns = due_ns(self._settings.due_from_ns(release_ns), before_ns, self._target_ns)
         if until_ns != NEVER:
@@ -278,7 +276,7 @@ class _UnitTracks:
         self._figures: dict[tuple[str, str], float] = {}
 
     def start(self, at_ns: int) -> None:
-        """Begin the units' tracks at `at_ns`, where the time that the ledger accounts for begins."""
+        """Begin the units' tracks at `at_ns`, the begin of the time that the ledger accounts for."""
         for tiles in self._tiles.values():
             tiles.start(at_ns)
 
@@ -353,7 +351,7 @@ class Tiles(Generic[Item]):
     """Puts the slices of one track in order, without overlap.
 
     A unit always has a job or is idle. Therefore a slice can be written when earlier slices fill the time up to its
-    begin. If a slice begins within the written time, its begin is cut.
+    begin. A slice that begins within the written time is cut at its begin.
     """
 
     def __init__(self) -> None:

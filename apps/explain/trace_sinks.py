@@ -42,7 +42,7 @@ class FlowArrow(NamedTuple):
 class Sink(Protocol):
     """A writer of a trace file. Tracks have numbers, which its methods return and take.
 
-    `notes` of a slice or event are shown with it, by name.
+    A viewer shows the `notes` of a slice or event, by name.
     """
 
     def recurring(self, names: Iterable[str]) -> None:
@@ -74,7 +74,7 @@ class Sink(Protocol):
         """
 
     def begin(self, track: int, at_ns: int, name: str, notes: Notes = NO_NOTES) -> None:
-        """Begin a slice of the track at `at_ns`; a call of `end` ends the slice."""
+        """Begin the slice `name` of the track at `at_ns`; a call of `end` ends it."""
 
     def end(self, track: int, at_ns: int) -> None:
         """End the slice of the track that `begin` began."""
@@ -282,7 +282,7 @@ class ChromeSink:
         self._write(ph="M", pid=number, name="process_name", args={"name": name})
         return number
 
-    def track(self, name: str, parent: int, rank: int = 0) -> int:  # noqa: ARG002 - the order is that of the calls
+    def track(self, name: str, parent: int, rank: int = 0) -> int:  # noqa: ARG002 - tracks stand in the order of the calls
         number = self._child(name, parent)
         pid = self._process_of[number]
         self._write(ph="M", pid=pid, tid=number, name="thread_name", args={"name": self._names[number]})

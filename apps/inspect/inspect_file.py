@@ -279,7 +279,7 @@ def _are_numbers(words: list[str]) -> bool:
         return False
 
 
-#: Test of a text, and the kind of a text that passes; with an empty kind, the test returns the kind.
+#: Test of a text, and the kind of a text that passes. If this kind is empty, the test itself returns the kind.
 _TEXTS: tuple[tuple[Callable[[str], bool | str], str], ...] = (
     (_is_bvh, MOTION),
     (_json_kind, ""),

@@ -1,6 +1,6 @@
 """The description of one file as plain data for people and JSON, and its contact sheet.
 
-Rule: a file is usable if the other commands can read it. A problem is the error of their reader, in its words.
+Rule: a file is usable if the other commands can read it. Otherwise, its problem is the error that their reader raises.
 
 A contact sheet shows skeletons, a path or points. All skeletons of a row have the same scale, and so have all views of
 a path. Therefore lengths can be compared. Y is up. In the view from the front, a person who faces +Z looks at the
@@ -73,7 +73,7 @@ class Inspection:
     `advice`: command that uses the file, or remedy. `detected`: format and conventions that the reader detected.
     `length`: length of a recording; None for other files.
     `facts`: further facts, by name. `notes`: notes as a run prints them. `draw`: function that draws the contact sheet;
-    None for a file without a sheet. `problem`: reason why the file is not usable; empty for a usable file.
+    None for a file without a sheet. `problem`: why the file is not usable; empty for a usable file.
     """
 
     kind: str
@@ -250,8 +250,9 @@ def _path_tile(
 
     `path` (T, 2): points of the path, in metres. `name`: title of the tile. `side`: side of the tile in pixels.
     `extent`: metres that the tile shows along a side. `every` (N, 2): points whose bounding box is centred in the tile;
-    None for the points of `path`. `seen`: cameras to draw, None for no cameras: their places (K, 3), the corners of
-    their frustums (K, 4, 3), both in metres, and the axes of the view (2, 3).
+    None for the points of `path`.
+    `seen`: places (K, 3) of the cameras to draw, corners (K, 4, 3) of their frustums, both in metres, and axes (2, 3)
+    of the view; None without cameras.
     """
     room = path if every is None else every
     low, high = room.min(axis=0), room.max(axis=0)

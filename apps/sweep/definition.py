@@ -29,7 +29,7 @@ Options = Mapping[str, Value]
 ID_DIGITS = 16
 MOST_TRIALS = 100_000
 EXPECTED = "a sweep (docs/sweeps.md)"
-#: Key -> the type of its value, and a message's words for such a value.
+#: Key -> the type of its value, and how messages describe such a value.
 KEYS: dict[str, tuple[type, str]] = {
     "command": (str, "a command in quotes, such as 'run' or 'bench raster'"),
     "kind": (str, "grid, list or random"),

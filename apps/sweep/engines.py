@@ -1,4 +1,4 @@
-"""Engines of a sweep, which do one trial in a process, and many on this machine or on the machines of a Ray cluster.
+"""Engines of a sweep: they do its trials on this machine or on the machines of a Ray cluster.
 
 Rule: a trial whose process was ended from outside is lost and may be tried again. A trial that ended by itself is
 final. A machine does one trial of the host clock at a time, and trials of the virtual clock on all its cores. No
@@ -41,7 +41,7 @@ from trilane.stages.machine_facts import machine_facts
 PROGRAM = "trilane"
 #: Seconds from SIGTERM, which asks a trial to end, to SIGKILL.
 END_S = 10.0
-#: Times that a run is done again if the machine disturbed it.
+#: A run that the machine disturbed is repeated at most so many times.
 REPEATS = 2
 #: Exit codes of a process that was ended from outside: by an interrupt, or by a signal that a defect does not cause.
 ENDED_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT, -signal.SIGHUP, 130)
@@ -81,7 +81,6 @@ class Children:
     """
 
     def __init__(self, inherited: tuple[int, ...] = ()) -> None:
-        """Keep the parameter; no process runs yet."""
         self._inherited = inherited
         self._lock = threading.Lock()
         self._going: set[subprocess.Popen[bytes]] = set()
@@ -250,7 +249,7 @@ def _remove(own: Path) -> None:
 
 
 def at_once(clock: TrialClock) -> int:
-    """Return how many trials run at once on this machine: 1 for the host clock, 1 on each core for the virtual one."""
+    """Return how many trials run at once on this machine: 1 on the host clock, 1 per core on the virtual clock."""
     return 1 if clock is TrialClock.HOST else len(machine.here.cores())
 
 

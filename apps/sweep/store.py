@@ -29,7 +29,7 @@ from trilane.units import HOST_CLOCK
 from trilane.writing import WRITABLE, write_bytes
 
 SWEEP, TRIALS, LOCK = "sweep.json", "trials.jsonl", ".lock"
-#: Seconds for the trials of a killed sweep to end; they hold its lock until then.
+#: Seconds to wait for the trials of a killed sweep to end: they hold its lock until then.
 LOCK_S = 15.0
 MAX_TRIALS_BYTES = 256 << 20
 TRIES = 3
@@ -72,7 +72,7 @@ class TrialRecord(Record, extra="ignore", allow_inf_nan=False):
         return {key: document[key] for key in ROW}
 
 
-#: Does trials and yields their records as they end. If its generator is closed, trials that still run are ended.
+#: Function that does trials and yields their records as they end. Closing the generator ends the trials still running.
 Engine = Callable[[Sequence[Trial]], Generator[TrialRecord]]
 
 
@@ -186,7 +186,7 @@ class SweepSummary:
 class Store:
     """The folder of a sweep, open for the one process that runs the sweep; a context manager.
 
-    `folder`: absolute path of the folder. `done`: last records by the trial's name, from the folder and from `add`.
+    `folder`: absolute path of the folder. `done`: last record of each trial, by its name, including those just added.
     `lock`: file descriptor of the lock. A child process that inherits it holds the lock too, until its end.
 
     Entering makes the folder, or opens a folder with the same trials. Entering raises BadInputError if:
@@ -240,10 +240,7 @@ class Store:
         return SweepSummary(self.folder, found, sum(trial.id in before for trial in self._trials))
 
     def add(self, record: TrialRecord) -> None:
-        """Write a trial's record, and wait until the record is on the disk.
-
-        Raises BadInputError if it cannot be written.
-        """
+        """Write a trial's record, and wait until it is on the disk. Raises BadInputError if this fails."""
         document = record.model_dump(mode="json", by_alias=True)
         line = json.dumps(document, separators=(",", ":"), allow_nan=False).encode() + b"\n"
         try:

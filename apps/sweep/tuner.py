@@ -23,7 +23,7 @@ from trilane.errors import BadInputError, MissingPartError, did_you_mean
 
 #: Number of random proposals before the search learns from results.
 DRAWN_FIRST = 10
-#: After so many known proposals in a row, the search takes an untried configuration itself.
+#: After so many repeated proposals in a row, the search itself chooses an untried configuration.
 MOST_KNOWN = 3
 #: Number of finished trials before a short run may end a trial.
 RUNS_BEFORE_PRUNING = 4
@@ -33,9 +33,9 @@ MOST_WITHOUT_FIGURE = 3
 AT_LIMIT = 1e-9
 FRAMES = "frames"
 KEEP = re.compile(r"\s*([A-Za-z][\w.-]*)\s*(<=|>=|<|>)\s*([-+]?[\d.]+(?:e[-+]?\d+)?)\s*([A-Za-z]*)\s*", re.IGNORECASE)
-#: Function that does those trials that have not ended, and returns the records of all by name.
+#: Function that does the given trials that have not ended, and returns the records of all given trials, by name.
 Do = Callable[[Sequence[Trial]], Mapping[str, TrialRecord]]
-#: Figures that the frontier weighs beside those asked for, if every trial has them.
+#: Figures that the frontier compares in addition to the goals and limits, if every judged trial has them.
 WEIGHED = ("psnr", "power")
 
 
@@ -104,7 +104,7 @@ class Aim:
         return tuple(dict.fromkeys([*self.goals, *(keep.name for keep in self.keeps)]))
 
     def costs(self, figures: Mapping[str, float], names: Sequence[str]) -> tuple[float, ...]:
-        """Return the figures with the given `names`, in their order. A figure of which more is better is negated.
+        """Return the figures with the given `names`, in their order. If more is better, a figure is negated.
 
         Therefore less is always better in the result. `figures`: figures of a trial, by name.
         """
