@@ -164,8 +164,8 @@ def assemble(base: Bundle, parts: Parts, out: Path) -> dict[str, Any]:
     `parts`: files that replace files of `base`.
 
     Keys: `avatar`, `made_from`, `replaced`, `network`, `texture`, `accuracy`.
-    Raises BadInputError before anything is written: if no part is given, if a part does not fit, or if `out` exists and
-    is not an empty folder.
+    Before anything is written, raises BadInputError for no part, for a part that does not fit, and for an `out` that
+    exists and is no empty folder.
     """
     if not parts.files():
         raise BadInputError("avatar create", "no part", "--network, --texture or --body, at least one of them")

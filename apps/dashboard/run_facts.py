@@ -1,7 +1,7 @@
 """Facts about a run for the page that do not change during the run, and the controls of the page.
 
-Rule: nothing is guessed; an unknown fact is null or empty. Names are the same as in report.json. Only a `Control` states
-the valid values of a control.
+Rule: an unknown fact is null or empty, never guessed. Names are the same as in report.json. Only a `Control` states the
+valid values of a control.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 Rule: the body is the default avatar's, so the rows are the same everywhere. A reference sums in extended precision or
 float64. A bound counts the roundings of the computation, and never follows from a result.
 
-If a texture has constant channels, every covered pixel of a tensor is a known byte: q = clamp(round(x / scale) + zero
-point, 0, 255), rounded to even. The values x are FP16 numbers. Some quotients x / scale lie halfway between two whole
+If a texture has constant channels, every covered pixel of a tensor has known bytes. A byte is clamp(round(x / scale) +
+zero point, 0, 255), rounded to even. The values x are FP16 numbers. Some quotients x / scale lie halfway between two whole
 numbers. Their scale is a power of two, so every driver divides exactly. All other quotients are at least 0.1 away from
 such a half. This is more than the error of a driver's division (2.5 units in the last place, Vulkan 1.3 and OpenCL 3.0
 for float32).
@@ -375,8 +375,8 @@ def time_cases() -> Iterator[HardNumber]:
 
     Frame 5,000,000 must show the same as the same moment in the first period of the motion. The reference reduces the
     frame's time by the period in fractions, which are exact. The tested time t = frame / fps is rounded once, so it is
-    off by at most U t (U: unit roundoff of float64). Reducing t by the period is exact. The error of a shown value has
-    two parts: a few roundings, and the error of t multiplied by the value's largest change in a second.
+    off by at most U t (U: unit roundoff of float64). Reducing t by the period is exact. The error of a shown value is a
+    few roundings, and the error of t multiplied by the value's largest change in a second.
     """
     motion, camera = walk_wave_turn(), load_builtin("orbit", CameraSpec())
     assert camera is not None

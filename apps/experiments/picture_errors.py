@@ -4,9 +4,9 @@ Rule: a picture is (h,w,3) sRGB, as bytes or as real numbers in 0..1. A mask is 
 validations: windows of 7 x 7 pixels, mean over the colours. The weights of LPIPS come from a file that the user names.
 Only tensors are read from this file; none of its code runs.
 
-Sources: SSIM: Wang et al., "Image Quality Assessment", IEEE TIP 13 (2004); MS-SSIM: Wang, Simoncelli and Bovik,
-"Multiscale structural similarity", Asilomar 2003; FLIP: Andersson et al., HPG 2020, at 67 pixels a degree; LPIPS: Zhang
-et al., "Unreasonable Effectiveness", CVPR 2018, version 0.1.
+SSIM: Wang et al., "Image Quality Assessment", IEEE TIP 13 (2004). MS-SSIM: Wang, Simoncelli and Bovik, "Multiscale
+structural similarity", Asilomar 2003. FLIP: Andersson et al., HPG 2020, at 67 pixels a degree. LPIPS: Zhang et al.,
+"Unreasonable Effectiveness", CVPR 2018, version 0.1.
 """
 
 from __future__ import annotations

@@ -211,8 +211,8 @@ class UnitTime(Record):
 class PlacementFacts(Record):
     """The placement of the units, and how it was chosen (`trilane.stages.placing`).
 
-    `how`: what decided: `tried` for a trial with real frames, `measured` for predictions from measured times, `asked`
-    for the user's request, `rule` for the rule that needs no measurement.
+    `how`: what decided: `tried` (a trial with real frames), `measured` (predictions from measured times), `asked` (the
+    user) or `rule` (the rule that needs no measurement).
     `why`: reason in words.
     `units`: place of each unit, by name.
     `measured_at`: time of the measurement, UTC. This field and all fields below are absent if nothing was measured.

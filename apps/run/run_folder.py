@@ -53,9 +53,9 @@ class RunFolder:
 
     Without `complete`, the exit removes `work` and the parent folders that the entry made. RESERVED_BYTES on the disk
     stay reserved for the report until `release`.
-    The entry raises BadInputError if `target` exists, if another live run will get that path, if `work` cannot be made,
-    or if the disk has no room for a report. The entry raises UnwrittenError if a limit of this process forbids a file
-    of RESERVED_BYTES.
+    The entry raises BadInputError if `target` exists or another live run will get that path. It also does if `work`
+    cannot be made, or if the disk has no room for a report. The entry raises UnwrittenError if a limit of this process
+    forbids a file of RESERVED_BYTES.
     The exit raises TrilaneError if `work` was moved or removed, or if the block ends because a file could not be
     written. In the latter case, `work` stays if it has content.
     """
