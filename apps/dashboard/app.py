@@ -214,7 +214,7 @@ def server(app: DashboardApp) -> Any:
             super().send_400_response(msg)
 
         def handle_websocket_upgrade(self, event: Any) -> None:
-            if refusal_of_head(self.scope) is None:  # checked here: uvicorn then passes on any version as 1.1
+            if refusal_of_head(self.scope) is None:  # checked here: uvicorn passes on every version as 1.1
                 super().handle_websocket_upgrade(event)
             else:
                 self.send_400_response("refused: malformed")

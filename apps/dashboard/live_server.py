@@ -92,7 +92,7 @@ async def serve(listener: socket.socket, channel: ChannelEnd, window_fd: int) ->
     asyncio.get_running_loop().add_reader(channel.fd, _hear, channel, view, run_is_over)
     leaving = asyncio.create_task(_leave(run_is_over, app, answers))
     os.setpriority(os.PRIO_PROCESS, 0, NICE)  # only now, so that the imports were quick
-    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # a process that wakes up takes no core from a unit
+    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # so that its wake-ups take no core from a unit
     await answers.serve(sockets=[listener])
     leaving.cancel()
 

@@ -4,10 +4,10 @@ Rule: the body is the default avatar's, so the rows are the same everywhere. A r
 float64. A bound counts the roundings of the computation, and never follows from a result.
 
 If a texture has constant channels, every covered pixel of a tensor has known bytes. A byte is clamp(round(x / scale) +
-zero point, 0, 255), rounded to even. The values x are FP16 numbers. Some quotients x / scale lie halfway between two whole
-numbers. Their scale is a power of two, so every driver divides exactly. All other quotients are at least 0.1 away from
-such a half. This is more than the error of a driver's division (2.5 units in the last place, Vulkan 1.3 and OpenCL 3.0
-for float32).
+zero point, 0, 255), rounded to even. The values x are FP16 numbers. Some quotients x / scale lie halfway between two
+whole numbers. Their scale is a power of two, so every driver divides exactly. All other quotients are at least 0.1 away
+from such a half. This is more than the error of a driver's division (2.5 units in the last place, Vulkan 1.3 and OpenCL
+3.0 for float32).
 
 The tensor of a scene's frame must be the same to the byte, no matter which frames were drawn before. The reference
 comes from stages that have drawn no other frame.

@@ -34,7 +34,7 @@ LEAST_MS_SSIM_PX = WINDOW_PX * 2 ** (len(SCALES) - 1)
 LEAST_SSIM_PX = 7
 #: Constants of SSIM for values in 0..1. They prevent 0 / 0.
 C1, C2 = 0.01**2, 0.03**2
-#: Function, such as an `Lpips`, of a picture and its reference, real numbers in 0..1, that returns their LPIPS.
+#: Function that takes a picture and its reference, real numbers in 0..1, and returns their LPIPS; an `Lpips` is one.
 Perceived = Callable[[F64, F64], float | None]
 LPIPS_FILE = "a file of all weights of lpips.LPIPS(net='alex')"
 LPIPS_REMEDY = "torch.save(lpips.LPIPS().state_dict(), FILE) writes one"
