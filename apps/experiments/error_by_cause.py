@@ -3,9 +3,8 @@
 Rule: causes are counted in two ways, and each way states its remainder. Alone: each cause is switched on in the
 reference, with only the causes that it needs. The errors need not sum to the whole error. In order: causes are switched
 on one after the other, so the picture changes in steps from the reference to the run's picture. Three figures of the
-steps each sum to the whole error, up to float64's rounding. They are the change of the MAE, the change of the mean
-square, and the product of the step's difference with the whole difference. All figures cover the region with the
-avatars.
+steps each sum to the whole error, up to float64's rounding: the change of the MAE, the change of the mean square, and
+the product of the step's difference with the whole difference. All figures cover the region with the avatars.
 """
 
 from __future__ import annotations

@@ -6,8 +6,7 @@ float64. A bound counts the roundings of the computation, and never follows from
 If a texture has constant channels, every covered pixel of a tensor has known bytes. A byte is clamp(round(x / scale) +
 zero point, 0, 255), rounded to even. The values x are FP16 numbers. Some quotients x / scale lie halfway between two
 whole numbers. Their scale is a power of two, so every driver divides exactly. All other quotients are at least 0.1 away
-from such a half. This is more than the error of a driver's division (2.5 units in the last place, Vulkan 1.3 and OpenCL
-3.0 for float32).
+from such a half. A driver's division is more exact (2.5 units in the last place, Vulkan 1.3, OpenCL 3.0 for float32).
 
 The tensor of a scene's frame must be the same to the byte, no matter which frames were drawn before. The reference
 comes from stages that have drawn no other frame.

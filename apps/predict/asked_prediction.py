@@ -1,9 +1,8 @@
 """Predictions from options to an answer, for the command line and for programs alike.
 
 Rule: this module neither prints nor computes. `trilane.hw_profiles` computes the answers. If the chip is this machine,
-the answers rest on measurements of `this_machine.py`. In all functions, `chip` is the hardware profile of the chip, and
-`options` are the options of the prediction. `say` is a function that gets a message before an action that takes
-seconds.
+the answers rest on measurements by `this_machine.py`. In all functions, `chip` is the chip's hardware profile,
+`options` are the options of the prediction, and the function `say` gets a message before an action that takes seconds.
 """
 
 from __future__ import annotations

@@ -1,5 +1,4 @@
-// The page. Rule: each message goes to the panels that show it. One loop draws what has changed, once for each picture
-// of the browser.
+// The page. Rule: each message goes to the panels that show it. One loop draws what has changed, once a browser frame.
 
 import { Chart } from "./charts.js";
 import { Connection, withToken } from "./connection.js";
