@@ -1,7 +1,7 @@
-"""An avatar's files: facts about them, a new avatar with replaced files, and a variant of an avatar for a run.
+"""Reports facts about an avatar's files, makes a new avatar with replaced files, and makes a variant for a run.
 
 Rule: every fact about an avatar comes from its own files or its manifest. When a file is replaced, the new manifest
-omits the figures and words about the old file. The validation stays only if none of the validated files has changed.
+omits what the old manifest said about the old file. The validation stays only if no validated file has changed.
 
 `remade_avatar` makes a variant with another calibration, width or number of channels of the network. A new calibration
 quantises the avatar's own float network, so the pictures of the variant are valid. A network of another width or number
@@ -54,9 +54,9 @@ from trilane.units import CALIBRATION_METHOD, CHANNELS, either
 if TYPE_CHECKING:
     from trilane.training.quantising.quantise import Quantised
 
-#: Encoder and norm in the manifest if the operators of a new network differ from the operators of the replaced network.
+#: Encoder and norm in the manifest if the operators of a new network differ from those in the replaced network.
 OTHER = "other"
-#: Scale of a network's output. The picture is the output bytes as they are: alpha and colour in 0..1, zero point 0.
+#: Scale of a network's output, with zero point 0: the bytes of the picture represent alpha and colour in 0..1.
 PICTURE_SCALE = 1 / 255
 MAX_WIDTH = 256
 NAME_LENGTH = 100
@@ -164,8 +164,8 @@ def assemble(base: Bundle, parts: Parts, out: Path) -> dict[str, Any]:
     `parts`: files that replace files of `base`.
 
     Keys: `avatar`, `made_from`, `replaced`, `network`, `texture`, `accuracy`.
-    Raises BadInputError before anything is written: if no part is given, if a part does not fit, or if `out` exists and
-    is not an empty folder.
+    Before anything is written, raises BadInputError for no part, for a part that does not fit, and for an `out` that
+    exists and is no empty folder.
     """
     if not parts.files():
         raise BadInputError("avatar create", "no part", "--network, --texture or --body, at least one of them")
@@ -317,7 +317,7 @@ def _clipped(texture: NDArray[np.float32], network: NetworkFile) -> float:
 
 #: Seed of an untrained network's weights.
 SEED = 0
-#: Part of a cached variant's digest. Raise it when this file would make other files from the same inputs.
+#: Part of a cached variant's digest. Raise it if a change of this module changes the files of a variant.
 VERSION = 2
 
 
@@ -401,7 +401,7 @@ def _alone(lock: Path) -> Iterator[None]:
     Raises BadInputError if the file cannot be opened.
     """
     try:
-        file = lock.open("w+")  # "w" alone would wait on a pipe
+        file = lock.open("w+")  # if the path is a named pipe, "w" alone would wait for a reader
     except OSError as error:
         raise BadInputError.of_os_error(lock, error, "a cache that can be written") from error
     with file:

@@ -1,4 +1,4 @@
-"""Results of `trilane times`: a document, a CSV of samples, a pipeline file with a measured time, a row for a fit.
+"""Makes the results of `trilane times`: a document, a CSV, a pipeline file with a measured time, or a row for a fit.
 
     reads = [read_measurements(path) for path in paths]
     document(reads)
@@ -95,8 +95,8 @@ def stage_text(path: Path, stage: str, read: Measurements, measurement: Measurem
     All else in the file stays, including comments. The stage may have no time in the old file, because only the new
     text is checked.
     `read`: measurements of the file that contains `measurement`.
-    Raises BadInputError for an unknown stage, too many samples or a wrong pipeline file. Raises MissingPartError
-    without tomlkit.
+    Raises BadInputError for an unknown stage, too many samples or a wrong pipeline file, MissingPartError without
+    tomlkit.
     """
     try:
         import tomlkit
@@ -119,8 +119,8 @@ def stage_text(path: Path, stage: str, read: Measurements, measurement: Measurem
 def _as_toml(path: Path, read: Measurements, measurement: Measurement) -> Any:
     """Return `measurement` as an inline table for `time_ms`. Raises BadInputError for too many samples.
 
-    If the measured file lies in the folder of the pipeline file `path`, the table names the measured file. Otherwise,
-    the table contains the samples. If there are no samples either, it contains the mean and the standard deviation.
+    If the measured file is in the folder of the pipeline file `path` or below, the table names the measured file.
+    Otherwise, the table contains the samples or, without samples, the mean and a known standard deviation.
     """
     import tomlkit
 
@@ -154,8 +154,8 @@ def with_row(
     and whether each value comes from the measured file or is assumed. The file `path` need not exist.
     `read`: measurements of the file that contains `measurement`.
     `network`: path of the network, relative to the folder of the table.
-    `asked`: value for each column in OPTION_OF. None means the value in the measured file or, if the file has no such
-    value, the fit's default.
+    `asked`: value for each column in OPTION_OF. For None, the column `unit` gets the unit that the measured file names.
+    Without such a unit, and in other columns, None means the fit's default.
     Raises BadInputError for the time of a layer, for a table with other columns, for a missing network and for an
     unknown value.
     """

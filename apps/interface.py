@@ -104,7 +104,7 @@ class Run:
 
     @cached_property
     def events(self) -> list[tuple[int, Event]]:
-        """The events that the scheduler received, in order, as pairs: time in ns, event of `trilane.scheduler.events`.
+        """The events that the scheduler received, in order, each as (time in ns, event of `trilane.scheduler.events`).
 
         Raises BadInputError for a missing or broken journal.
         """
@@ -192,14 +192,14 @@ def run(
 
     `scene`: a scene file, the name of a bundled scene, or a pipeline file.
     `options`: fields of `trilane.stages.run_options.RunOptions`; `trilane run --help` explains them. None means the
-    scene's own value. `cores` may be a mapping, such as {"dsp": [0, 1]}. A `sequential` run for comparison follows only
-    if `baseline_frames` is above 0.
+    scene's own value. `cores` may be a mapping, such as {"dsp": [0, 1]}. A baseline, which is a `sequential` run of the
+    same scene, follows only if `baseline_frames` is above 0.
     `on_progress(what, done, total)`: function that gets the progress, in the caller's thread. `what` is the policy, or
     `check` during the check; `done` and `total` are numbers of frames.
     `on_message(text)`: function that gets messages for a person, in the caller's thread.
-    Raises BadInputError and MissingPartError before a run that cannot begin. Raises RunFailedError if the run ended
-    early but left its folder, TrilaneError if no frame was presented. Raises KeyboardInterrupt after an interrupt, when
-    the folder is complete.
+    Raises BadInputError or MissingPartError if the run cannot begin. Raises RunFailedError if the run ended early but
+    left its folder, TrilaneError if no frame was presented. After an interrupt, raises KeyboardInterrupt as soon as the
+    folder is complete; there is no folder if no frame was presented.
     """
     from trilane.apps.run.run_job import INTERRUPTED, Hooks
     from trilane.pipeline.pipeline_file import is_pipeline_file
@@ -371,7 +371,7 @@ def _bound(function: Callable[..., Any], first: str | Path, options: Mapping[str
 def table(title: str, rows: Iterable[Row]) -> str:
     """Return an HTML table with the caption `title`. All texts are escaped.
 
-    `rows`: name, value and source of each figure, a row each.
+    `rows`: (name, value, source) of each figure.
     """
     body = "".join(
         f"<tr><th style='text-align:left'>{escape(name)}</th><td style='text-align:left'>{escape(value)}</td>"
@@ -422,8 +422,8 @@ def _between(low: float | None, high: float | None) -> str:
 def _error(facts: Mapping[str, Any]) -> tuple[str, str]:
     """Return two texts about an avatar's error: the PSNR of each band of zoom, and the source of these figures.
 
-    For an avatar without figures, the texts are `NO_FIGURES` and the reason. `facts`: entry of `accuracy` in
-    report.json.
+    For an avatar without figures, the texts are `NO_FIGURES` and the reason. `facts`: the avatar's entry in `accuracy`
+    of report.json.
     """
     if "psnr_db_by_band" not in facts:
         return NO_FIGURES, str(facts.get("why", ""))

@@ -1,7 +1,7 @@
 """Old names of commands and options, which work until the version `GONE_IN`, with a note.
 
-Rule: a name that was only replaced by a new name stands here and nowhere else. Command lines, axes of a sweep and
-options of a program are translated before any other code reads them.
+Rule: all names that were only replaced by a new name are listed here, and nowhere else. Command lines, axes of a sweep
+and options of a program are translated before any other code reads them.
 """
 
 from __future__ import annotations
@@ -16,10 +16,10 @@ GONE_IN: Final = "0.3"
 
 
 class Renamed(NamedTuple):
-    """An option of `command` that was called `old` and is called `new`. Both names include the dashes.
+    """An option of `command` that was called `old` and is now called `new`. Both names include the dashes.
 
     `values`: regular expression for the values that the old option could have. With any other value, `old` means the
-    option that has this name now.
+    present option of the same name.
     """
 
     command: str
@@ -41,9 +41,9 @@ OPTIONS: Final = (
     Renamed("predict", "--runtime", "--unit", "cpu|gpu|dsp|all"),
     Renamed("avatar create-data", "--output", "--picture"),
 )
-#: Options of today's `trilane explain` that take a value.
+#: Options of the present `trilane explain` that take a value.
 OF_EXPLAIN: Final = frozenset({"--slowest", "--jobs"})
-#: Options that `trilane explain` had when it explained a scene.
+#: Options that `trilane explain` had while it still explained scenes.
 OF_A_SCENE: Final = frozenset(
     {"--motion", "--camera", "--avatar", "--frames", "--fps", "--picture", "--output", "--size", "--skinning"}
     | {"--cores", "--profile", "--performance-profile"}

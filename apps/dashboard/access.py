@@ -1,4 +1,4 @@
-"""Where the dashboard's server listens, and which requests the server refuses. Rule: every refusal is counted.
+"""Opens the dashboard's socket, and refuses requests that the server must not answer. Rule: every refusal is counted.
 
 The server accepts only requests from this machine, to this address, with the token of this run. A page of another site
 may know the port. Its requests are refused for their Origin header, or for a Host header with another host name. The
@@ -22,8 +22,8 @@ from urllib.parse import parse_qs
 from trilane import machine
 from trilane.errors import BadInputError, MissingPartError, install_line, reason
 
-SEND_BYTES: Final = 1 << 18  # size of the system's send buffer, for bytes that a client has not yet received
-PATIENCE_MS: Final = 10_000  # after which the system ends a connection whose client acknowledges nothing
+SEND_BYTES: Final = 1 << 18  # size of the system's buffer for bytes that a client has not yet received
+PATIENCE_MS: Final = 10_000  # the system ends a connection whose client acknowledges nothing for so long
 BACKLOG: Final = 256
 TOKEN_BYTES: Final = 24
 PACKAGES: Final = ("starlette", "uvicorn", "websockets", "prometheus_client")
@@ -159,7 +159,7 @@ def headers(port: int) -> dict[str, str]:
 
 
 def refusal_of_head(scope: Mapping[str, Any]) -> Refusal | None:
-    """Return why a request is refused for its HTTP version, the size of its head, or a body; None if it is allowed.
+    """Return why a request is refused: for the size of its head, a body, or its HTTP version. None if it is allowed.
 
     `scope`: ASGI scope of the request.
     """

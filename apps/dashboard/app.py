@@ -1,7 +1,7 @@
 """The dashboard's HTTP server: the page's files, a WebSocket, metrics and the trace.
 
-Rule: this module decides nothing about the run. News about the run goes to all clients at once; an answer goes only to
-the client that asked. For each request for a picture, a client gets one picture: the newest one that the client has not
+Rule: this module decides nothing about the run. News about the run goes to all clients; an answer goes only to the
+client that asked. For each request for a picture, a client gets one picture: the newest one that the client has not
 had. A client that does not receive or answer in time loses its connection.
 """
 
@@ -60,8 +60,8 @@ class DashboardApp:
     `port`: port on which the server listens.
     `token`: secret that clients must send.
 
-    `asgi`: the ASGI application. `refusals`: counts of refused requests. `stop`: function that ends the server, set by
-    `server`. The application calls `stop` if one of its own tasks fails.
+    `asgi`: the ASGI application. `refusals`: counts of refused requests. `stop`: function that ends the server; the
+    function `server` sets it. The application calls `stop` if one of its own tasks fails.
     """
 
     def __init__(self, view: RunView, port: int, token: str) -> None:
@@ -214,7 +214,7 @@ def server(app: DashboardApp) -> Any:
             super().send_400_response(msg)
 
         def handle_websocket_upgrade(self, event: Any) -> None:
-            if refusal_of_head(self.scope) is None:  # checked here: uvicorn passes on any version as 1.1
+            if refusal_of_head(self.scope) is None:  # checked here: uvicorn passes on every version as 1.1
                 super().handle_websocket_upgrade(event)
             else:
                 self.send_400_response("refused: malformed")

@@ -1,9 +1,9 @@
 """Messages between the process of a run and the process of its server, in msgpack.
 
-Rule: only messages of the types in MESSAGES exist. A message is an array: the index of its type in MESSAGES, followed
-by its fields. Each message is one packet on a pair of sockets, which only these two processes have. Neither process
-waits for the other: a message that cannot be sent at once is lost. `ServerLink` starts and ends the server's process.
-If that process ends by itself, the run goes on without a server.
+Rule: every message has a type in MESSAGES. A message is an array: the index of its type in MESSAGES, followed by its
+fields. Each message is one packet on a pair of sockets, which only these two processes have. Neither process waits for
+the other: a message that cannot be sent at once is lost. `ServerLink` starts and ends the server's process. If the
+server's process ends by itself, the run goes on without a server.
 """
 
 from __future__ import annotations
@@ -68,9 +68,9 @@ class StateIs(NamedTuple):
 
 
 class ChangesRefused(NamedTuple):
-    """A message to the server: the run refuses a request.
+    """A message to the server: the run refuses a request of the page, or a new run did not begin.
 
-    `control`: name of the control, `restart` for several controls, "" for a new run that did not begin.
+    `control`: name of the control; `restart` for several controls; "" for a new run that did not begin.
     `why`: reason in words.
     """
 

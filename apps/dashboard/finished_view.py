@@ -139,8 +139,9 @@ class _FinishedRun:
     `facts`: facts for the page.
 
     `end_ms`: time of the last step. `jobs`, `idle`, `presented`: tables of jobs, idle slices and presented frames.
-    `figures`: table of the places of stored figures, at regular times. `metrics`: figures of the whole run in
-    OpenMetrics. `notes`: last messages for a person, each as (time, text). All times are ms since the first step.
+    `figures`: table of regular moments, with the place where the figures of each are stored. `metrics`: figures of the
+    whole run in OpenMetrics. `notes`: last messages for a person, each as (time, text). All times are ms since the
+    first step.
     """
 
     def __init__(self, begun: Begun, facts: RunFacts) -> None:
@@ -178,10 +179,7 @@ class _FinishedRun:
             table.complete()
 
     def figures_at(self, t_ms: float) -> Mapping[str, Any]:
-        """Return the message with the newest figures that were stored up to `t_ms`.
-
-        If all stored figures are later, return the first of them.
-        """
+        """Return the message with the newest stored figures up to `t_ms`; if there are none, the first after."""
         row = self.figures.last_before(t_ms)
         row = self.figures.near(t_ms, FIGURES_EVERY_MS, 1)[0] if row is None else row
         figures: Mapping[str, Any] = json.loads(self._written.read(int(row["offset"]), int(row["size"])))
@@ -190,7 +188,7 @@ class _FinishedRun:
     def slices_near(self, t_ms: float, span_ms: float) -> Message:
         """Return the message with the jobs and idle slices from `t_ms` - `span_ms` to `t_ms` + `span_ms`.
 
-        If there are more than `MOST_JOBS` jobs or `MOST_IDLE` idle slices, the nearest to `t_ms` are returned.
+        If there are more than `MOST_JOBS` jobs or `MOST_IDLE` idle slices, only the nearest to `t_ms` are returned.
         """
         jobs = [
             (int(r["unit"]), int(r["stage"]), int(r["frame"]), float(r["begin"]), float(r["end"]), float(r["wait"]))
@@ -280,9 +278,9 @@ class _Piece(NamedTuple):
 class TimeTable:
     """A table in a temporary file. Each row has a begin and an end, and rows are found by time.
 
-    The file consists of pieces of PIECE_ROWS rows. Memory holds only the offset, the number of rows, the earliest begin
-    and the latest end of each piece. Rows need not be sorted exactly, but `near` is faster if rows of similar times are
-    added together.
+    The file consists of pieces of at most PIECE_ROWS rows. Memory holds only the offset, the number of rows, the
+    earliest begin and the latest end of each piece. Rows need not be sorted exactly, but `near` is faster if rows of
+    similar times are added together.
     `dtype`: type of a row, with the fields `begin` and `end` in one unit of time.
     """
 
@@ -330,7 +328,7 @@ class TimeTable:
     def last_before(self, time: float) -> np.void | None:
         """Return the row with the latest end that is not after `time`; None if the table has no such row.
 
-        Only the last piece with such a row is searched. Therefore rows must be added about in the order of their ends.
+        Only the last piece with such a row is searched. Therefore rows must be added in about the order of their ends.
         """
         for piece in reversed(self._pieces):
             rows = self._read(piece)

@@ -1,8 +1,8 @@
 """Runs a scene or a pipeline file under a dashboard, with a new run for each configuration that the page requests.
 
-Rule: this process runs the pipeline by the code of `trilane run`. The page's server is another process, and neither
-waits for the other. Some settings change during the run. A request to change any other setting is checked like a
-command line. If the request is accepted, the run ends cleanly, and a new run starts with its own folder. A pipeline
+Rule: this process runs the pipeline with the code of `trilane run`. The page's server is another process, and neither
+waits for the other. Some controls change the running run. Other controls need a new run, and their values are checked
+like a command line. If the values are valid, the run ends cleanly, and a new run starts with its own folder. A pipeline
 file has only one run.
 """
 
@@ -52,7 +52,7 @@ RUNNING, PAUSED, RESTARTING, ENDED, FAILED = "running", "paused", "restarting", 
 #: Control that holds or continues the run -> number of frames that the run may release, and the run's new state.
 HOLDS: Final = {"play": (ALL, RUNNING), "pause": (0, PAUSED), "step": (1, PAUSED)}
 MOST_AVATARS: Final = 20
-#: Name, in a refusal, that stands for several requested changes together.
+#: Name of the control in a refusal of several changes that were requested together.
 RESTART: Final = "restart"
 
 
@@ -62,7 +62,7 @@ def run_live(
     """Run a scene under a dashboard, and each configuration that the page requests. Return the outcome of the last run.
 
     `options`: options of the first run. If they state a number of frames, each run ends after this number. Otherwise,
-    the last run ends by an interrupt.
+    an interrupt ends the last run.
     `hooks`, `command`: as in `run_asked`. `port`: as in `listen`.
     `tell`: function that gets the page's address, and other sentences for a person.
     Raises the errors of `run_asked` and `listen`.
@@ -156,7 +156,7 @@ def _numbered(folder: Path, number: int) -> Path:
 class Director:
     """Carries out the page's requests in successive runs.
 
-    One thread calls `do`; another thread calls all other methods.
+    One thread calls `do`. Another thread calls all other methods.
     `prepare`: function that checks the options of a run.
     `send`: function that sends a message to the server.
     """
@@ -252,7 +252,7 @@ def reasons_against(options: RunOptions) -> dict[str, str]:
 
 
 def _neighbours(avatar: str) -> Iterator[str]:
-    """Yield the paths of the first `MOST_AVATARS` avatars in the folder around `avatar`, in alphabetical order.
+    """Yield the paths of the first `MOST_AVATARS` avatars in the parent folder of `avatar`, in alphabetical order.
 
     Yield nothing if `avatar` is a built-in name or no folder.
     """
@@ -271,7 +271,8 @@ def run_file_live(
     """Run a pipeline file under a dashboard, and return the outcome.
 
     The page can only hold the run, step it and kill units.
-    `options`: options of the run, with the pipeline file. Without a number of frames, the run ends by an interrupt.
+    `options`: options of the run, with the pipeline file. If neither a number of frames nor the file's key `arrivals`
+    limits the run, an interrupt ends it.
     `hooks`, `command`, `port`, `tell`, and the errors raised: as in `run_live`.
     """
     from trilane.apps.run.run_file import run_file
@@ -311,7 +312,7 @@ class FileWatch:
         config = facts["config"]
         output = config["scene"].get("output")
         sides = (output["height"], output["width"]) if output else NO_PICTURE
-        height, width = (max(side // 2 * 2, 2) for side in sides)  # as the video has them
+        height, width = (max(side // 2 * 2, 2) for side in sides)  # even, as the sides of the video
         link = self._link = self._make(height, width, self.do)
         said = facts_of_config(run_name(folder), config, facts["machine"], {})
         controls = controls_of_file(list(pipeline.units))

@@ -1,8 +1,8 @@
 """The server process of a live run. It shows the growing journal, the newest picture and the controls.
 
 Rule: nothing here makes the run wait. This process reads the journal, fetches pictures through the window, sends
-requests to the run, and sends the run's answers to all pages. It has a low priority and ends with the run's process. It
-inherits three file descriptors: the listening socket, its end of the channel, and the window.
+requests to the run, and sends the run's answers to all pages. Its priority is low, and it ends with the run's process.
+It inherits three file descriptors: the listening socket, its end of the channel, and the window.
 """
 
 from __future__ import annotations
@@ -91,8 +91,8 @@ async def serve(listener: socket.socket, channel: ChannelEnd, window_fd: int) ->
     run_is_over = asyncio.Event()
     asyncio.get_running_loop().add_reader(channel.fd, _hear, channel, view, run_is_over)
     leaving = asyncio.create_task(_leave(run_is_over, app, answers))
-    os.setpriority(os.PRIO_PROCESS, 0, NICE)  # not earlier, so that the imports are quick
-    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # so that waking up takes no core from a unit
+    os.setpriority(os.PRIO_PROCESS, 0, NICE)  # only now, so that the imports were quick
+    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))  # so that its wake-ups take no core from a unit
     await answers.serve(sockets=[listener])
     leaving.cancel()
 
@@ -139,7 +139,7 @@ def main() -> None:
 class _Course:
     """The timeline and figures of one live run.
 
-    `begun`: first record of its journal.
+    `begun`: first record of the run's journal.
 
     `timeline`, `figures`: rows and figures so far. `jobs`, `idle`, `notes`: the newest rows and notes, for clients that
     join later.
@@ -275,7 +275,7 @@ class LiveView:
         return control.refusal(value) if control else f"found {name!r}, expected one of {', '.join(self._controls)}"
 
     def _hand_over(self, asked: ControlAsked | ChangesAsked) -> str:
-        """Send the request `asked` to the run. Return ACCEPTED, or in words why the request was not sent."""
+        """Send the request `asked` to the run. Return ACCEPTED, or why the request was not sent, in words."""
         now_s = time.monotonic()
         if len(self._asked_s) == ASKED_A_SECOND and now_s - self._asked_s[0] < 1.0:
             return f"more than {ASKED_A_SECOND} things were asked for within a second"
@@ -358,7 +358,7 @@ class LiveView:
         self._is_news = True
 
     def _now_ns(self) -> int | None:
-        """Return the present time in ns, for which to compute figures; None for the time of the last record.
+        """Return the time for which to compute figures: now, in ns, or None for the time of the last record.
 
         None is returned if the run is over, or if its journal is not fully read.
         """
@@ -366,7 +366,7 @@ class LiveView:
 
 
 def _place_of(folder: Path) -> Path:
-    """Return the folder that has the run's files now: `folder`, or the folder with the final name after a rename."""
+    """Return the folder that has the run's files now: `folder` or, after the rename, the folder with the final name."""
     complete = folder.with_name(run_name(folder))
     return folder if folder.is_dir() or not complete.is_dir() else complete
 

@@ -1,7 +1,7 @@
 """Facts about a run for the page that do not change during the run, and the controls of the page.
 
-Rule: unknown facts are null, nothing is guessed, and the words are the same as in report.json. The valid values
-of a control are stated only in its `Control`.
+Rule: an unknown fact is null or empty, never guessed. Names are the same as in report.json. Only a `Control` states the
+valid values of a control.
 """
 
 from __future__ import annotations
@@ -42,9 +42,8 @@ class RunFacts:
     `config`: value of each control at the beginning of the run, by name.
     `plan`: key `plan` of report.json, with the report's `notes`.
     `placement`, `accuracy`: as in report.json; `placement` is None if it is unknown.
-    `bound`: for a finished run, the values in report.json of the keys that `BOUND` lists: what bounds the run, and its
-    efficiencies. None if they are unknown.
-    `verdict`: verdict of a finished run, with its lines; None if it is unknown.
+    `bound`: bound and efficiencies of a finished run: the keys of report.json that `BOUND` lists. None if unknown.
+    `verdict`: verdict of a finished run, with its lines; None if unknown.
     """
 
     name: str
@@ -62,7 +61,7 @@ class RunFacts:
 
     @classmethod
     def of_row(cls, row: Mapping[str, Any]) -> RunFacts:
-        """Return the facts from `row`, a mapping by field that was sent in a message."""
+        """Return the facts from `row`, which has the value of each field and was sent in a message."""
         width, height = row["output"]
         return cls(**{**row, "output": (width, height)})
 
@@ -124,7 +123,7 @@ def facts_of_checked(name: str, checked: Checked, options: RunOptions, machine: 
     `options`: options of the run.
     `machine`: block `machine` of report.json.
     """
-    # Imports stand in functions here and below: a live run's server needs neither module, and starts sooner without.
+    # Functions here import these modules themselves: a live run's server needs none of them, and starts sooner without.
     from trilane.apps.run.report_facts import config_facts
 
     config = checked.config
@@ -210,7 +209,7 @@ class Control:
 
     `name`: name of the control.
     `kind`: action, choice, number or drag.
-    `live`: whether a use of the control changes the running run; otherwise, it starts a new run.
+    `live`: whether a use of the control changes the running run; if not, it needs a new run.
     `choices`: valid values of a choice, empty for other kinds.
     `min`, `max`: range of a number, or of both numbers of a drag; None for other kinds.
     `why_not`: reason for which the control is disabled, "" if it is enabled.
@@ -249,7 +248,7 @@ class Control:
 
 
 def control_of(row: Mapping[str, Any]) -> Control:
-    """Return the control from `row`, a mapping by field that was sent in a message."""
+    """Return the control from `row`, which has the value of each field and was sent in a message."""
     return Control(**{**row, "choices": tuple(row["choices"])})
 
 

@@ -4,11 +4,11 @@ Rule: a view answers at once or awaits; it never blocks the event loop, which al
 since the run's first step. Units and stages are given by their index in the message `hello`. The page and /metrics get
 the same figures.
 
-A message is one byte, its kind, and a payload. Kind 1 is JSON in UTF-8, in both directions. Kind 2 is a picture for the
-page. Its payload has the number of the frame (uint32), the frame's time in the scene and its age (float64, ms), and a
-JPEG. All numbers are little-endian. Every message of a page is checked. No page delays other pages: each has its own
-queue, which a task sends. The server drops and counts a page whose queue is full, or that receives nothing for SEND_S
-seconds.
+A message is one byte, which is its kind, and a payload. Kind 1 is JSON in UTF-8, in both directions. Kind 2 is a
+picture for the page. Its payload has the number of the frame (uint32), the frame's time in the scene and its age (both
+float64, ms), and a JPEG. All numbers are little-endian. Every message of a page is checked. No page delays other pages,
+because a task sends each page's own queue. The server drops and counts a page whose queue is full, or that receives
+nothing for SEND_S seconds.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Client:
     """A page that shows a run.
 
     `socket`: the server's end of the WebSocket to the page.
-    `gone`: function that is called once, when the server drops the page.
+    `gone`: function that is called once if the server drops the page.
 
     `asks_picture`: whether the page waits for a picture. `had_frame`: number of the newest frame that the page got, -1
     before the first. `faults`: number of malformed messages that the page has sent.
@@ -208,7 +208,7 @@ def said(message: Mapping[str, Any]) -> bytes:
 def shown(frame: int, media_ms: float, age_ms: float, jpeg: bytes) -> bytes:
     """Return a picture as bytes for the page, kind 2.
 
-    `frame`: number of its frame.
+    `frame`: number of the picture's frame.
     `media_ms`: time of the frame in the scene.
     `age_ms`: time since the pose of the frame was sampled.
     `jpeg`: the picture as a JPEG.
@@ -269,7 +269,7 @@ class RunView(Protocol):
 
 
 class TimelineRows:
-    """Collects the jobs, idle slices and notes of a run. `take` returns each of them once.
+    """Collects the jobs, idle slices and notes of a run. `take` returns each one once.
 
     `begun`: first record of the journal.
 

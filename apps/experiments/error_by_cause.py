@@ -1,10 +1,10 @@
 """How far is a run's picture from the reference, and how much does each cause contribute?
 
 Rule: causes are counted in two ways, and each way states its remainder. Alone: each cause is switched on in the
-reference, with only the causes that it needs; the errors may not sum to the whole error. In order: causes are switched
+reference, with only the causes that it needs. The errors need not sum to the whole error. In order: causes are switched
 on one after the other, so the picture changes in steps from the reference to the run's picture. Three figures of the
-steps sum to the whole error, up to float64's rounding: the changes of the MAE, the changes of the mean square, and the
-products of a step's difference with the whole difference. All figures cover the region with the avatars.
+steps each sum to the whole error, up to float64's rounding: the change of the MAE, the change of the mean square, and
+the product of the step's difference with the whole difference. All figures cover the region with the avatars.
 """
 
 from __future__ import annotations
@@ -43,10 +43,10 @@ STEPS = 255
 #: Name of the heat map of the run against the reference.
 WHOLE = "whole"
 Frames = Callable[[Sequence[int]], Iterable[int]]
-#: The bar's colours from no difference to the largest: black, violet, red, orange, pale yellow.
+#: Colours of the colour bar, from no difference to the largest: black, violet, red, orange, pale yellow.
 COLOURS = np.array([(0, 0, 4), (87, 16, 110), (188, 55, 84), (249, 142, 9), (252, 255, 164)], np.float64)
 LARGEST_FACTOR = 1024
-#: Share of the pixels whose differences must lie within the bar's range.
+#: Share of the pixels whose differences must lie within the range of the colour bar.
 ON_THE_BAR = 0.999
 #: Least length of a panel's longer side, pixels. A smaller panel is enlarged by a whole factor.
 LEAST_SIDE_PX = 320
@@ -68,11 +68,11 @@ def error_by_cause(
     Keys of the result:
     `causes`: a row for each cause, in the order of `Cause`.
     `whole`: error of the frame with all causes against the reference.
-    `sums`: sums over the causes, `in_order` and `alone`, and `whole` minus these sums, `left_in_order` and
-    `left_alone`. `remainder`: error of the run's own frame against the frame with all causes.
+    `sums`: `in_order` and `alone` are sums over the causes; `left_in_order` and `left_alone` are `whole` minus them.
+    `remainder`: error of the run's own frame against the frame with all causes.
     `truth`: errors of the reference and of the run against the ground truth; None if the scene has no ground truth.
     `frames`: numbers of the frames. `empty_frames`: frames with nobody in view, which do not count.
-    `network`: names of the networks that paint the reference. `sources`: source of each key.
+    `network`: names of the networks that paint the reference, as one text. `sources`: source of each key.
     `config`: name, plan, size and runtime of the scene.
 
     Keys of a row:
@@ -124,8 +124,9 @@ def _truth(path: ReferencePath) -> Any:
 
 @dataclass
 class _Pooled:
-    """The errors of the added frames. MAE and mean square are over all pixels, other figures are means over the frames.
+    """The errors of the added frames.
 
+    MAE, mean square and PSNR are over the pixels of all frames; other figures are means over the frames.
     `lpips`: function that computes LPIPS; None leaves LPIPS out.
     `values`: number of the compared values. `absolute`, `square`: sums of their absolute and squared differences.
     `each`: figures of each frame.
@@ -238,10 +239,10 @@ class _Split:
         self._show(moment.number, WHOLE, own, reference)
 
     def add_truth(self, moment: ReferenceMoment, true: Sequence[RasterLayer]) -> None:
-        """Count `moment` against its ground truth: once the reference, once the run's picture.
+        """Count the errors of the reference and of the run's picture against the ground truth of `moment`.
 
-        If there is a folder for heat maps, write both heat maps. `true`: layers of the clothed bodies, which lie over
-        the run's background in the ground truth.
+        If there is a folder for heat maps, write both heat maps. `true`: layers of the clothed bodies. The ground truth
+        shows these layers over the run's background.
         """
         box = region(moment.boxes, self._output)
         picture, cover = laid_over(moment.background, true)

@@ -1,8 +1,8 @@
-"""What does a speed cost in image error, for each size of tensor on each runtime?
+"""How fast is each tensor size on each runtime, and how large is its image error?
 
 Rule: all rows use the same frames and the same part of the picture, where the avatars are. The pictures are made
-first, as a warm-up. After that, each round times every frame, in the scene's order, on every row in turn. Time without
-a core does not count.
+first, which also warms up. After that, each round times every frame in the scene's order: once for each row, before the
+next frame. Time without a core does not count.
 """
 
 from __future__ import annotations

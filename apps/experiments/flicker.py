@@ -54,8 +54,8 @@ class FlickerRow:
     def add(self, error: F64, part: tuple[slice, slice]) -> None:
         """Count the next frame.
 
-        `error` (h,w,3): picture minus reference. `part`: rows and columns that hold the avatars of this and the last
-        frame.
+        `error` (h,w,3): picture minus reference. `part`: rows and columns that contain the avatars in this frame and in
+        the frame before.
         """
         if self._before is not None:
             self.changes.append(flicker(self._before[part], error[part]))
@@ -86,8 +86,8 @@ def measure(
     Figures cover the part of the picture with avatars, in steps of 1/255.
 
     Keys of a row in `rows`: `runtime`, `calibration`, `texture_filter`. `flicker`: mean over the pairs of frames.
-    `worst`: largest flicker of a pair. `worst_frame`: later frame of that pair. `mae`: mean absolute error of the
-    frames.
+    `worst`: largest flicker of a pair. `worst_frame`: number of the later frame of this pair. `mae`: mean absolute
+    error of the frames.
 
     Other keys: `scene_change`: mean change of the reference between successive frames. `against`: name of the
     reference. `frames`: numbers of the frames. `sources`: source of the figures. `config`: scene, plan, size, frames a

@@ -45,11 +45,11 @@ CASE_SEED, NETWORK_SEED = 7, 0
 FIGURE_HEIGHT, FIGURE_WIDTH, OFF_CENTRE = 0.42, 0.25, 0.1
 #: Size of the figure in "little but background", as a share of the usual size.
 SMALL = 0.7
-#: Sides of the cells of smooth and of flat texture, in pixels.
+#: Sides of the cells of `_smooth` and `_flat` textures, in pixels.
 SMOOTH_CELL, FLAT_CELL = 8, 16
 #: Norm of a kernel's smooth part, and size of its random part.
 GAIN, RANDOM_PART = 2**0.5, 0.5
-#: Factor on weights for features from deeper levels, largest bias of a norm, standard deviation of logits.
+#: Factor on the weights of features from deeper levels, largest bias of a norm, standard deviation of the logits.
 DEEP, BIAS, CONTRAST = 0.25, 0.05, 1.5
 #: Name of a network -> its norm, and whether the weights of one channel of the stem are `OUTLIER` times as large.
 NETWORKS: dict[str, tuple[str, bool]] = {
@@ -85,8 +85,8 @@ class Case:
     """A pair of networks with an input, the expected picture, and the bound on a picture's error.
 
     `pair`: the networks. `tensor`: input (1,H,W,C) uint8. `wanted`: picture of the float network (1,H,W,4), in steps of
-    1/255. `predicted`, `bound`: expected error and bound by one of two noise models, the one with the smaller bound.
-    `source`: name of this noise model. `own_bound`: bound by the model with the integer network's steps.
+    1/255. `predicted`, `bound`: expected error and bound, from the noise model with the smaller bound.
+    `source`: name of this noise model. `own_bound`: bound from the model with the integer network's steps.
     `wrong`: result of `wrong_answers`. All errors and bounds are means, in steps of 1/255.
     """
 
@@ -101,16 +101,13 @@ class Case:
 
     @property
     def tells(self) -> bool:
-        """Whether the bound tells wrong pictures from right ones.
-
-        This holds if the error of every kind of wrong picture is above the bound.
-        """
+        """Whether the error of every kind of wrong picture is above the bound."""
         return self.bound < min(self.wrong.values())
 
     def verdict(self, error: float) -> str:
         """Return the verdict on a picture's `error`: HOLDS, EXCEEDED or UNTOLD. NaN counts as above the bound.
 
-        UNTOLD means that a wrong picture could also stay within the bound (`tells` is false).
+        UNTOLD means that the error of a wrong picture could also be within the bound (`tells` is false).
         """
         if not self.tells:
             return UNTOLD
@@ -288,8 +285,8 @@ def float_network(name: str) -> onnx.ModelProto:
 def _draw(module: Any, generator: Any) -> None:
     """Draw random weights for `module` if it is a convolution, or random biases if it is a norm.
 
-    For each output channel of a convolution, the weights sum to about 0 over the input channels. `generator`: PyTorch's
-    random numbers.
+    For each output channel of a convolution, the sum of the smooth parts over the input channels is 0. `generator`:
+    PyTorch's random numbers.
     """
     import torch
 

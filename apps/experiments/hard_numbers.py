@@ -3,13 +3,13 @@
 Rule: the body is the default avatar's, so the rows are the same everywhere. A reference sums in extended precision or
 float64. A bound counts the roundings of the computation, and never follows from a result.
 
-If a texture has constant channels, every covered pixel of a tensor is a known byte: q = clamp(round(x / scale) + zero
-point, 0, 255), rounded to even. The values x are FP16 numbers. Some values are halves of a step. Their scale is a power
-of two, so every driver divides x / scale exactly. All other quotients are at least a tenth of a step from a half. This
-is more than the error of a driver's division (2.5 units in the last place, Vulkan 1.3 and OpenCL 3.0 for float32).
+If a texture has constant channels, every covered pixel of a tensor has known bytes. A byte is clamp(round(x / scale) +
+zero point, 0, 255), rounded to even. The values x are FP16 numbers. Some quotients x / scale lie halfway between two
+whole numbers. Their scale is a power of two, so every driver divides exactly. All other quotients are at least 0.1 away
+from such a half. A driver's division is more exact (2.5 units in the last place, Vulkan 1.3, OpenCL 3.0 for float32).
 
-A scene's frame must be the same to the byte, no matter which frames were drawn before. Its reference comes from stages
-that have drawn no other frame.
+The tensor of a scene's frame must be the same to the byte, no matter which frames were drawn before. The reference
+comes from stages that have drawn no other frame.
 """
 
 from __future__ import annotations
@@ -202,9 +202,9 @@ def _skinned(shaped: ShapedBody, matrices: F64, feature: F64) -> tuple[F64, F64]
 def _left_out(shaped: ShapedBody) -> Iterator[HardNumber]:
     """Yield rows about skinning with only the largest weights of each vertex.
 
-    One row keeps four weights of the body `shaped`, whose vertices have seven weights at most. In the other rows, each
-    vertex has random weights, and each count of `WEIGHT_COUNTS` is kept. There the body is 200 m away. At this
-    distance, an error would show if the kept weights did not sum to 1.
+    One row keeps four weights of the body `shaped`, whose vertices have seven weights at most. The other rows keep each
+    count of `WEIGHT_COUNTS` of random weights, with the body 200 m away. At this distance, an error would show if the
+    kept weights did not sum to 1.
     """
     rng = np.random.default_rng(5)
     poses = [rng.normal(0, 1.0, (JOINTS, 3)) for _ in range(POSES)]
@@ -220,7 +220,8 @@ def _left_out(shaped: ShapedBody) -> Iterator[HardNumber]:
 def _fewer(shaped: ShapedBody, count: int, poses: Sequence[F64], metres: float, what: str) -> HardNumber:
     """Return the row about skinning with the `count` largest weights of each vertex.
 
-    The bound is `weight_error_bound`, plus the rounding of the weighted sums: gamma_n times the reach of the body.
+    The bound is `weight_error_bound`, plus the rounding of two weighted sums: each gamma_n times how far the body
+    reaches from the origin.
 
     `shaped`: body. `poses`: axis-angle vectors (55,3) of each pose. `metres`: distance of the body from the origin.
     `what`: description of the weights for the row's name.
@@ -293,9 +294,10 @@ def _drawn(skeleton: Skeleton, fov_deg: float, metres: float) -> Iterator[tuple[
 
 
 def _outside(bounds: MeshBounds, posed: Posed, vertices: F64, clip: F64) -> float:
-    """Return how far visible vertices lie outside the body's rectangle, in NDC; inf if `bounds` finds no rectangle.
+    """Return how far visible vertices lie outside the body's rectangle, in NDC; 0 if no vertex is visible.
 
-    A vertex is visible if it is on the screen and in front of the near plane. Without a visible vertex, return 0.
+    A vertex is visible if it is on the screen and beyond the near plane. If a vertex is visible but `bounds` finds no
+    rectangle, return inf.
 
     `bounds`: object that computes the rectangle. `posed`: posed skeleton. `vertices` (V,3): metres. `clip`: projection
     @ view (4,4).
@@ -320,7 +322,7 @@ def _behind(bounds: MeshBounds, skeleton: Skeleton) -> Iterator[HardNumber]:
 
 
 def _crops() -> Iterator[HardNumber]:
-    """Yield rows about points in a crop: the cropped projection in float64 against the whole one in extended precision.
+    """Yield rows about points in a crop: the crop's projection in float64 against the screen's in extended precision.
 
     X' = (2 X - (x0 + x1) W) / (x1 - x0) and W are sums of at most 8 products in float64. The absolute values of the
     products sum to at most 2 (|X| + 2 |W|) / (x1 - x0).
@@ -372,8 +374,8 @@ def time_cases() -> Iterator[HardNumber]:
 
     Frame 5,000,000 must show the same as the same moment in the first period of the motion. The reference reduces the
     frame's time by the period in fractions, which are exact. The tested time t = frame / fps is rounded once, so it is
-    off by at most U t (U: unit roundoff of float64). Reducing t by the period is exact. The error of a shown value has
-    two parts: a few roundings, and the error of t multiplied by the value's largest change in a second.
+    off by at most U t (U: unit roundoff of float64). Reducing t by the period is exact. The error of a shown value is a
+    few roundings, and the error of t multiplied by the value's largest change in a second.
     """
     motion, camera = walk_wave_turn(), load_builtin("orbit", CameraSpec())
     assert camera is not None
@@ -435,7 +437,7 @@ NUMBERS: dict[str, tuple[float, int, Sequence[float]]] = {
     "a scale so large that all is 0": (1e30, 117, [LARGEST, -LARGEST] * 8),
 }
 HALF_ULP = "FP16 rounds to the nearest: 2^-11 of a number, 2^-25 at least"
-#: Scene -> frames that differ much from the one before: in camera, pose, rectangle, tensor shape, avatars in view.
+#: Scene -> frames to draw, in this order. Each differs much from the one drawn before it, such as in camera or pose.
 JUMPS = {"walk-past": (0, 180, 30, 299, 0), "leave-and-return": (0, 150, 20, 240), "top-to-floor": (0, 90, 180, 0)}
 RUNTIME = "ort"
 
@@ -527,7 +529,7 @@ def scene_cases() -> Iterator[HardNumber]:
 
 
 def _differing(checked: Checked, numbers: list[int]) -> int:
-    """Return how many tensor bytes of the frames `numbers` depend on the frames that the same stages drew before.
+    """Return how many tensor bytes of the frames `numbers` differ if the stages have drawn other frames before.
 
     `checked`: scene and its avatars.
     """

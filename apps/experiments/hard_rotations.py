@@ -39,13 +39,13 @@ ANGLES = {
     "100 pi": 100 * np.pi,
     "1e6": 1e6,
 }
-#: Angles that are tested to a quaternion and back. Only vectors up to half a turn come back.
+#: Angles whose vectors are converted to a quaternion and back. Vectors beyond half a turn would not come back.
 RETURNED = ("1e-12", "1e-6", "1e-3", "pi - 1e-7")
 RANDOM, CHUNK, SEED = 1_000_000, 100_000, 17
 LEAST = 2.0**-1074
 DIGITS = 80
 PI = Decimal("3.14159265358979323846264338327950288419716939937510582097494459230781640628620899862803482534211706798")
-#: Angle below which the first terms of the series of sin(t) / t and (1 - cos(t)) / t^2 give all digits.
+#: Angle t below which two terms of the series of sin(t) / t and (1 - cos(t)) / t^2 give all `DIGITS` digits.
 TINY = Decimal("1e-30")
 MM = 1e3
 Wide = NDArray[np.longdouble]
@@ -104,7 +104,7 @@ def worst(errors: ArrayLike, bounds: ArrayLike) -> tuple[float, float]:
 
 
 def rotation_cases() -> Iterator[HardNumber]:
-    """Yield rows about rotations by each angle of `ANGLES`, random rotations, and vectors to a quaternion and back."""
+    """Yield rows about rotations by each of `ANGLES`, random rotations, and conversions to quaternions and back."""
     axes = _axes()
     for name, angle in ANGLES.items():
         vectors = axes * angle
@@ -140,9 +140,9 @@ def turn_bound(angle: F64) -> F64:
 def return_bound(angle: F64) -> F64:
     """Return the bound on the error of an entry of the axis-angle vector from a quaternion (...), radians.
 
-    `angle` (...): angle of the rotation, up to pi. Let w be the quaternion's first part, and sine the length of its
-    other parts. With e and f as in `turn_bound`, the angle 2 atan2(sine, w) is off by 2 (f sine + sqrt(3) e) and four
-    roundings. The axis is the other parts divided by sine.
+    `angle` (...): angle of the rotation, radians, up to pi. Let w be the quaternion's first part, and sine the length
+    of the vector of its other parts. With e and f as in `turn_bound`, the angle 2 atan2(sine, w) is off by
+    2 (f sine + sqrt(3) e) and four roundings. The axis is this vector divided by sine.
     """
     _, e, f = _parts(np.asarray(angle, np.float64))
     sine = np.sin(np.minimum(angle / 2, np.pi / 2))

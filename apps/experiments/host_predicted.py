@@ -31,7 +31,7 @@ from trilane.stages.run_options import RunOptions
 from trilane.units import HOST
 
 RUN, ALONE = "run", "network"
-MIN_FRAMES = 100  # frames of a run that is placed by its times
+MIN_FRAMES = 100  # a shorter run is not placed by measured times
 
 
 def measure(
@@ -41,9 +41,9 @@ def measure(
 
     Each network has two rows in `rows`. `name`: name of the avatar, or `width` with the number. `what`: `run` (mean
     frame time of a run of `frames` frames) or `network` (median time of calls during `seconds` seconds).
-    `predicted_ms`, with the 80 % interval `low_ms`, `high_ms`. `measured_ms`. `error`: predicted / measured - 1.
-    `inside`: whether the measured time is in the interval. `others`: share of the cores that other programs had in the
-    run; null for calls of a network. If `others` is above 0.1, the row says little.
+    `predicted_ms`: predicted time, with the 80 % interval `low_ms` to `high_ms`. `measured_ms`: measured time.
+    `error`: predicted / measured - 1. `inside`: whether the measured time is in the interval. `others`: share of the
+    cores that other programs had in the run; null if unknown, and for calls. Above 0.1, the row says little.
 
     `run`, `network`: summaries of the rows of that kind. `inside`: number of rows in their interval, out of `of` rows.
     `median_error`: median of the absolute errors. `leave_one_out_error`: root mean square of log(predicted / measured).
@@ -133,5 +133,5 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[Hooks]:
-    """Give a run's hooks that print nothing, as a context manager."""
+    """Return a context manager that yields hooks of a run which print nothing."""
     yield Hooks(lambda *_: None, lambda _: None)

@@ -2,11 +2,11 @@
 
 Rule: a picture is (h,w,3) sRGB, as bytes or as real numbers in 0..1. A mask is (h,w) bool. SSIM is as in the avatars'
 validations: windows of 7 x 7 pixels, mean over the colours. The weights of LPIPS come from a file that the user names.
-Only tensors are read from this file, and no code in it runs.
+Only tensors are read from this file; none of its code runs.
 
-Sources: SSIM: Wang et al., "Image Quality Assessment", IEEE TIP 13 (2004); MS-SSIM: Wang, Simoncelli and Bovik,
-"Multiscale structural similarity", Asilomar 2003; FLIP: Andersson et al., HPG 2020, at 67 pixels a degree; LPIPS: Zhang
-et al., "Unreasonable Effectiveness", CVPR 2018, version 0.1.
+SSIM: Wang et al., "Image Quality Assessment", IEEE TIP 13 (2004). MS-SSIM: Wang, Simoncelli and Bovik, "Multiscale
+structural similarity", Asilomar 2003. FLIP: Andersson et al., HPG 2020, at 67 pixels a degree. LPIPS: Zhang et al.,
+"Unreasonable Effectiveness", CVPR 2018, version 0.1.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ LEAST_MS_SSIM_PX = WINDOW_PX * 2 ** (len(SCALES) - 1)
 LEAST_SSIM_PX = 7
 #: Constants of SSIM for values in 0..1. They prevent 0 / 0.
 C1, C2 = 0.01**2, 0.03**2
-#: Function that returns the LPIPS of a picture and its reference, real numbers in 0..1, such as an `Lpips`.
+#: Function that takes a picture and its reference, real numbers in 0..1, and returns their LPIPS; an `Lpips` is one.
 Perceived = Callable[[F64, F64], float | None]
 LPIPS_FILE = "a file of all weights of lpips.LPIPS(net='alex')"
 LPIPS_REMEDY = "torch.save(lpips.LPIPS().state_dict(), FILE) writes one"
-#: AlexNet's convolutions: name in the file, outputs, inputs, kernel side, stride, padding, whether pooling is before.
+#: AlexNet's convolutions: name in the file, outputs, inputs, kernel side, stride, padding, whether pooling precedes it.
 LPIPS_LAYERS = (
     ("slice1.0", 64, 3, 11, 4, 2, False),
     ("slice2.3", 192, 64, 5, 1, 2, True),
@@ -46,7 +46,7 @@ LPIPS_LAYERS = (
     ("slice4.8", 256, 384, 3, 1, 1, False),
     ("slice5.10", 256, 256, 3, 1, 1, False),
 )
-#: The network's input is (picture in -1..1 - shift) / scale.
+#: Shift and scale of the network's input by channel: (2 x picture - 1 - shift) / scale.
 LPIPS_SHIFT, LPIPS_SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 #: Added to the length of a feature vector, which may be 0.
 LPIPS_TINY = 1e-10
@@ -62,7 +62,7 @@ class ErrorFigures:
     `ssim`, `ms_ssim`: similarity, 1 without an error; None if the picture is too small.
     `flip`: mean FLIP, 0 without an error.
     `dice`, `iou`: agreement of the masks, 1 if they are equal; None without masks.
-    `lpips`: LPIPS, 0 without an error; None without weights, or if the picture is too small.
+    `lpips`: LPIPS, 0 without an error; None without weights, or if the pictures differ and are too small.
     """
 
     mae: float

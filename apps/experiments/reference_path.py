@@ -4,8 +4,8 @@ Rule: without a cause, the path is the plan `full` (`bench/lib/full_picture.py`)
 on. The raster is supersampled in float64, from a float texture, into an unrounded tensor of about the network's own
 area. The network is in FP32, and its picture is blended in linear light in float64 and not rounded. Each cause replaces
 one of these steps by the run's step. With all causes, the picture is the run's. Motion, camera, background and contact
-shadows are always the run's. `NEEDS` has the causes that a cause needs. For example, a runtime needs bytes, and stages
-that draw into the run's tensor or read it need this tensor.
+shadows are always the run's. A cause may need other causes (`NEEDS`). For example, a runtime reads bytes, so `RUNTIME`
+needs `PACKING`. The composite stage reads pictures of the run's tensor, so `COMPOSITE` needs `CROP`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ HALF = 0.5
 
 
 class Cause(StrEnum):
-    """The causes of the difference between a run's picture and the reference, in the order of switching on."""
+    """The causes of the difference between a run's picture and the reference, in the order in which they are added."""
 
     WEIGHTS = "skin weights"
     BLEND = "blend shapes"
@@ -112,10 +112,10 @@ def require_complete(causes: Iterable[Cause]) -> Causes:
 
 
 class RunBody:
-    """The body of one distinct avatar, which computes its vertices with any causes.
+    """Computes the vertices of one distinct avatar with any causes.
 
-    In float64, the vertices are computed joint by joint. In float32, Trilane's own skinning computes them. With all
-    causes on, they equal the CPU unit's vertices to the bit.
+    In float64, the vertices are computed joint by joint. In float32, Trilane's own skinning computes them. If the CPU
+    unit skins and all causes are on, the result equals this unit's vertices to the bit.
 
     `data`: avatar. `on_cpu`: whether the CPU unit skins the body; if not, the GPU unit skins it.
     """
@@ -139,9 +139,10 @@ class RunBody:
         return (self._by_cpu(detail, posed) if self._on_cpu else self._by_gpu(detail, posed)).astype(np.float64)
 
     def _detail(self, level: int | None, causes: Causes) -> Detail:
-        """Return the level of detail: the run's in the parts whose cause is on, and everything in the other parts.
+        """Return the level of detail. Where a cause is on, it is the run's; otherwise, nothing is left out.
 
-        The parts are skin weights with hands and face, and pose blend shapes. `level`, `causes`: as in `vertices`.
+        `WEIGHTS` concerns skin weights, hands and face; `BLEND` concerns pose blend shapes. `level`, `causes`: as in
+        `vertices`.
         """
         run = EVERYTHING
         if self._on_cpu:
@@ -195,8 +196,8 @@ class RunBody:
 class ReferenceFrame:
     """The frame `number`, drawn with or without causes.
 
-    `picture`: (h,w,3) sRGB in 0..1. `mask` (h,w) bool: pixels of which avatars cover at least half. `boxes`: rectangles
-    around the visible avatars, pixels.
+    `picture`: (h,w,3) sRGB in 0..1. `mask` (h,w) bool: pixels that avatars cover by half or more. `boxes`:
+    rectangles around the visible avatars, pixels.
     """
 
     number: int
@@ -397,7 +398,7 @@ class ReferenceMoment:
     def _once(self, key: Hashable, make: Callable[[], Any]) -> Any:
         """Return the result of `make`, which is called once for each `key`.
 
-        A cause of error that changes no input leaves the key the same. Then nothing is computed again.
+        A cause that changes no input of `make` leaves the key the same, so nothing is computed again.
         """
         if key not in self._made:
             self._made[key] = make()
@@ -411,8 +412,8 @@ class _Avatar:
     `body`: body that computes vertices. `mesh`: triangles and texture coordinates. `texture`: neural texture (H,W,C).
     `encoding`: scale and zero point of the tensor's bytes. `area`: pixels of the tensor of its network's own size.
     `paint`, `as_written`, `by_runtime`: functions from a tensor of real numbers to the network's picture. They compute
-    the network in FP32, in integers as its file says, and in integers on the run's runtime.
-    `network`: name of the network in `paint`.
+    the network in FP32, in integers as its file says, and in integers on the run's runtime. `network`: name of the
+    network that `paint` computes.
     """
 
     body: RunBody
@@ -426,10 +427,7 @@ class _Avatar:
     by_runtime: Paint
 
     def packed(self, tensor: F64, causes: Causes) -> F64:
-        """Return `tensor` (h,w,C).
-
-        If packing is on, its values are rounded and clamped to values that bytes represent.
-        """
+        """Return `tensor` (h,w,C). If packing is on, round and clamp its values to values that bytes represent."""
         if Cause.PACKING not in causes:
             return tensor
         return self.real(quantise(tensor, self.encoding.scale, self.encoding.zero_point))

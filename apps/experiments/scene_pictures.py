@@ -72,8 +72,8 @@ class ScenePictures:
     def frame(self, number: int) -> tuple[U8, Mapping[str, float]]:
         """Return (picture, times) of frame `number`: (h,w,3) uint8 sRGB, and the time in ms by stage.
 
-        The stage present does not run. A skipped stage takes almost no time. Time in which a ready thread had no core
-        does not count.
+        The stage present does not run. A skipped stage takes almost no time. The time in which a thread was ready but
+        had no core does not count.
         """
         cores, times = len(machine.here.cores()), {}
         with closing(CoreMeter()) as meter:
@@ -109,7 +109,7 @@ def wanted_pictures(cast: Cast, ctx: Any) -> tuple[Wanted, str]:
 
 
 def spread(total: int, frames: int) -> list[int]:
-    """Return the numbers of at most `frames` of `total` frames, evenly spread, from 0 on.
+    """Return the numbers of at most `frames` of `total` frames, evenly spread; the first number is 0.
 
     Raises BadInputError if `frames` is not 1 to `MAX_FRAMES`.
     """

@@ -1,4 +1,4 @@
-"""Predictions for a pipeline file on a chip: for the file as it is, and for a variant with each `--set`.
+"""Predictions for a pipeline file on a chip: for the file as it is, and for the variant that each `--set` makes.
 
 Rule: this module prints nothing and imports no Python of the file. `trilane.hw_profiles` computes the answers.
 """
@@ -120,7 +120,7 @@ class _Chips:
         """Return the chip whose unit `unit` has the precision and runtime of the network `graph` of `stage`.
 
         If the chip is this machine, `unit` is its unit for networks, and no precision is requested, calls of the
-        network are measured first. `name`: name of the stage.
+        network are measured first. `name`: name of `stage`.
         """
         options, asked = self._options, stage.precision or self._options.numbers
         key = graph.path, tuple(sorted(stage.shapes.items())), unit, asked, stage.runtime

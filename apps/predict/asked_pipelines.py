@@ -41,7 +41,7 @@ FORM = "SCENE, SCENE@RATE or NETWORK.onnx@RATE, with :gpu or :dsp behind the rat
 class AskedPipeline(NamedTuple):
     """A pipeline as typed on the command line.
 
-    `text`: the whole text, such as `face.onnx@30:gpu`. `what`: part before the @, a scene, network or pipeline file.
+    `text`: the whole text, such as `face.onnx@30:gpu`. `what`: scene, network file or pipeline file, without the rate.
     `fps`: frames a second; None for the pipeline's own rate. `unit`: unit of the network; None if not given.
     """
 
@@ -101,8 +101,8 @@ def _unit(text: str, asked_for: str) -> UnitName:
 def tenants(texts: Sequence[str], variant: Variant = NEWEST, precision: str | None = None) -> list[SharingPipeline]:
     """Return the pipeline that each of `texts` describes, in order.
 
-    `variant`: policy and edge of scenes. `precision`: int8, fp16 or fp32 for all networks; None for the precision in
-    each network's file. Stages of a pipeline file with a `precision` keep it.
+    `variant`: policy, edge and batch of scenes. `precision`: int8, fp16 or fp32 for all networks; None for the
+    precision in each network's file. Stages of a pipeline file that have a `precision` keep their own.
 
     Raises BadInputError for too many pipelines, and for a scene, network or file that cannot be used.
     """
@@ -131,7 +131,7 @@ def _tenant(each: AskedPipeline, name: str, variant: Variant, precision: str | N
 
 
 def _names(stems: Sequence[str]) -> list[str]:
-    """Return a unique name for each pipeline, in order. Equal stems get numbers.
+    """Return a name for each pipeline, in order. Equal stems get numbers.
 
     `stems`: file names of the pipelines without the suffix.
     """

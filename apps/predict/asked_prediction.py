@@ -1,8 +1,8 @@
 """Predictions from options to an answer, for the command line and for programs alike.
 
-Rule: this module neither prints nor computes. `trilane.hw_profiles` computes the answers, for this machine from the
-measurements of `this_machine.py`. In all functions, `chip` is the hardware profile of the chip, and `options` are the
-options of the prediction. `say` is a function that gets a message before an action that takes seconds.
+Rule: this module neither prints nor computes. `trilane.hw_profiles` computes the answers. If the chip is this machine,
+the answers rest on measurements by `this_machine.py`. In all functions, `chip` is the chip's hardware profile,
+`options` are the options of the prediction, and the function `say` gets a message before an action that takes seconds.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def application_of(
 ) -> tuple[Profile, Plan]:
     """Return (chip in the network's precision, avatar application with the network that `options` select).
 
-    With the profile `host`, this machine is measured with this network. It is not measured for a published network, for
-    a requested precision, and for another unit than the one for networks.
+    With the profile `host`, the network is first measured on this machine. Nothing is measured for a published network,
+    for a requested precision, or for another unit than the machine's unit for networks.
 
     Raises BadInputError for a network or avatar that cannot be read, and for options that no application has.
     """
@@ -106,8 +106,8 @@ def _network_of(chip: Profile, options: PredictOptions, say: Callable[[str], Non
 def _is_measured(chip: Profile, options: PredictOptions, unit: UnitName) -> bool:
     """Return whether the network is to be measured on this machine.
 
-    It is measured if the chip is this machine, `unit` is the unit for networks, and `options` request no precision. A
-    run then uses the network in the same way.
+    It is measured if the chip is this machine, `unit` is the unit for networks, and `options` request no precision.
+    Otherwise, a run would use the network in another way.
     """
     return chip.name == HOST and unit == INFER[1] and options.precision is None
 

@@ -66,7 +66,7 @@ OF_A_SCENE: Final = {"scene", "beside", "turns", "profile", "minutes", "policy",
     "trace",
     "precision",
 }
-#: Value of `unit` that stands for all units, to compare them.
+#: Value of `unit` that requests all units, to compare them.
 ALL_UNITS: Final = "all"
 #: Options that need a pipeline file.
 OF_A_PIPELINE_ALONE: Final = {"changes", "frames", "measured", "seed"}
@@ -247,9 +247,9 @@ class PredictOptions(Options):
     def cap(self) -> str:
         """Return the performance profile that the user gave; without one, return the usual performance profile.
 
-        The usual one is `burst` for a network by itself, because published latencies are measured with it. It is also
-        `burst` for a pipeline file, and on this machine, where a run has no cap. For any other prediction, it is
-        `sustained_high_performance`.
+        `burst` is usual for a network by itself, because published latencies are measured under it. `burst` is also
+        usual for a pipeline file, and for this machine, where a run has no cap. For any other prediction,
+        `sustained_high_performance` is usual.
         """
         if "performance_profile" in self.model_fields_set:
             return self.performance_profile

@@ -1,7 +1,7 @@
-"""Makes the verdict of a prediction: of an application, of a network by itself, or of a pipeline.
+"""Makes the verdict of a prediction for an application, for a network by itself, or for a pipeline.
 
 Rule: the functions are pure. A prediction can be trusted if the 80 % interval of its rate is known and does not contain
-the target. A prediction that rests on a run which is not trusted is not trusted either.
+the target. If a prediction uses the times of a run that is not trusted, the prediction is not trusted either.
 """
 
 from __future__ import annotations
@@ -103,8 +103,8 @@ def _judged(
     """Return the verdict of a prediction.
 
     `needs`: frame time that neither the rate nor the display limits. `target`: rate to hold, in frames a second.
-    `bound`, `lateness`, `facts`: fields of `Facts`.
-    `if_slow`, `if_fast`: proposal if the frame time is too long, or short enough; "" for none.
+    `bound`, `lateness`: fields of `Facts`. `facts`: further fields of `Facts`, by name.
+    `if_slow`: proposal if the frame time is too long. `if_fast`: proposal if it is short enough. Each may be "".
     `is_held`: whether only the refresh rate of the chip's display limits the rate.
     `of_run`: judgement of the run whose times the prediction uses; None if it uses no run.
     """
@@ -148,10 +148,10 @@ def _trust_in(low: float | None, high: float | None, target: float, *, is_held: 
 
 
 def _bound(stages: Mapping[str, tuple[str, float]], frame_ms: float, *, is_held: bool = False) -> NamedBound | None:
-    """Return the bound: the unit whose stages take most of a frame's time; None if none takes time.
+    """Return the bound: the unit whose stages take most of a frame's time; None if no stage takes time.
 
-    `stages`: (unit, time in ms) of each stage that counts. `frame_ms`: time of a frame.
-    `is_held`: whether the display limits the rate, so that it is the bound.
+    `stages`: (unit, time in ms) of each stage that counts, by name; at least one. `frame_ms`: time of a frame.
+    `is_held`: whether the display limits the rate. In this case, the display is the bound.
     """
     by_unit: dict[str, float] = {}
     for unit, ms in stages.values():

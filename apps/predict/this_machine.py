@@ -1,7 +1,7 @@
 """Adds measurements of this machine to the profile `host`: calls of a network, and stages of an avatar's run.
 
-Rule: a measurement is announced and takes at most half a minute. Its result is kept for this machine and these
-packages, so the measurement happens once. If a measurement fails, a message says why. The profile then stays as it is,
+Rule: a measurement is announced and takes at most half a minute. The result is stored for this machine and its
+packages, so each measurement happens once. If a measurement fails, a message says why. The profile then stays as it is,
 and its predictions have no interval.
 """
 
@@ -38,7 +38,7 @@ Say = Callable[[str], None]
 
 
 def with_avatar(chip: Profile, avatar: str, say: Say) -> tuple[Profile, Network]:
-    """Return (`chip` with measured times of a run of `avatar`, the avatar's network at the run's usual tensor shape).
+    """Return (`chip` with measured times of a run of `avatar`, the avatar's network at the usual tensor shape).
 
     `chip`: profile `host`. `avatar`: name or folder.
     `say`: function that gets a message before a measurement, and after a measurement that failed.
@@ -90,7 +90,7 @@ def with_first(chip: Profile, text: str, say: Say) -> Profile:
 def with_file_in_application(chip: Profile, graph: GraphFile, shapes: Mapping[str, Sequence[int]], say: Say) -> Profile:
     """Return `chip` with the measured times of an application: the default avatar's stages with the network in `graph`.
 
-    A run of the default avatar and calls of the network are measured apart. If one of the two measurements fails,
+    A run of the default avatar and calls of the network are measured one after the other. If a measurement fails,
     `chip` is returned unchanged. `chip`, `graph`, `shapes`, `say`: as in `with_file`.
     """
     usual, _ = with_avatar(chip, DEFAULT, say)

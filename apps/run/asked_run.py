@@ -68,7 +68,7 @@ def prepare(
     """Check `options`, and return the prepared run.
 
     `gl`: function from `early_processes`. `command`: words of the command line.
-    `hooks`: see `run_asked`; a message is sent if the check takes long. None: no message is sent.
+    `hooks`: see `run_asked`; a message is sent if the check takes long. For None, no message is sent.
     Raises BadInputError for wrong input, and MissingPartError if a part that the run needs is absent.
     """
 
@@ -134,7 +134,7 @@ def _require_check(checked: Checked) -> None:
 
 @contextmanager
 def early_processes() -> Iterator[tuple[UnitStarter, GlFacts]]:
-    """Start the fork server and, because an OpenGL driver may crash, a separate process that examines the driver.
+    """Start the fork server, and a process that examines the OpenGL driver, because a driver may crash its process.
 
     Yield (fork server, function). The function waits for the facts about OpenGL and returns them.
     Raises TrilaneError if there is too little memory for a run.

@@ -28,9 +28,9 @@ from trilane.transport.slots import DEFAULT_EDGE
 from trilane.units import BEFORE_INFER, BYPASS, SUSTAINED, TARGET_FPS
 
 MAX_SLOW_MOTION = 1000.0
-#: Delay at the end of a job that does not count as late: waking up takes this long on a quiet machine.
+#: A job counts as late if it ends later than this after its time: waking up takes this long on a quiet machine.
 SLACK_NS = 200_000
-#: Number of frames, counted from a late one on, whose times it may have changed: those in flight, and one more.
+#: A late frame may change the times of this many frames, itself included: the frames in flight and one more.
 WAKE_FRAMES = 8
 
 
@@ -40,7 +40,7 @@ class Pace:
 
     `profile`: hardware profile of the chip, by name. `performance_profile`: performance profile of the chip.
     `slow_motion`: factor by which the run is slower than the chip.
-    `stage_ns`: time in ns to which a job is stretched, by stage.
+    `stage_ns`: time in ns to which a job is stretched, by stage. It includes the slow motion.
     """
 
     profile: str
@@ -143,9 +143,10 @@ def _presented(jobs: Sequence[JobRecord]) -> tuple[list[int], list[int]]:
 
 
 def _in_time(jobs: Sequence[JobRecord], late_frames: Sequence[int]) -> list[tuple[int, int]]:
-    """Return (frame number, ns since the previous presented frame) for each frame that no late frame disturbed.
+    """Return (frame number, ns since the previous presented frame) for each presented frame that is not disturbed.
 
-    `jobs`: all jobs of the run. `late_frames`: numbers of the frames with a job that took too long.
+    A late frame disturbs the frame before it and the WAKE_FRAMES frames from itself on. `jobs`: all jobs of the run.
+    `late_frames`: numbers of the frames with a job that took too long.
     """
     frames, ends = _presented(jobs)
     disturbed = {near for frame in late_frames for near in range(frame - 1, frame + WAKE_FRAMES)}

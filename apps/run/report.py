@@ -91,9 +91,9 @@ class PaceComparison(Record):
     `slow_motion`: factor by which the run is slower than the chip.
     `stage_ms`: time in ms to which a job was stretched, by stage.
     `host_slower`: number of jobs that took longer on this machine than `stage_ms`, by stage.
-    `late_frames`: numbers of the frames that had a job which took longer.
+    `late_frames`: numbers of the frames of these jobs.
     `virtual_ms`: median frame time in virtual time.
-    `measured_ms`: median frame time of the run, without the late frames and their neighbours; null if no frame is left.
+    `measured_ms`: median frame time of the run, without late frames and frames near them; null if no frame is left.
     `compared_share`: share of the frames that `measured_ms` counts.
     `ratio`: `measured_ms` / `virtual_ms`; null if `measured_ms` is null.
     """
@@ -213,13 +213,13 @@ class UnitTime(Record):
 class PlacementFacts(Record):
     """The placement of the units, and how it was chosen (`trilane.stages.placing`).
 
-    `how`: way in which the placement was chosen. `tried`: by a trial with real frames. `measured`: by predictions from
-    measured times. `asked`: by the user. `rule`: by the rule for any run.
+    `how`: what decided: `tried` (a trial with real frames), `measured` (predictions from measured times), `asked` (the
+    user) or `rule` (the rule that needs no measurement).
     `why`: reason in words.
     `units`: place of each unit, by name.
     `measured_at`: time of the measurement, UTC. This field and all fields below are absent if nothing was measured.
     `predicted_ms`: predicted frame time under the run's policy.
-    `rule`, `rule_ms`: placement by the rule for any run, and its predicted frame time.
+    `rule`, `rule_ms`: placement by the rule that needs no measurement, and its predicted frame time.
     `alternatives`: next best placements, the shortest predicted frame time first.
     `times`: a row for each unit and number of threads; medians over distinct frames, with one job at a time.
     `tried`: placements that were tried with real frames, before this run or an earlier run; absent without a trial.
@@ -271,7 +271,7 @@ class VerdictBound(Record):
 
     `unit`: unit that bounds the frame time, or another cause, such as `other programs`.
     `share`: share of this unit in the critical path.
-    `stages`: names of the stage that bounds, and after it of the unit's stages with a noticeable share of the path.
+    `stages`: name of the stage that bounds, followed by the unit's other stages with a noticeable share of the path.
     """
 
     unit: str
@@ -343,8 +343,8 @@ class Preamble(Record):
     `schema_`: version of the format, 1; `schema` in the file.
     `clock`: clock of all times.
     `machine`: machine on which the run was measured.
-    `config`: the RunConfig as JSON, without folders, with `policy` and `edge`.
-    `plan`: sizes that follow from the scene; absent for a pipeline file.
+    `config`: RunConfig of a scene's run, without folders, or tables of a pipeline file; also `policy` and `edge`.
+    `plan`: tensor shapes that follow from the scene; absent for a pipeline file.
     `caps`: limits on the work of the units.
     """
 
@@ -367,13 +367,13 @@ class Report(RunMetrics, Preamble):
     """The whole document: the keys of `Preamble`, the other keys of `RunMetrics`, and the following keys.
 
     `temperature_c`: temperatures in °C.
-    `verdict`: judgement whether the run holds its rate, what bounds it, and whether its times can be trusted; absent in
-    older reports.
-    `made`: time, command line and Trilane of the run; null for a run without a command line.
+    `verdict`: whether the run holds its rate, what bounds it, and whether its times can be trusted; absent in older
+    reports.
+    `made`: time and command line of the run, and version of Trilane; null for a run without a command line.
     `options`: value of every option of the run, by name; empty in older reports.
     `pids`: process number of each unit at the end of the run, by unit.
     `startup_ms`: time until the unit was ready, by unit.
-    `stage_metrics`: mean of each metric of a stage's jobs, by metric, by stage; `figures` in the file.
+    `stage_metrics`: mean of each metric over a stage's jobs, by stage and metric; `figures` in the file.
     `messages`: sentences for a person about faults during the run.
     `interrupted`: whether a signal ended the run.
     `failure`: reason for an early end; null for a run that did not fail.
@@ -384,10 +384,10 @@ class Report(RunMetrics, Preamble):
     `accuracy`: figures of each avatar's validation, or why there are none, by avatar; the result of
     `trilane.avatars.validation.accuracy_of`.
     `check`: image error of frames of this run; absent without a check.
-    `sources`: source of figures, by their key or by a key that contains them (dotted path); the longest key applies.
+    `sources`: source of figures, by dotted key. A key also covers all keys below it, unless a longer key matches.
     `notes`: format of each file that was read, and choices that were made for the run.
     `video`: facts about video.mp4; null if no frame was recorded.
-    `checksum`: SHA-256 over the presented pictures; null if no frame was recorded.
+    `checksum`: SHA-256 over the presented pictures' numbers and digests; null if some or all were not recorded.
     """
 
     caps: Caps

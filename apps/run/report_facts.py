@@ -76,7 +76,7 @@ def report_of(
     baseline: RunResult | None = None,
     facts: Mapping[str, Any],
 ) -> Report:
-    """Build the report of a run on the host clock. Raises ValueError that names a wrong or unknown key.
+    """Build the report of a run on the host clock. Raises ValueError, which names a wrong or unknown key.
 
     `result`: result of the run. `config`: block `config` of the report. `machine`: result of `machine_facts`.
     `baseline`: result of the `sequential` run of the same pipeline; None without such a run.
@@ -112,7 +112,7 @@ def _compared(metrics: RunMetrics) -> PolicyMetrics:
 def sources_of(report: Report) -> dict[str, str]:
     """Return the source of each figure in a report, by dotted key.
 
-    The figures `least` and `ratio` of a stage's bytes need own sources, because they are not measured.
+    The figures `least` and `ratio` of a stage's bytes have sources of their own, because they are not measured.
     """
     document = report.as_json()
     sources = {key: source for key, source in SOURCES.items() if _holds(document, key.split("."))}
@@ -199,7 +199,7 @@ def resolution_of(rungs: Mapping[int, int], switches: int, config: RunConfig, lo
     """Return the sizes of a run's tensors, with the loss of PSNR in each.
 
     `rungs`: number of presented frames by rung; each rung has one tensor size. `switches`: number of presented frames
-    whose rung differs from that of the previous frame. `config`: configuration of the run. `losses`: loss of PSNR by
+    whose rung differs from the previous frame's rung. `config`: configuration of the run. `losses`: loss of PSNR by
     tensor size, for each avatar of the scene.
     """
     sizes = tuple(

@@ -109,8 +109,8 @@ def imports_of(file: PipelineFile) -> list[str]:
 def frames_of(file: PipelineFile) -> int:
     """Return the number of frames of a run of `file`.
 
-    The key `run.frames` states the number. Without this key, the shortest video determines the number; its length is
-    counted at the run's rate. Without a video, the number is DEFAULT_FRAMES.
+    The key `run.frames` states the number. Without this key, the run lasts as long as the shortest video. Without a
+    video, the number is DEFAULT_FRAMES.
     Raises BadInputError for a video that cannot be read.
     """
     if file.run.frames is not None:
@@ -137,8 +137,8 @@ def _footage_of(file: PipelineFile, stage: VideoBlock) -> FoundPictures:
 def picture_fps(file: PipelineFile) -> float:
     """Return the rate of the videos that a run of `file` writes, in frames a second.
 
-    The key `run.fps` states the rate. Without this key, the first video that the run reads determines the rate. Without
-    a video of known rate, the rate is DEFAULT_FPS. Raises BadInputError for a video that cannot be read.
+    The key `run.fps` states the rate. Without this key, it is the rate of the first video with a known rate that the
+    run reads. Without such a video, it is DEFAULT_FPS. Raises BadInputError for a video that cannot be read.
     """
     if file.run.fps is not None:
         return file.run.fps
@@ -266,8 +266,8 @@ def _bypassed(
 ) -> tuple[PipelineStage, ...]:
     """Return `stages` as a chain with the bypass of `file`.
 
-    The stage where the bypass begins learns how the bypass works. The stage where the bypass ends learns the ports of
-    the stage where the bypass begins.
+    The stage where the bypass begins gets the keys of the bypass in its settings. The stage where the bypass ends gets
+    the ports of the stage where the bypass begins.
     `types`: types of all ports. `rules`: rule of each edge, by the name of the stage that writes to the edge.
     """
     assert file.bypass is not None
@@ -292,11 +292,11 @@ def _factory(stage: StageKeys) -> str:
 
 
 def _keys(file: PipelineFile, name: str, stage: StageKeys, networks: Mapping[str, GraphFile]) -> dict[str, Any]:
-    """Return the settings of `stage`: the keys of its kind, and facts from other tables of `file`.
+    """Return the keys of `stage` that only its kind of stage has, with facts from other tables of `file`.
 
     `name`: name of the stage. `networks`: networks by stage.
-    Raises BadInputError for a network without weights, for a network with an input that is not numbers, and for a video
-    that cannot be read. Raises MissingPartError if a runtime is not installed.
+    Raises BadInputError for a network without weights or with an input that is not numbers, and for a video that cannot
+    be read. Raises MissingPartError if a runtime is not installed.
     """
     common = set(StageKeys.model_fields)
     keys: dict[str, Any] = {
@@ -350,8 +350,8 @@ TAKEN: Final = (*OF_THE_RUN, "runtime", "changes", "out")
 class Watch(Protocol):
     """A viewer that shows a run and steers the run.
 
-    A watched run lasts until the viewer ends it. The option `frames` and the key `arrivals` of the file limit the
-    number of its frames.
+    A watched run lasts until the viewer ends it, unless the option `frames` or the file's key `arrivals` limits the
+    number of frames.
     `controls`: requests of the viewer to the run.
     """
 

@@ -39,9 +39,9 @@ def write_files(work: Path, fps: float, frames: int) -> tuple[dict[str, Any], Un
 
     `facts` has two keys of the report. `video` has the fields of `trilane.apps.run.report.Video`; it is None without a
     video. `checksum` is the result of `run_checksum`; it is None if segments were removed.
-    `error` is None if every file is complete. If a file is not, `error` says that the disk is full, or that segments
-    were removed during the run. On a full disk, each file is complete or absent, and the segments stay until the video
-    and the contact sheet are complete. If segments were removed, the files are made from the remaining segments.
+    `error` is None if every file is complete. Otherwise, it says that the disk is full, or that segments were removed
+    during the run. On a full disk, each file is complete or absent, and the segments stay until the video and the
+    contact sheet are complete. If segments were removed, the files are made from the remaining segments.
 
     `fps`: frames a second of the scene. `frames`: least number of frames that the segments should contain.
     Raises BadInputError for a broken journal.
@@ -66,7 +66,7 @@ def write_files(work: Path, fps: float, frames: int) -> tuple[dict[str, Any], Un
 
 @contextmanager
 def _whole_or_absent(*files: Path) -> Iterator[None]:
-    """Remove `files` if the `with` block that writes them fails. Raises UnwrittenError if the disk is full."""
+    """Remove all `files` if the block that writes them fails. Raises UnwrittenError if the disk is full."""
     try:
         with full_disk_told(files[0]):
             yield
@@ -114,8 +114,8 @@ def join_folder(
     """Join the segments in the folder `segments` to the video `target`. Return (video, error).
 
     `video` is None if no segment contains a frame. `error` says that files were removed during the run; it is None if
-    no file is missing. Counts show missing files: each encoded frame has a line in a digest file. A segment contains
-    the frames of these lines, except perhaps the last frame if the process that wrote the segment was killed.
+    no file is missing. Numbers of frames reveal missing files. Each encoded frame has a line in a digest file, and its
+    picture is in the segment beside this file. Only the last picture may be missing, if a kill interrupted its writing.
     `fps`: frames a second of the scene. `frames`: least number of frames that were encoded.
     Raises UnwrittenError if the disk is full.
     """
@@ -138,8 +138,8 @@ def join_segments(segments: list[Path], target: Path, fps: float) -> JoinedVideo
     `target`: MP4 file to write.
     `fps`: frames a second of the scene.
     Each line of a digest file has the number of a frame. The number determines the time at which the frame's packet is
-    shown. If the previous packet ends later than this time, the packet is shown right after the previous packet. A
-    truncated segment is used up to its end.
+    shown. If the previous packet ends later than this time, the packet is shown right after the previous packet. Of a
+    truncated segment, all complete packets are copied.
     """
     readable = [path for path in segments if _has_packets(path)]
     if not readable:
@@ -166,15 +166,12 @@ def _frame_numbers(segment: Path) -> list[int]:
 
 
 def _digest_lines(path: Path) -> list[str]:
-    """Return the lines of the digest file `path`, without the last line if it is incomplete in a truncated file."""
+    """Return the lines of the digest file `path`, without a last line that is incomplete."""
     return [line for line in path.read_text(encoding="ascii").splitlines(keepends=True) if line.endswith("\n")]
 
 
 def _packets(container: Any) -> Iterator[Any]:
-    """Yield the packets of the video stream of `container`, a file that PyAV has opened.
-
-    From a truncated file, the complete packets come.
-    """
+    """Yield the complete packets of the video stream of `container`, a file that PyAV has opened."""
     try:
         for packet in container.demux(video=0):
             if packet.pts is not None and packet.size:
@@ -207,7 +204,7 @@ def run_checksum(digests: list[Path]) -> str | None:
 def contact_sheet(video: Path, target: Path, fps: float) -> int:
     """Write the PNG `target` with up to COLUMNS x ROWS evenly spaced frames of `video`; return how many frames it has.
 
-    The first and the last frame of the video are among them. Each picture is labelled with the number of its frame.
+    The first and the last frame of the video are among them. Each picture shows the number of its frame.
     `fps`: frames a second of the scene. Raises av.error.FFmpegError if the video cannot be decoded.
     """
     with av.open(str(video)) as container:
@@ -224,7 +221,7 @@ def contact_sheet(video: Path, target: Path, fps: float) -> int:
 def _decode_all(container: Any, wanted: list[int]) -> Iterator[tuple[int, Image.Image]]:
     """Yield (pts, thumbnail) for each pts in `wanted`, in one pass over the video.
 
-    A pts is the time at which a frame is shown, in units of the stream's time base.
+    The pts of a frame is the time at which it is shown, in units of the stream's time base.
     """
     container.seek(0)
     for frame in container.decode(video=0):

@@ -1,4 +1,4 @@
-"""The folder that a run writes. Until the folder is complete, it has a temporary name in the same parent folder.
+"""Makes the folder of a run. Until the folder is complete, it has a temporary name in the same parent folder.
 
 Rule: a folder with the run's name is complete; a folder whose name ends in `.partial` is not. If a file cannot be
 written, as on a full disk, the written files stay in the partial folder, and the error names this folder.
@@ -36,8 +36,8 @@ def require_free(target: Path) -> None:
 def default_place(scene: str) -> Path:
     """Return the path `runs/<UTC time>-<scene>` in the working directory.
 
-    `scene`: name of the scene; characters that a file name should not have become `-`. If another run has the path,
-    `-2`, `-3` and so on is added.
+    `scene`: name of the scene; characters that a file name should not have become `-`. If another run has the path, the
+    name ends in `-2`, `-3` and so on.
     """
     stamp = machine.here.now().strftime("%Y%m%dT%H%M%SZ")
     safe = "".join(letter if letter.isalnum() or letter in "-_" else "-" for letter in scene)
@@ -53,9 +53,9 @@ class RunFolder:
 
     Without `complete`, the exit removes `work` and the parent folders that the entry made. RESERVED_BYTES on the disk
     stay reserved for the report until `release`.
-    The entry raises BadInputError if `target` exists, or if another live run will get that path. The entry raises the
-    same error if `work` cannot be made, or if the disk has no room for a report. The entry raises UnwrittenError if a
-    limit of this process forbids a file of RESERVED_BYTES.
+    The entry raises BadInputError if `target` exists or another live run will get that path. It also does if `work`
+    cannot be made, or if the disk has no room for a report. The entry raises UnwrittenError if a limit of this process
+    forbids a file of RESERVED_BYTES.
     The exit raises TrilaneError if `work` was moved or removed, or if the block ends because a file could not be
     written. In the latter case, `work` stays if it has content.
     """
@@ -151,10 +151,9 @@ class RunFolder:
             raise TrilaneError(f"{failed}; {left}") from error
 
     def _unwritten(self, error: BaseException | None) -> str:
-        """Return a text that says which file could not be written, and why.
+        """Return a text that says which file could not be written, and why; "" if `error` has another cause.
 
-        `error`: exception that ended the `with` block; None if no exception did. For None, and for an exception with
-        another cause, the text is "".
+        `error`: exception that ended the `with` block; None without an exception.
         """
         if isinstance(error, UnwrittenError):
             return str(error)
@@ -181,7 +180,7 @@ class RunFolder:
 
 
 def _partial(target: Path) -> Iterator[Path]:
-    """Yield the `.partial` folders of all runs, live or ended, that were to write `target`."""
+    """Yield the `.partial` folders of all runs, live or ended, whose final path is `target`."""
     return target.parent.glob(f"{glob.escape(target.name)}.*.partial")
 
 

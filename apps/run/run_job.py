@@ -48,7 +48,7 @@ if TYPE_CHECKING:
 
 BASELINE_POLICY = "sequential"
 INTERRUPTED = 130
-ENDLESS = 1_000_000_000  # frames of a run that somebody watches: a year at 30 a second
+ENDLESS = 1_000_000_000  # frames of a watched run that no number limits: a year at 30 frames a second
 NO_VIDEO = "no video, no contact sheet and no checksum: the frames were presented without, as was asked for"
 TRUTH = "the truth: the clothed body that the avatar was trained on"
 FLOAT_PATH = "the float path: float64 body and raster, FP32 network"
@@ -102,7 +102,7 @@ class Watched:
 
 @dataclass(frozen=True)
 class RunOutcome:
-    """The end of a run. `report`: report as written. `folder`: path of the run folder. `exit_code`: of the command."""
+    """How a run ended. `report`: written report. `folder`: run folder. `exit_code`: exit code for the command."""
 
     report: Report
     folder: Path
@@ -126,10 +126,11 @@ def run_to_folder(
     `hooks`: callbacks of the run.
     `machine`: result of `machine_facts`.
     `made`: result of `trilane.apps.run.report_facts.made_facts`; None for a run without a command line.
-    `starter`: fork server that runs already; None: the units are not placed on cores for this run.
+    `starter`: fork server that runs already; None if the units shall not be placed on cores for this run.
     `watched`: viewer of the run; None if nobody watches the run.
-    Raises BadInputError if `target` cannot be written. Raises TrilaneError if no frame was presented, or if a file
-    could not be written. If a file could not be written, the written files stay in a folder that the message names.
+    Raises BadInputError if `target` cannot be written. Raises TrilaneError if no frame was presented, KeyboardInterrupt
+    if an interruption was the cause. Raises TrilaneError if a file could not be written; the message then names the
+    folder in which the written files stay.
     """
     options, checked, pace = prepared.options, prepared.checked, prepared.pace
     with RunFolder(target) as folder:
@@ -285,7 +286,7 @@ class _Job:
 def _checked_frames(checked: Checked, work: Path, hooks: Hooks, interrupted: Callable[[], bool]) -> dict[str, Any]:
     """Check the run's frames, and return {"check": block `check` of the report}.
 
-    If the check fails or is interrupted, return {"notes": all notes of the report, the last of which says why}.
+    If the check fails or is interrupted, return {"notes": the notes of the report, and a last note that says why}.
     `checked`: configuration of the run. `work`: run folder; its lossless pictures are removed after the check.
     `hooks`: callbacks of the run. `interrupted`: function that returns whether the check shall end; it is called before
     the check and after each frame.
@@ -373,9 +374,9 @@ def require_parts(bundles: Iterable[Bundle]) -> None:
 
 
 def check_run(checked: Checked, folder: Path, told: Callable[[int, int], None] = lambda *_: None) -> dict[str, Any]:
-    """Compare the pictures stored in `folder` with the float path and with the truth; return the block `check`.
+    """Compare the pictures stored in `folder` with the truth and the float path; return the report's block `check`.
 
-    The block belongs to report.json. Only bundled avatars have a truth; without it, the float path alone is compared.
+    Only bundled avatars have a truth. Without it, the pictures are compared with the float path alone.
     Frames without a visible avatar are left out. The figures count the region that contains the avatars. The IoU
     compares masks of the pixels that differ from the background.
     `checked`: configuration of the run. `folder`: run folder with the stored pictures.

@@ -17,11 +17,11 @@ from typing import Any, Final, NamedTuple
 from trilane.scheduler.stats import NEEDED
 from trilane.units import HOST_CLOCK
 
-#: Share of the cores' time. If other programs take more, the run is not trusted, and a comparison names it.
+#: Share of the cores' time. If other programs take more, the run is not trusted, and comparisons say so.
 MOST_OTHERS = 0.05
 #: Temperature in °C at which processors may slow down. Laptops and phones begin at 90 to 105 °C.
 HOT_C = 90.0
-#: Relative change of the processor's clock frequency, from the begin to the end of a run, that is still trusted.
+#: Largest relative change of the processor's clock frequency, from begin to end, of a run that is trusted.
 CLOCK_CHANGE = 0.1
 
 
@@ -102,7 +102,7 @@ UNKNOWN: Final = "not known"
 NO_RATE: Final = f"the rate is {UNKNOWN}: fewer than two frames were presented"
 #: Words beside the figures of a live run, and of a prediction.
 SO_FAR, COMPUTED = "so far", "computed"
-#: Words beside a predicted rate that needs a source which always has a frame.
+#: Words beside a predicted rate that is only reached if the next frame is always ready.
 ALWAYS_FED: Final = "if always fed"
 #: Name of the bound if the refresh rate of the chip's display limits a prediction.
 DISPLAY: Final = "display"
@@ -131,8 +131,9 @@ class Rate(NamedTuple):
 class LateFrames(NamedTuple):
     """The numbers of frames that were not in time.
 
-    `due`: number of frames that had to be in time. `late`, `dropped`, `lost`: numbers of these frames that were
-    presented late, dropped and lost. `replaced`: number of frames that were dropped in a run that no rate releases.
+    `due`: number of frames that had to be in time. `late`, `dropped`, `lost`: numbers of frames that were presented
+    late, dropped and lost. `replaced`: number of frames that newer frames replaced, in a run whose frames no fixed rate
+    releases; these frames do not count as dropped.
     """
 
     due: int
@@ -154,7 +155,7 @@ class NamedBound(NamedTuple):
     stages of the unit. `share`: share of the unit in the critical path, 0 to 1.
     `cost`: relative growth of the frame time if the unit's jobs take 20 % longer; None if only the path is known.
     `rivals`: names of units that may bound as much. `of_unit`: names of all stages of `unit`.
-    `path`: name of the unit with the largest share of the path; "" if this is `unit`.
+    `path`: name of the unit with the largest share of the path; "" if this is `unit`, or unknown.
     """
 
     unit: str
@@ -171,7 +172,7 @@ class Facts:
     """The facts that a verdict rests on.
 
     In all fields, None means that the value is unknown.
-    `rate`: rate of presented frames; None for fewer than two frames. `target_fps`: rate to hold, in frames a second.
+    `rate`: rate of presented frames; None for fewer than two frames. `target_fps`: rate to hold, frames a second.
     `lateness`: numbers of frames that were not in time. `trust`: judgement whether the times can be trusted.
     `is_held_to_rate`: whether a fixed rate releases the frames. In that case, `rate` proves nothing, and only
     `lateness` counts.
@@ -291,8 +292,8 @@ def _late(found: LateFrames) -> str:
 def _held(facts: Facts) -> str:
     """Return the rate and the late frames as a text, such as `96 fps (92 to 102), at 30 fps 0 of 299 frames late`.
 
-    For a run that failed, the text is the reason. If a fixed rate releases the frames, the first number is followed by
-    `shown`. In a prediction that counts late frames, the first number is followed by ALWAYS_FED.
+    For a run that failed, the text is the reason. If a fixed rate releases the frames, `shown` follows the measured
+    rate. In a prediction that counts late frames, ALWAYS_FED follows the predicted rate.
     """
     if facts.failure:
         return f"the run ended early: {facts.failure}"
@@ -388,7 +389,7 @@ def slow_percentile(times: Mapping[str, float | None]) -> tuple[str, float] | No
 
 
 def _apart(one: float, other: float) -> tuple[str, str]:
-    """Return two numbers as texts of three digits. If these texts are equal, more digits tell the numbers apart."""
+    """Return two numbers as texts of three digits. If these texts are equal, more digits show the difference."""
     texts = _number(one), _number(other)
     for digits in range(4, 17) if one != other else ():
         if texts[0] != texts[1]:

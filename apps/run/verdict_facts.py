@@ -1,7 +1,7 @@
 """Makes the facts of a verdict from a report, or from the figures of a live run.
 
-Rule: the functions are pure. The verdict leaves out unknown values. A report and a live run name their bound, and the
-verdict has the same bound.
+Rule: the functions are pure. The verdict leaves out unknown values. It does not look for a bound, but uses the bound
+that the report or the live run names.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from trilane.units import NO_FIGURES, TARGET_FPS
 if TYPE_CHECKING:
     from trilane.apps.watch.figures import MomentFigures, StageFigures
 
-#: Ratio of latency to the latency of a frame alone. Above this ratio, the verdict proposes late latching.
+#: Ratio of the latency to the latency with one frame at a time. Above it, the verdict proposes late latching.
 MUCH_LATER: Final = 2.0
 #: Unused share of a frame's time from which the verdict proposes larger pictures.
 MUCH_LEFT: Final = 0.5
@@ -55,7 +55,7 @@ def verdict_of(report: Report, folder: str = "") -> Verdict:
 def facts_of(
     run: RunMetrics, config: Mapping[str, Any], accuracy: Mapping[str, Mapping[str, Any]], folder: str = ""
 ) -> Facts:
-    """Return the facts on which the verdict of a run that has ended rests.
+    """Return the facts for the verdict of a run that has ended.
 
     `run`: figures of the run; a `Report` also has its failure, baseline, check and pace. `config`, `accuracy`: blocks
     of report.json. `folder`: see `verdict_of`.
@@ -87,7 +87,7 @@ def facts_of(
 
 
 def facts_so_far(figures: MomentFigures, late: int, config: Mapping[str, Any], policy: str) -> Facts:
-    """Return the facts on which the verdict of a run that goes on rests.
+    """Return the facts for the verdict of a run that still goes on.
 
     `figures`: figures so far. `late`: number of late frames so far. `config`: block `config` of report.json, as far as
     it is known. `policy`: policy of the run.
@@ -175,8 +175,8 @@ def _causes(idle: Mapping[str, float | None]) -> dict[str, float]:
 def _image(config: Mapping[str, Any], accuracy: Mapping[str, Mapping[str, Any]], check: Check | None = None) -> str:
     """Return a text on the image error of a run.
 
-    If the run's frames were checked, the text has their error. If they were not, the text has the error from the
-    validation of the worst avatar, or says that the error is unknown. `config`, `accuracy`: blocks of report.json.
+    If the run's frames were checked, the text has their error. Otherwise, it has the error in the validation of the
+    worst avatar, or says that the error is unknown. `config`, `accuracy`: blocks of report.json.
     """
     if check:
         against, least = check.against.partition(":")[0], check.worst_psnr_db
@@ -232,7 +232,7 @@ def _shorter(run: RunMetrics, config: Mapping[str, Any], bound: NamedBound | Non
     """Yield proposals to shorten the frame time.
 
     For a run with one frame at a time, the first proposal is a policy under which the units work at once. If a unit
-    bounds the run, and not, for example, the rate, another proposal concerns the stage that bounds.
+    bounds the run, another proposal concerns the stage that bounds.
     `run`, `config`, `bound`: see `_tries`.
     """
     if works_on_one_frame(run.policy) and len(run.units) > 1:

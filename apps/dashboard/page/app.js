@@ -1,4 +1,4 @@
-// The page. Rule: a message goes to the panels that show it, and one loop a browser picture draws what has changed.
+// The page. Rule: each message goes to the panels that show it. One loop draws what has changed, once a browser frame.
 
 import { Chart } from "./charts.js";
 import { Connection, withToken } from "./connection.js";
@@ -25,7 +25,7 @@ import { byId, clock, isNumber, setText, words } from "./text.js";
 import { followThemeSwitch, onThemeChange } from "./theme.js";
 import { Timeline } from "./timeline.js";
 
-// The page shares the cores with the run: where there are few it draws what moves half as often as the screen could.
+// The page shares the cores with the run. On a machine with few cores, the page draws about half as often.
 const FEW_CORES = 4;
 const DRAW_EVERY_MS = navigator.hardwareConcurrency > FEW_CORES ? 0 : 30;
 const NOTE_EVERY_MS = 250;
@@ -43,7 +43,7 @@ let accuracy = null;
 let run = { name: "" };
 let isLive = true;
 let isOver = false;
-let isReported = false; // what bounded it
+let isReported = false; // whether the report says what bounded the run
 let state = "";
 let span = [0, 0];
 let drawnAt = 0;
@@ -139,7 +139,7 @@ function figured(figures) {
   if (!isSurvey) showFigures(figures);
 }
 
-// The first figures of a finished run end what the server says unasked; from then on it answers.
+// The first figures of a finished run come unasked, and end the server's greeting. All later figures are answers.
 function answered(figures) {
   if (!seek.isOn) seek.begin(span);
   else {
@@ -160,7 +160,7 @@ function showFigures(figures) {
   }
 }
 
-// Of a run that goes on as far as it is known, of one that is over as its report has it.
+// `bound`: of a run that goes on, the bound so far; of a finished run, the bound in its report.
 function showBound(bound) {
   byId("bound-part").hidden = !bound;
   if (!bound) return;

@@ -1,5 +1,5 @@
-// Figures over time. Rule: as many moments as two minutes of a live run have, no more; what nobody sees is not drawn
-// again. It is drawn once, so that the page below it stands still when it comes into view.
+// Figures over time. Rule: a chart has at most POINTS moments. A chart that nobody sees is not drawn again. It is drawn
+// once, so that the page below it does not move when the chart comes into view.
 /* global uPlot */
 
 import { colour, onThemeChange } from "./theme.js";
@@ -9,7 +9,7 @@ const POINTS = 480; // two minutes, at four a second
 const HEIGHT = 130;
 const DASHES = [[], [6, 3], [2, 3], [8, 3, 2, 3], [4, 4], [1, 2]];
 
-// One chart in the element `home`. `read(figures)` gives {name: number or null}; series come and go with its names.
+// One chart in the element `home`. `read(figures)` returns {name: number or null}; each new name adds a series.
 export class Chart {
   constructor(home, unit, digits, read) {
     this.home = home;
@@ -43,7 +43,7 @@ export class Chart {
     this.plot = null;
   }
 
-  // In the order of time, whatever the order of the calls; the oldest go when there are too many.
+  // Keeps the figures sorted by time, whatever the order of the calls. If there are too many, the oldest are dropped.
   add(figures) {
     const row = this.read(figures);
     const time = figures.t_ms / 1000;
@@ -64,7 +64,7 @@ export class Chart {
     this.isDirty = true;
   }
 
-  // The moment of a finished run that is shown.
+  // Marks the moment `time`, in ms, of a finished run.
   mark(time) {
     this.marked = time / 1000;
     this.isDirty = true;
@@ -79,12 +79,12 @@ export class Chart {
     if (this.plot) this.plot.setData([this.times, ...columns]);
     else {
       this.plot = new uPlot(this.#options(), [this.times, ...columns], this.home);
-      this.isDirty = true; // it has its scales, which the cursor needs, once it was drawn
+      this.isDirty = true; // the cursor needs the plot's scales, which exist only after a drawing
     }
     this.#point();
   }
 
-  // While nobody points at the chart, its legend has the newest values, or those of the moment that is marked.
+  // While nobody points at the chart, its legend shows the values at the marked moment, or else the newest values.
   #point() {
     const { plot } = this;
     if (plot.over.matches(":hover")) return;

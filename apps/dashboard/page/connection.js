@@ -1,9 +1,9 @@
-// The one WebSocket. Rule: it says of itself what it is, and comes back by itself while there is a run; of pictures
-// there is never more than one request on its way, so a slow page gets fewer of them and makes nobody wait.
+// The one WebSocket. Rule: it reports its state, and connects again until the run is over. At most one request for a
+// picture is on its way, so a slow page gets fewer pictures and makes nobody wait.
 
 const FIRST_RETRY_MS = 500;
 const LONGEST_RETRY_MS = 8000;
-const STEADY_MS = 5000; // a connection that lasted so long was a good one
+const STEADY_MS = 5000; // after a connection that lasted so long, the first retry comes soon again
 const JSON_KIND = 1;
 const PICTURE_KIND = 2;
 const PICTURE_HEADER_BYTES = 21;
@@ -20,7 +20,7 @@ export function withToken(path) {
   return `${path}?token=${encodeURIComponent(token())}`;
 }
 
-// `parse` of a binary message: {json} or {picture: {frame, mediaMs, ageMs, jpeg}}; null for an unknown kind.
+// Returns a binary message as {json} or {picture: {frame, mediaMs, ageMs, jpeg}}; null for an unknown kind.
 export function parse(buffer) {
   const view = new DataView(buffer);
   if (view.byteLength > 0 && view.getUint8(0) === JSON_KIND) {
@@ -35,7 +35,8 @@ export function parse(buffer) {
 }
 
 export class Connection {
-  // on: {message(json), picture(picture), link(state, text), isOver()}; state: "connecting", "open", "lost" or "over".
+  // on: callbacks {message(json), picture(picture), link(state, text), isOver()}. `state`: "connecting", "open", "lost"
+  // or "over". isOver() returns whether the run is over.
   constructor(on) {
     this.on = on;
     this.retryMs = FIRST_RETRY_MS;
@@ -100,7 +101,7 @@ export class Connection {
     return true;
   }
 
-  // Asks for the newest picture that this page has not had, unless that is asked already.
+  // Requests the newest picture that this page has not had, unless a request is on its way.
   pullPicture() {
     if (!this.isPictureAsked && this.send({ type: "picture" })) this.isPictureAsked = true;
   }

@@ -1,5 +1,5 @@
-// The controls, from the table in the server's `hello`. Rule: none is known here by what it does, only by its kind; what
-// restarts the run says so before it is used, and a refusal stands where the control is.
+// The controls, from the table in the server's `hello`. Rule: this module knows a control's kind, not its effect. A
+// control that needs a new run says so before its use. A refusal is shown beside its control.
 
 import { element, isNumber, setText, words } from "./text.js";
 
@@ -8,8 +8,8 @@ const SLIDER_STEPS = 200;
 const AHEAD_MS = 700;
 
 export class Controls {
-  // send(name, value) sends, restart(changes) asks for a run with all of them; homes: {live, restart, actions}, the
-  // elements that they go into.
+  // send(name, value) sends the value of a control; restart(changes) requests a new run with all changes.
+  // homes: {live, restart, actions}, the elements that contain the controls.
   constructor(homes, send, restart) {
     this.homes = homes;
     this.send = send;
@@ -17,7 +17,7 @@ export class Controls {
     this.table = new Map();
   }
 
-  // Who has the focus in a control keeps it in the one of that name.
+  // Replaces all controls. If a control has the focus, the new control of the same name gets it.
   build(table) {
     const focused = document.activeElement?.closest("[data-control]")?.dataset.control;
     this.table = new Map(table.map((control) => [control.name, { ...control, usedAt: -Infinity }]));
@@ -33,7 +33,7 @@ export class Controls {
     if (focused) document.querySelector(`[data-control=${CSS.escape(focused)}] :is(select, input, button)`)?.focus();
   }
 
-  // One bar for all that was chosen: what changes, a button for the restart, and one to choose nothing.
+  // Makes one bar for all pending choices: their text, a button for the restart, and a button that discards them.
   #applies() {
     const apply = element("button", { type: "button", class: "primary", "data-action": "apply", text: "Apply and restart" });
     const discard = element("button", { type: "button", text: "Discard" });
@@ -58,7 +58,7 @@ export class Controls {
     return { show };
   }
 
-  // [name, value] of each choice that is not in force.
+  // Returns [name, value] of each choice that is not in force.
   #pending() {
     const chosen = [...this.table.values()].filter((control) => control.isPending);
     return chosen.map((control) => [control.name, control.field.value]);
@@ -79,7 +79,7 @@ export class Controls {
     this.#inForce(control, value);
   }
 
-  // The value within the control's range that is `factor` times the one in force.
+  // Uses the control with `factor` times its present value, kept within its range.
   scale(name, factor) {
     const control = this.table.get(name);
     if (!control) return;
@@ -87,7 +87,8 @@ export class Controls {
     this.use(name, Math.min(Math.max(value, control.min ?? -Infinity), control.max ?? Infinity));
   }
 
-  // What is in force, by name. A number that the person moves now is ahead of what the server says of it.
+  // Shows the values in force, by name. A number that the person has just moved is skipped: the page is ahead of the
+  // server.
   config(values) {
     for (const [name, value] of Object.entries(values ?? {})) {
       const control = this.table.get(name);
@@ -95,7 +96,7 @@ export class Controls {
     }
   }
 
-  // What the person has chosen and not yet applied stays chosen.
+  // A choice that the person has not applied yet stays chosen.
   #inForce(control, value) {
     control.value = value;
     if (control.isPending) control.compare();
@@ -125,7 +126,7 @@ export class Controls {
     return made;
   }
 
-  // A choice without a value in force, such as a unit to kill, is something to do: a button for each.
+  // A choice without a present value, such as a unit to kill, is an action: it gets a button for each value.
   #actsAtOnce(control) {
     return control.live && (control.value === null || control.value === undefined);
   }
@@ -171,7 +172,7 @@ export class Controls {
     return this.#shell(control, label, select);
   }
 
-  // A value in force that is none of the choices (set on the command line) is one of the list all the same.
+  // A value in force that is no choice, because the command line set it, is also listed.
   #select(select, value) {
     const text = String(value);
     if (value !== null && value !== undefined && ![...select.options].some((option) => option.value === text)) {
@@ -228,7 +229,7 @@ export class Controls {
     return this.#shell(control, button);
   }
 
-  // What is dragged is the picture; here stands only where its refusals go.
+  // The person drags the picture. Here are only a hint and the place for refusals.
   #drag(control) {
     const hint = element("p", { class: "hint", text: `${this.#label(control)}: drag the picture, or use the arrow keys` });
     return this.#shell(control, hint);

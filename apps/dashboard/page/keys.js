@@ -1,10 +1,10 @@
-// Keys of the whole page. Rule: each is in the table that the help sheet shows, and none acts while somebody types.
+// Keys of the whole page. Rule: the help sheet shows a table of all keys. No key acts while somebody types.
 
 import { byId, element } from "./text.js";
 
 const TYPING = "input:not([type=range]), textarea, select, [contenteditable]";
 
-// actions: rows {keys, text, run}; `other(key)` is asked for keys of no row and says whether it took them.
+// actions: rows {keys, label, text, run}. `other(key)` gets a key without a row, and returns whether it used the key.
 export function listen(actions, other) {
   const sheet = byId("help");
   const table = byId("shortcuts").tBodies[0];
@@ -25,7 +25,7 @@ export function listen(actions, other) {
   });
 }
 
-// Space and Enter press a button that has the focus, and arrows move a slider.
+// Returns whether the focused element itself uses the key: Space and Enter press a button, arrows move a slider.
 function pressesElement(event) {
   if (event.target.closest("button, summary, a")) return event.key === " " || event.key === "Enter";
   return Boolean(event.target.closest("input[type=range]")) && event.key.startsWith("Arrow");

@@ -8,7 +8,7 @@ const MOST_NOTES = 200;
 const BYTES = ["read", "written", "uploaded", "read_back", "least"];
 const LONG_TEXT = 24;
 
-// "PSNR 30.6 dB, worst frame 19.5 dB (source)" for each avatar, or why there is no figure.
+// Returns a text such as "PSNR 30.6 dB, worst frame 19.5 dB (source)" for each avatar, or why there is no figure.
 export function errorText(accuracy) {
   const avatars = Object.entries(accuracy ?? {});
   if (avatars.length === 0) return "not known: the run does not say how exact its avatar is";
@@ -54,7 +54,8 @@ export function showSpeed(figures, accuracy) {
   setText(byId("presented-rest"), `presented; ${lost} lost · ${dropped} dropped · ${rest}`);
 }
 
-// The verdict's lines, as every view of a run has them. A sign beside PASS or FAIL, not its colour alone.
+// Shows the verdict's lines, the same as in every view of a run. The style sheet adds a sign to PASS and FAIL, so that
+// their meaning does not rest on colour alone.
 export function showVerdict(verdict) {
   const lines = verdict?.lines ?? [];
   byId("no-verdict").hidden = lines.length > 0;
@@ -80,7 +81,7 @@ function setHead(table, titles) {
   titles.forEach((title, place) => setText(head.cells[place], title));
 }
 
-// The timeline's figures as a table: each unit's busy share and idle by cause; `join` only in a graph.
+// Shows each unit's busy share, and its idle share by cause. The cause `join` is shown only if a unit has it.
 export function showUnits(figures) {
   const units = Object.entries(figures.units ?? {});
   const idle = units.map(([, unit]) => unit.run?.idle ?? {});
@@ -103,7 +104,7 @@ export function showUnits(figures) {
   }
 }
 
-// `edges`: {name, rule} of each edge; the first stage has none before it.
+// `edges`: {name, rule} of each edge. The first stage has no edge before it.
 export function showStages(figures, edges) {
   const stages = Object.entries(figures.stages ?? {});
   const kinds = [...new Set(stages.flatMap(([, stage]) => Object.keys(stage.bytes ?? {})))].sort(byPlace);
@@ -138,7 +139,7 @@ function lostText(cause) {
   return `lost, ${words(cause.split(":")[0])}`;
 }
 
-// Plain data as nested lists of terms, for plan and placement, whatever they hold.
+// Shows any plain data, such as plan and placement, as nested lists of terms.
 export function showFacts(home, facts) {
   const text = JSON.stringify(facts ?? null);
   if (home.dataset.shown === text) return;
@@ -163,7 +164,7 @@ function factNode(facts) {
   return plain(facts);
 }
 
-// Kinds of bytes that are not in the list come before the last.
+// Kinds of bytes that are not in BYTES come before the last of BYTES.
 function byPlace(a, b) {
   const place = (kind) => (BYTES.includes(kind) ? BYTES.indexOf(kind) : BYTES.length - 1.5);
   return place(a) - place(b);
@@ -204,7 +205,7 @@ export function buildLegend(home) {
   );
 }
 
-// The newest message on top; the oldest go.
+// Shows messages, the newest on top. Only the newest MOST_NOTES stay.
 export class Notes {
   constructor(home) {
     this.home = home;

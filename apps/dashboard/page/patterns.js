@@ -1,11 +1,12 @@
-// Fills of the timeline. Rule: a frame is a plain colour, an idle cause a pattern with a colour: told without colour too.
+// Fills of the timeline. Rule: a frame has a plain colour, an idle cause a coloured pattern. Causes therefore differ
+// without colour, too.
 
 import { colour, isDark } from "./theme.js";
 
 const TILE = 8;
 const FRAME_COLOURS = 12;
 
-// How each cause draws its tile of TILE x TILE pixels.
+// Cause -> function that draws its tile of TILE x TILE pixels.
 const STROKES = {
   starved: (pen) => {
     pen.fillRect(1, 1, 1.5, 1.5);
@@ -41,14 +42,14 @@ function tile(cause, ratio) {
   return canvas;
 }
 
-// A pattern for `pen`, a 2D context whose unit is a CSS pixel of `ratio` device pixels.
+// Returns a pattern for `pen`, a 2D context whose unit is a CSS pixel, which has `ratio` device pixels a side.
 export function causePattern(pen, cause, ratio) {
   const pattern = pen.createPattern(tile(cause, ratio), "repeat");
   pattern.setTransform(new DOMMatrix().scale(1 / ratio));
   return pattern;
 }
 
-// Fills of frames: equally light to the eye but for every second one, and neighbours differ much in hue.
+// Returns the fills of frames. Two degrees of lightness alternate, and neighbours differ much in hue.
 export function frameColours() {
   const light = isDark() ? [0.72, 0.8] : [0.45, 0.54];
   return Array.from({ length: FRAME_COLOURS }, (_, index) => {

@@ -1,12 +1,12 @@
-// "Open in Perfetto". Rule: only on the person's click does anything leave this page, and then it goes to the window of
-// ui.perfetto.dev that the click opened, from memory to memory; no request of this page goes there.
+// "Open in Perfetto". Rule: data leaves this page only after the person's click. It goes from memory to memory, to the
+// window of ui.perfetto.dev that the click opened. This page sends no request there.
 // https://perfetto.dev/docs/visualization/deep-linking-to-perfetto-ui
 
 const PERFETTO = "https://ui.perfetto.dev";
 const PING_EVERY_MS = 100;
 const GIVE_UP_MS = 60_000;
 
-// Fetches the trace at `url` and hands it over. `say` hears how far it is. Call it when the person has clicked.
+// Fetches the trace at `url` and hands it over. `say` gets texts about the progress. Call it after the person's click.
 export async function openInPerfetto(url, title, say) {
   if (!(await fetch(url, { method: "HEAD" })).ok) {
     say("the run has no trace yet: it is written at its end");
@@ -28,7 +28,7 @@ export async function openInPerfetto(url, title, say) {
   say("handed to ui.perfetto.dev");
 }
 
-// Whether the window answers PONG before GIVE_UP_MS.
+// Resolves to whether the window `target` answers PONG within GIVE_UP_MS.
 function ponged(target) {
   return new Promise((resolve) => {
     const end = (isThere) => {

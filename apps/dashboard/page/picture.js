@@ -1,4 +1,5 @@
-// The avatar. Rule: the newest picture is shown when the browser draws anyway; one that nobody sees is not asked for.
+// The avatar. Rule: the newest picture is shown when the browser draws the page. While nobody sees the avatar, the page
+// requests no picture.
 
 const DEGREES_A_PIXEL = 0.4;
 const DEGREES_A_KEY = 5;
@@ -7,7 +8,7 @@ const ZOOM_A_WHEEL = 0.0015;
 const SEND_EVERY_MS = 40;
 
 export class Picture {
-  // camera: {orbit(dx, dy), zoom(factor), reset()}, which this calls with degrees and a factor.
+  // camera: callbacks {orbit(dx, dy), zoom(factor), reset()}; `dx` and `dy` are degrees.
   constructor(canvas, camera) {
     this.canvas = canvas;
     this.pen = canvas.getContext("bitmaprenderer");
@@ -41,7 +42,7 @@ export class Picture {
     return true;
   }
 
-  // What mouse and keys asked for since the last time goes out together, at most every SEND_EVERY_MS.
+  // Sends all movements by mouse and keys since the last call together, at most once in SEND_EVERY_MS.
   tick(now) {
     if (now - this.sentAt < SEND_EVERY_MS) return;
     if (this.turn[0] || this.turn[1]) {
@@ -64,7 +65,7 @@ export class Picture {
     this.factor *= factor;
   }
 
-  // Whether `key` moves the camera.
+  // Moves the camera if `key` is a key for it, and returns whether it is.
   key(key) {
     const actions = {
       ArrowLeft: () => this.orbit(-DEGREES_A_KEY, 0),

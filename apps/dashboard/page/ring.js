@@ -1,7 +1,7 @@
-// The slices of one unit, oldest first. Rule: memory is taken once; the newest slice takes the place of the oldest.
+// The slices of one unit, oldest first. Rule: memory is taken once. In a full ring, a new slice replaces the oldest.
 //
-// A slice is {begin, end, frame, kind, wait}: times in ms since the run's first step, `kind` the place of its stage or
-// idle cause in a table that the owner has.
+// A slice is {begin, end, frame, kind, wait}. `begin` and `end`: ms since the run's first step. `kind`: index of the
+// stage or idle cause in a table of the ring's owner. `wait`: ms from ready to begin.
 
 export class SliceRing {
   constructor(capacity) {
@@ -19,7 +19,7 @@ export class SliceRing {
     this.count = 0;
   }
 
-  // Keeps the order by end also where a slice comes late; one that is older than all of a full ring is not kept.
+  // Adds a slice, and keeps the slices sorted by end. A slice that is older than all slices of a full ring is ignored.
   add(begin, end, frame, kind, wait) {
     if (this.count === this.capacity) {
       if (end < this.ends[this.first]) return;
@@ -44,12 +44,12 @@ export class SliceRing {
     for (const column of [this.begins, this.ends, this.frames, this.kinds, this.waits]) column[to] = column[from];
   }
 
-  // Where the slice number `index`, counted from the oldest, lies in the columns.
+  // Returns the place in the columns of slice number `index`, counted from the oldest.
   at(index) {
     return (this.first + index) % this.capacity;
   }
 
-  // The number of the first slice that ends after `time`; `count` if there is none.
+  // Returns the number of the first slice that ends after `time`; `count` if there is none.
   firstAfter(time) {
     let low = 0;
     let high = this.count;

@@ -1,4 +1,4 @@
-// A finished run. Rule: one question at a time is on its way to the server, and it is always about the newest wish.
+// A finished run. Rule: one request at a time is on its way to the server, and it always asks for the newest moment.
 
 import { byId, clock, setText } from "./text.js";
 
@@ -8,12 +8,12 @@ const BEFORE_END_MS = 200;
 const SURVEY_MOMENTS = 120;
 const BAR_STEP_MS = 10;
 const LEAST_SPAN_MS = 1;
-// Asked for around a moment, in views of the timeline: the view stays within it while the run plays on.
+// Time to request on each side of a moment, in views of the timeline. The view stays within it while the run plays on.
 const MARGIN_VIEWS = 1.5;
 
 export class Seek {
-  // send(t_ms, span_ms) asks for what was span_ms before and after; moved(t_ms) hears of each new moment. First the
-  // figures of moments all over the run are asked for, one after the other, for the charts: `isSurveying`.
+  // send(t_ms, span_ms) requests the run from span_ms before to span_ms after t_ms. moved(t_ms) gets each new moment.
+  // At first, `isSurveying`: the figures of moments all over the run are requested for the charts, one by one.
   constructor(send, moved) {
     this.send = send;
     this.moved = moved;
@@ -67,12 +67,12 @@ export class Seek {
     this.#show();
   }
 
-  // Whether the slices of the answer that comes now are those of a new stretch, which take the place of the old ones.
+  // Whether the answer that comes now has the slices of a new stretch, which replace the old slices.
   get isNewStretch() {
     return Boolean(this.asked?.stretch);
   }
 
-  // The server has answered the last question.
+  // Takes note that the server has answered the last request.
   answered() {
     if (this.asked?.stretch) this.loaded = this.asked.stretch;
     if (this.asked?.isSurvey) this.moments.shift();
@@ -87,7 +87,7 @@ export class Seek {
     setText(byId("seek-play"), this.isPlaying ? "Pause" : "Play");
   }
 
-  // `viewMs`: how much time the timeline shows, the moment in its middle.
+  // `viewMs`: time that the timeline shows; the moment is in its middle.
   tick(now, viewMs) {
     if (!this.isOn) return;
     if (this.isPlaying) this.#play(now);
@@ -109,7 +109,7 @@ export class Seek {
     this.sentAt = now;
   }
 
-  // Whether a view around `time` reaches beyond the slices that are there.
+  // Returns whether a view around `time` reaches beyond the loaded slices.
   #needs(time, viewMs) {
     return time - viewMs / 2 < this.loaded[0] || time + viewMs / 2 > this.loaded[1];
   }

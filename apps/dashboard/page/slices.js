@@ -1,8 +1,8 @@
-// What the timeline shows: the jobs and the idle time of each unit. Rule: bounded, whatever the length of the run.
+// What the timeline shows: the jobs and the idle time of each unit. Rule: memory is bounded, however long the run is.
 
 import { SliceRing } from "./ring.js";
 
-// At 60 frames a second a unit with two stages fills this many in over two minutes.
+// A unit with two stages at 60 frames a second has so many jobs in more than two minutes.
 export const SLICES_PER_UNIT = 16384;
 export const CAUSE_MEANINGS = {
   starved: "no input",
@@ -27,7 +27,7 @@ export class Slices {
     for (const ring of [...this.jobs, ...this.idle]) ring.clear();
   }
 
-  // A message of type slices.
+  // Adds the jobs and idle slices of a message `slices`.
   add({ jobs = [], idle = [] }) {
     for (const [unit, stage, frame, begin, end, wait] of jobs) this.jobs[unit]?.add(begin, end, frame, stage, wait);
     for (const [unit, cause, begin, end] of idle) {
@@ -40,7 +40,7 @@ export class Slices {
     return Math.max(...this.jobs.map((ring) => ring.lastEnd), ...this.idle.map((ring) => ring.lastEnd));
   }
 
-  // What `unit` did at `time`: {unit, isJob, …slice}, or null.
+  // Returns what `unit` did at `time`, as {unit, isJob, index, …slice}; null if unknown.
   find(unit, time, toleranceMs = 0) {
     for (const [ring, isJob] of [
       [this.jobs[unit], true],
@@ -55,7 +55,7 @@ export class Slices {
     return null;
   }
 
-  // The jobs of `frame` that ended after `from` and began before `to`, in the order of their begin.
+  // Returns the jobs of `frame` that ended after `from` and began before `to`, sorted by begin.
   jobsOf(frame, from, to) {
     const found = [];
     this.jobs.forEach((ring, unit) => {
@@ -68,7 +68,7 @@ export class Slices {
     return found.sort((a, b) => a.begin - b.begin);
   }
 
-  // A sentence about a slice.
+  // Returns a sentence about a slice.
   describe(slice) {
     const unit = this.units[slice.unit];
     const length = `${(slice.end - slice.begin).toFixed(2)} ms`;

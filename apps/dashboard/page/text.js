@@ -1,4 +1,4 @@
-// How figures and elements are written. Rule: a figure that is not known is a dash, never 0.
+// Makes the texts of figures, and elements. Rule: an unknown figure is a dash, never 0.
 
 export const DASH = "–";
 
@@ -10,7 +10,7 @@ export function number(value, digits = 1) {
   return isNumber(value) ? value.toFixed(digits) : DASH;
 }
 
-// Three digits or so.
+// About three digits.
 export function short(value) {
   return number(value, value < 100 ? 1 : 0);
 }
@@ -34,7 +34,7 @@ export function bytes(value) {
   return `${value.toFixed(place && value < 100 ? 1 : 0)} ${units[place]}`;
 }
 
-// Minutes, seconds and tenths of a time in ms, such as 1:02.5.
+// Returns a time in ms as minutes, seconds and tenths, such as 1:02.5.
 export function clock(timeMs) {
   const tenths = Math.max(0, Math.round(timeMs / 100));
   const seconds = Math.floor(tenths / 10);
@@ -45,7 +45,7 @@ export function words(name) {
   return name.replaceAll("_", " ");
 }
 
-// element("p", {class: "x", text: "y"}, child, …): attributes as they are written, `text` for the content.
+// Makes an element, such as element("p", {class: "x", text: "y"}, child, …). The attribute `text` is the content.
 export function element(tag, attributes = {}, ...children) {
   const made = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
@@ -61,12 +61,12 @@ export function byId(id) {
   return document.getElementById(id);
 }
 
-// Changes the text only where it is another one: screen readers speak each change of a live region.
+// Sets the text only if it differs, because screen readers speak each change of a live region.
 export function setText(target, text) {
   if (target.textContent !== text) target.textContent = text;
 }
 
-// Makes the rows of a table's body those of `rows`, each a list of texts; the first one is the row's heading.
+// Gives a table's body the rows `rows`. A row is a list of texts; the first text is the row's heading.
 export function setRows(body, rows) {
   while (body.rows.length > rows.length) body.deleteRow(-1);
   rows.forEach((cells, index) => {

@@ -1,4 +1,4 @@
-// Dark or light. Rule: the system decides until the person does; canvases take their colours from the style sheet.
+// Dark or light. Rule: the system decides until the person chooses. Canvases take their colours from the style sheet.
 
 const KEY = "trilane.theme";
 const root = document.documentElement;
@@ -20,7 +20,7 @@ export function wantsCalm() {
   return calm.matches;
 }
 
-// The colour that the style sheet's variable `--name` has now, as the canvas wants it.
+// Returns the present colour of the style sheet's variable `--name`, in a form that a canvas accepts.
 export function colour(name) {
   if (!cache.has(name)) {
     probe.style.color = `var(--${name})`;
@@ -44,7 +44,7 @@ export function chooseTheme(theme) {
   try {
     localStorage.setItem(KEY, theme);
   } catch {
-    // a browser that stores nothing forgets the choice with the page
+    // a browser that stores nothing forgets the choice when the page is closed
   }
   changed();
 }

@@ -1,5 +1,5 @@
-// The timeline of the units. Rule: a picture of it is drawn only when it is seen and something has changed, and what is
-// narrower than a pixel is drawn once for the pixel.
+// The timeline of the units. Rule: it is drawn only if somebody sees it and something has changed. Slices within one
+// pixel are drawn once.
 
 import { CAUSES } from "./slices.js";
 import { causePattern, frameColours } from "./patterns.js";
@@ -11,18 +11,18 @@ const GAP = 6;
 const LABEL = 44;
 const SHORTEST_SPAN_MS = 2;
 const LONGEST_SPAN_MS = 60_000;
-// Three views' slices of a finished run come in one answer, which is bounded.
+// One answer about a finished run has the slices of three views, and its size is bounded.
 const LONGEST_FINISHED_SPAN_MS = 5000;
-const FIRST_SPAN_MS = 400; // of a canvas of WIDE pixels or more
+const FIRST_SPAN_MS = 400; // on a canvas at least WIDE pixels wide
 const WIDE = 1200;
-// Live slices come a few times a second; so much later than the newest one the view runs evenly.
+// Live slices come a few times a second. The view moves evenly if it stays so far behind the newest slice.
 const LAG_MS = 300;
 const CALM_STEP_MS = 1000;
 const FRAME_LOOK_MS = 2000;
 const TICKS = [1, 2, 5];
 
 export class Timeline {
-  // say(text): what is selected; changed(view): the shown time has moved by the person.
+  // say(text) gets a text about the selected slice. changed(view) is called if the person has moved the shown time.
   constructor(canvas, { say, changed }) {
     this.canvas = canvas;
     this.pen = canvas.getContext("2d");
@@ -64,7 +64,7 @@ export class Timeline {
     this.span = isFirst ? FIRST_SPAN_MS * Math.min(1, this.width / WIDE) : span;
   }
 
-  // Slices have come: the newest one tells how the run's clock lies to this page's.
+  // Call it after new slices: the newest slice gives the offset of the run's clock from the page's clock.
   fed() {
     const offset = this.slices.lastEnd - performance.now();
     if (Number.isFinite(offset)) {
@@ -97,7 +97,7 @@ export class Timeline {
     this.isDirty = true;
   }
 
-  // Once for each picture of the browser; `now` as performance.now() has it.
+  // Call it once for each picture of the browser. `now`: time as in performance.now().
   tick(now) {
     if (!this.slices || !this.isSeen) return;
     if (this.isFollowing && this.isLive) this.#follow(now);
@@ -181,7 +181,7 @@ export class Timeline {
     this.#drawJobs(this.slices.jobs[unit], top, focus?.isJob ? focus.frame : null);
   }
 
-  // Calls draw(x, width, slot) for what is seen, leaving out what falls into a pixel that is drawn.
+  // Calls draw(x, width, slot) for each visible slice, except slices within a pixel that is drawn already.
   #each(ring, draw) {
     let drawnTo = -Infinity;
     for (let index = ring.firstAfter(this.left); index < ring.count; index += 1) {
@@ -226,7 +226,7 @@ export class Timeline {
     if (pen.measureText(stage).width <= width) pen.fillText(stage, x, top + LANE * 0.3);
   }
 
-  // The jobs of the frame that is pointed at are joined in the order in which they ran.
+  // Joins the jobs of the frame in focus by lines, in the order in which they ran.
   #drawFlow(focus) {
     if (!focus) return;
     const { pen } = this;
@@ -266,7 +266,7 @@ export class Timeline {
   #point(slice) {
     this.hovered = slice;
     this.isDirty = true;
-    const told = slice ?? this.selected; // a finger that lets go leaves the canvas too
+    const told = slice ?? this.selected; // a finger that is lifted also leaves the canvas
     this.say(told ? this.slices.describe(told) : "");
   }
 
@@ -289,7 +289,7 @@ export class Timeline {
     this.#moved();
   }
 
-  // Of a finished run the moment that is shown is in the middle.
+  // The middle is the shown moment of a finished run.
   get middle() {
     return this.right - this.span / 2;
   }
@@ -299,8 +299,8 @@ export class Timeline {
     this.isDirty = true;
   }
 
-  // `factor` above 1 shows more time; the time at `x` stays where it is, and that at the right end while it follows.
-  // In a finished run it is the moment in the middle that stays.
+  // `factor` above 1 shows more time. One time stays at its place: in a finished run the middle; in a live run the time
+  // at `x` or, if the view follows the run, the right end.
   zoom(factor, x = this.width) {
     const isFollowing = this.isFollowing;
     const fixed = this.isLive ? (isFollowing ? this.right : this.time(x)) : this.middle;
@@ -313,7 +313,7 @@ export class Timeline {
     this.changed(this);
   }
 
-  // The next (1) or the one before (-1) of the jobs in the lane of what is selected.
+  // Selects the next (1) or previous (-1) job in the lane of the selected job.
   select(step) {
     const from = this.selected ?? this.hovered;
     const unit = from?.isJob ? from.unit : 0;
@@ -323,7 +323,7 @@ export class Timeline {
     this.#choose(unit, Math.min(Math.max(here + step, 0), ring.count - 1));
   }
 
-  // The job at the same time in the lane above (-1) or below (1).
+  // Selects the job at the same time in the lane above (-1) or below (1).
   selectLane(step) {
     const from = this.selected;
     if (!from) return this.select(0);
@@ -379,7 +379,7 @@ export class Timeline {
     } else if (this.dragged > 4) this.pan(((oldX - x) * this.span) / (this.width - LABEL));
   }
 
-  // With Ctrl (what a pinch sends too) or while it has the focus the wheel zooms; else it scrolls the page.
+  // The wheel zooms with Ctrl (which a pinch sends too) or while the canvas has the focus; if not, it scrolls the page.
   #wheel(event) {
     const isSideways = Math.abs(event.deltaX) > Math.abs(event.deltaY);
     if (isSideways) this.pan((event.deltaX * this.span) / this.width);
@@ -412,7 +412,7 @@ export class Timeline {
   }
 }
 
-// A round length of time of which at most `most` fit into `span`.
+// Returns a round length of time that fits into `span` at most `most` times.
 export function tickStep(span, most) {
   let unit = 0.1;
   for (;;) {
