@@ -180,7 +180,7 @@ def tried(
 def _thrown_away(checked: Checked) -> Iterator[RunConfig]:
     """Yield the configuration of `checked` with one tensor shape and a run folder that is removed afterwards.
 
-    A single shape is prepared faster than many. No shape of the same size has more than 25/16 of its area.
+    A single shape is prepared faster than many. The other shapes of a size have at most 25/16 of this shape's area.
     """
     with tempfile.TemporaryDirectory(prefix="trilane-rehearsal-") as folder:
         height, width = one_shape(checked.config)
@@ -189,6 +189,6 @@ def _thrown_away(checked: Checked) -> Iterator[RunConfig]:
 
 
 def one_shape(config: RunConfig) -> Shape:
-    """Return the most square tensor shape, apart from shapes that are only used when frames would be late."""
+    """Return the most square tensor shape. Shapes with at most half of the largest area are left out."""
     large = [shape for shape in config.buckets if 2 * shape[0] * shape[1] > config.max_tensor_pixels]
     return min(large, key=lambda shape: (abs(shape[0] - shape[1]), shape))

@@ -74,7 +74,7 @@ def tensor_works(scene: Scene, policy: str, losses: Sequence[SizeLoss]) -> tuple
     return (within if paced else within[-1:]), said
 
 
-#: Number of frames to examine: divided by the number of avatars, and the least number of the result.
+#: Number of frames to examine for one avatar. For n avatars, this number is divided by n, but not below LEAST_FRAMES.
 FORESEEN_FRAMES, LEAST_FRAMES = 96, 24
 #: Largest distance in frames between two examined frames with which changes are foreseen.
 MOST_APART = 15
@@ -250,7 +250,7 @@ def foreseen_rects(
 
 
 def bytes_per_pixel(network: NetworkFile) -> float:
-    """Return the bytes of memory per pixel of its tensor that the prepared `network` takes.
+    """Return how many bytes of memory the prepared `network` takes for each pixel of its tensor.
 
     There are COPIES copies of each of the network's byte tensors.
     """

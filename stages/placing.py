@@ -178,7 +178,7 @@ def _reason(facts: Mapping[str, Any]) -> str:
 def rehearsed(
     checked: Checked, starter: UnitStarter, driver: str = "", say: Callable[[str], None] = lambda _: None
 ) -> tuple[Rehearsed, str]:
-    """Return (the times that place a run of `checked`, when they were measured, UTC). They may be an earlier run's.
+    """Return (measured or cached times by which a run of `checked` is placed, date and time of the measurement, UTC).
 
     Parameters and errors are as in `placed`.
     """

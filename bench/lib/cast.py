@@ -28,7 +28,8 @@ class CastView:
     """One visible avatar in one frame.
 
     `index`: number of the avatar in the scene. `folder`: folder of the avatar's bundle.
-    `pose`, `translation`: pose (55,3) and translation (3,) from `Mover.sample`. `world`: matrix (4,4) of the `Mover`.
+    `pose`, `translation`: pose (55,3) and translation (3,) from `Mover.sample`. `world`: matrix (4,4) from the body's
+    space to the world.
     `joints`: skinning matrices (55,3,4), as the pose stage computes them.
     `box`: rectangle of the picture around the avatar and its clothes; it may reach beyond the picture.
     `depth`: camera z of the pelvis. `view`: view matrix (4,4). `projection`: matrix (4,4) of the projection to the box.

@@ -91,7 +91,7 @@ class Outermost:
     def _side(self, row: F32, reach: float, sign: int, slack: float) -> I64 | None:
         """Return the indices of the vertices that may be outermost on one side; None if one may be off the screen.
 
-        `sign`: 1 for the lowest coordinates, -1 for the highest. `slack`: largest error of a quotient, twice.
+        `sign`: 1 for the lowest coordinates, -1 for the highest. `slack`: twice the largest error of a quotient.
         """
         scratch, least, most = self._scratch
         place = np.subtract(row, np.float32(reach), out=scratch) if sign > 0 else np.negative(row, out=scratch)
@@ -240,7 +240,7 @@ class _Extent:
             np.maximum(self.high, high.max(axis=0), out=self.high)
 
     def widened_by(self, low: F64, high: F64) -> Mask:
-        """Return a mask (N,) of the boxes from `low` to `high` (N,2), NDC, that would move a side inside the screen."""
+        """Return a mask (N,) of the boxes from `low` to `high` (N,2), NDC, that move a side which is on the screen."""
         return np.asarray(
             (((low < self.low) & (self.low > -1.0)) | ((high > self.high) & (self.high < 1.0))).any(axis=1)
         )

@@ -71,7 +71,7 @@ def _from_arrays(arrays: Arrays, where: str) -> list[NetworkPart]:
 
 
 def crossing_bytes(config: RunConfig, network: NetworkFile) -> list[int]:
-    """Return the bytes that cross each cut of `network`, for the tensor shape with the most. Raises BadInputError."""
+    """Return the most bytes that cross each cut of `network`, over all tensor shapes. Raises BadInputError."""
     if not config.cuts:
         return []
     shapes = [[part.crossing_out for part in parts_for(config, network, shape)[:-1]] for shape in config.buckets]

@@ -69,7 +69,7 @@ class DrawnFrames:
         self._slots: dict[int, tuple[Drawing | None, int]] = {}
 
     def slot_of(self, drawing: Drawing | None, preferred: int) -> int | None:
-        """Return a slot that has `drawing`, preferably the slot `preferred`; None without such a slot or drawing."""
+        """Return a slot that has `drawing`, if possible `preferred`; None if no slot has it or `drawing` is None."""
         if drawing is None:
             return None
         held = [slot for slot, (there, _) in self._slots.items() if there == drawing]
@@ -245,8 +245,8 @@ class CompositeStage:
         - `stale`: the right picture never came, so an older one is shown;
         - `copied`: the frame was copied from an earlier frame, not drawn.
 
-        The least bytes are the new parts of the background, of the network's picture in the `tensor_rect`s of visible
-        avatars, and the frame if no slot had it.
+        The least bytes are a new picture of the background, a new picture of the networks in the `tensor_rect`s of
+        visible avatars, and the frame if no slot had it. Raises UnitLostError if the context was lost.
         """
         if slot_in is None or slot_out is None:
             raise ValueError("composite needs an input and an output slot")

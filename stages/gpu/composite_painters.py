@@ -3,10 +3,10 @@
 The room is the built-in background: a wooden floor at y = 0 and walls, as a mesh and three textures. Rule: mesh and
 textures are computed from constants and a fixed seed, and the room always contains the camera.
 
-Background bytes are copied unchanged, as sRGB; all other layers are blended over them in linear light. A shadow only
-multiplies light, which a sum on sRGB numbers does too, so its bytes are not converted. The planes come from the scene
-file; nothing is detected here. A contact shadow is a disc under a joint, which grows and fades with the joint's height
-above the floor.
+Background bytes are copied unchanged, as sRGB; all other layers are blended over them in linear light. Only shadows are
+blended on sRGB numbers, by a formula with the same result (`shadow.frag`). The planes come from the scene file; nothing
+is detected here. A contact shadow is a disc under a joint, which grows and fades with the joint's height above the
+floor.
 
 A body fills about half of its rectangle, and a software driver takes as long for a transparent pixel as for any other.
 Therefore the network's picture is drawn in bands of rows. Each band has only the columns between its first and its last
@@ -354,7 +354,7 @@ class ShadowPainter:
         self._discs = ctx.vertex_array(self._program, [])
 
     def draw(self, view: Floats, projection: Floats, blobs: F32) -> None:
-        """Darken the current target with discs.
+        """Darken the current target with discs, which a camera below the floor does not see.
 
         `view`, `projection`: OpenGL matrices (4,4).
         `blobs`: x, z, radius in metres, and strength 0 to 0.72 of each disc (N,4) float32.
@@ -373,7 +373,7 @@ class ShadowPainter:
 
 
 class AvatarPainter:
-    """Draws the network's picture, which is uploaded once a frame, avatar by avatar into their crop rectangles.
+    """Draws the parts of a network's picture into the avatars' crop rectangles. The picture is uploaded once a frame.
 
     `shapes`: shapes (height, width) of the pictures that may come.
     """
@@ -444,7 +444,7 @@ class AvatarPainter:
 
 
 def taps_of(cell: tuple[int, int], pixels: tuple[float, float]) -> int:
-    """Return the number of texels along a side that are averaged for a screen pixel.
+    """Return the number of reads along a side that are averaged for a screen pixel, 1 to MAX_TAPS.
 
     `cell`: (height, width) of the part of the picture that is drawn.
     `pixels`: (height, width) on the screen.

@@ -8,8 +8,8 @@ Functions of this file make all copies of a frame's data between the CPU's memor
 A context has one counter, because the stages that draw with it do one job at a time. A software driver copies within
 the same memory, and such copies count too.
 
-A target's first row in memory is the top row of the image. Therefore `target_clip` flips y in the projection; no other
-code flips it.
+A target's first row in memory is the top row of the image. Therefore `target_clip` flips y in the projection, and
+`avatar.vert` flips y of crop rectangles.
 """
 
 from __future__ import annotations

@@ -171,7 +171,7 @@ class PackedPass:
         triangle.
         `filtering`: one of FILTERS. A deferred pass has no derivatives of u and v, so it takes only `linear`.
 
-        Raises BadInputError.
+        Raises BadInputError for another filter or number of channels.
         """
         if filtering not in FILTERS:
             raise BadInputError("texture filter", repr(filtering), f"one of {', '.join(FILTERS)}")
@@ -393,7 +393,7 @@ def _placement(pose: NDArray[np.void], avatar: Any, vertices: NDArray[np.float32
 def build(settings: Mapping[str, Any], unit: UnitContext) -> RasterStage:
     """Build the raster stage of the configuration in `settings`. Raises BadInputError, MissingPartError.
 
-    The kind of the driver, hardware or software, decides only whether the pass is deferred.
+    On a software driver, the pass is deferred if the filter is `linear` and no texture has learnt levels.
     """
     config = RunConfig.model_validate(settings["config"])
     ctx = unit.shared(CONTEXT, lambda: open_context(unit.settings.threads))
