@@ -1,7 +1,7 @@
 """How soon after the producer's last write can the consumer process read all bytes, and when has it read them?
 
-Rule: one definition holds for all variants, which run in interleaved rounds. For each frame, the producer writes the
-bytes anew, and reads the clock after the last byte. Two variants are compared with the peers. The first is a real run
+Rule: one definition holds for all variants, which run in interleaved rounds. The producer writes the bytes of each
+frame, and reads the clock after the last byte. Two variants are compared with the peers. The first is a real run
 through the scheduler, of a pipeline with four stages in a chain. Its second stage fills a slot, and its third stage
 reads every byte of the slot; the others do no work. The second variant has the same slot, but no scheduler between the
 processes.
@@ -233,7 +233,7 @@ def _answer(pipe: Connection) -> Any:
 
 
 def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, int], ChannelPair], dict[str, str]]:
-    """Return (waiting processes by variant and size in KiB, which `stack` ends; the reason for each absent variant)."""
+    """Return (processes by variant and size in KiB, reason for each absent variant). `stack` ends the processes."""
     context = multiprocessing.get_context("spawn")
     pairs, absent = {}, {}
     for variant, make in CHANNELS.items():

@@ -141,7 +141,7 @@ def _cache(folder: Path) -> Iterator[None]:
 def _measure_periods(variants: dict[str, ProcessVariant], seconds: float, period: float) -> dict[str, dict[str, Any]]:
     """Return the measured times of each variant, by name, in ms.
 
-    Their keys are `startup_cold_ms`, `startup_warm_ms` and `periods`, which has a list of all runs for each period.
+    Their keys are `startup_cold_ms`, `startup_warm_ms` and `periods`, which has a list of times for each period.
     """
     with runners(variants) as by_name:
         cold = {name: runner.startup_ms for name, runner in by_name.items()}

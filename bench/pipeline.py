@@ -265,10 +265,9 @@ def _units_ms(result: RunResult) -> dict[str, float]:
 
 
 def idle_between_jobs(jobs: Sequence[JobRecord]) -> dict[str, float]:
-    """Return a unit's idle shares by cause, and under `idle` their sum.
+    """Return the idle shares of a unit, `starved`, `undispatched` and `overhead` as in `measure`, and their sum `idle`.
 
-    The shares refer to the time from the begin of the unit's first job to the end of its last job. The causes are
-    `starved`, `undispatched` and `overhead`, as in `measure`. `jobs`: all jobs of the unit.
+    The shares refer to the time from the begin of the unit's first job to the end of its last. `jobs`: all its jobs.
     """
     ordered = sorted(jobs, key=lambda job: job.begin_ns)
     span = ordered[-1].end_ns - ordered[0].begin_ns

@@ -68,7 +68,7 @@ def measure(
     `chosen_over_best`: frame time of the chosen placement divided by the frame time of the best other placement. It is
     the median over the further rounds; up to 1, the chosen placement is the best.
     `low`, `high`: 95 % interval of `chosen_over_best`; with fewer than six rounds, its least and largest value.
-    `rule_over_chosen`: the same ratio of the rule's placement to the chosen placement.
+    `rule_over_chosen`: frame time of the rule's placement divided by the frame time of the chosen placement.
     `rule_low`, `rule_high`: 95 % interval of `rule_over_chosen`.
     `rank_correlation`: Spearman's rank correlation of the predicted and the tried times of all placements.
     `predicted_over_tried`, `predicted_least`, `predicted_largest`: median, least and largest ratio of these times.

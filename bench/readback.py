@@ -158,7 +158,7 @@ RING = 3
 
 
 class Readback:
-    """Reads part of a framebuffer of 32-bit unsigned words into a slot: the driver copies while the caller waits.
+    """Reads part of a framebuffer of 32-bit unsigned words into a slot. The caller waits until the driver has copied.
 
     `lag`: number of further submits after which the bytes arrive.
     """

@@ -226,7 +226,7 @@ def _row(variant: str, frames: int, events: int, seconds: list[float], processed
 
 
 def _traces(seed: int) -> list[str]:
-    """Do the same run `REPEATS` times, with a death of the DSP unit, and return a digest of each run's steps."""
+    """Do `REPEATS` equal runs in which the DSP unit dies. Return a digest of each run's steps and report."""
     settings = Settings(SEED_FRAMES, "deadline", period_ns=PERIOD_NS, deadline_ns=3 * PERIOD_NS)
     digests, faults = [], [(1_000 * MS + seed * 7 * MS, "dsp")]
     for _ in range(REPEATS):

@@ -1,7 +1,7 @@
 """The assets of a run of the avatar: arrays that the parent loads, and that every unit maps.
 
-Rule: files are opened once. The prefix of a name says what the array belongs to: `body0/` and `avatar0/` to the first
-distinct bundle, `network0/` to the first distinct network, `scene/` to the scene.
+Rule: files are opened once. An array belongs to what its name begins with: `body0/`, `avatar0/` and `meshes0/` are the
+first distinct bundle, `network0/` is the first distinct network, `scene/` is the scene.
 """
 
 from __future__ import annotations

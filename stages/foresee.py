@@ -51,7 +51,6 @@ def tensor_works(scene: Scene, policy: str, losses: Sequence[SizeLoss]) -> tuple
     """Return (`RunConfig.works` of a scene under `policy`, note for a person, which may be empty).
 
     `losses`: loss of PSNR of each avatar in tensors below full size; without figures if it was not measured.
-
     Raises BadInputError if the scene has an error budget and an avatar has no measured errors.
     """
     if not scene.plans_tensor:
@@ -155,11 +154,11 @@ class Painted:
 def foresee(
     scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], painted: Painted, budgets: Sequence[TensorBudget]
 ) -> Foreseen:
-    """Return the tensor shapes that `scene` needs.
+    """Return the tensor shapes that `scene` needs, and the changes between them if they can be foreseen.
 
     `bodies`: bodies of its avatars, in order.
     `painted`: networks that paint the avatars.
-    `budgets`: budgets of its tensors, the largest first. The run may step down to the smaller ones, if memory has room
+    `budgets`: budgets of its tensors, the largest first. The run may step down to smaller budgets, if memory has room
     for their shapes.
     """
     count = min(scene.frames, max(FORESEEN_FRAMES // len(bodies), LEAST_FRAMES))

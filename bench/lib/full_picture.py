@@ -126,7 +126,7 @@ class FullPictures:
     """Makes pictures of the avatars in `cast` by the plan `full`."""
 
     def __init__(self, cast: Cast) -> None:
-        """Load the networks. Raises BadInputError if a file cannot be read, MissingPartError without PyTorch."""
+        """Load the networks. Raises BadInputError for an unreadable file, MissingPartError if PyTorch is lacking."""
         self._cast = cast
         self._avatars = {folder: _avatar(data) for folder, data in cast.avatars.items()}
 
@@ -244,8 +244,8 @@ def _clothed(data: AvatarData, ctx: Any) -> ClothedBody:
 # The FP32 network of an avatar, with which the plan `full` paints.
 #
 # Rule: results name the source of the network. If the avatar's manifest names the float network that the avatar was
-# quantised from, by its digest, and the file is in WEIGHTS, this network is used. Otherwise the integer network runs with
-# its weights in float32, without rounding between its layers. In that case, `full` has the error of quantised weights.
+# quantised from, by its digest, and the file is in WEIGHTS, this network is used. Otherwise the integer network runs
+# with its weights in float32, without rounding between its layers, and `full` has the error of quantised weights too.
 
 #: Folder in which Trilane keeps the weights of float networks.
 WEIGHTS = Path(__file__).resolve().parents[2] / "training"

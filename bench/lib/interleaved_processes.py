@@ -98,7 +98,7 @@ class Runner:
     """The process of a variant, as the parent process sees it.
 
     `startup_ms`: time that the process took to import libraries and load the network.
-    The constructor waits for this time. It raises TrilaneError if the process does not start.
+    The constructor waits until the process is ready. It raises TrilaneError if the process does not start.
     """
 
     def __init__(self, pipe: Connection, name: str) -> None:

@@ -19,7 +19,7 @@ it. Joint b turns about its centre c_b by its own angle t_b, so |G_b c - G_paren
 error of the outermost one are projected again in float64, which finds the truly outermost vertex.
 
 The rounding error follows from u = 2**-24. A clip coordinate c = r . v + d is a sum of three products of rounded
-factors and d, so its error is at most 6 u (sum |r_k| |v_k| + |d|). The bound e_c is 8 u times this sum plus the
+factors and d. Its error is at most 6 u (sum |r_k| |v_k| + |d|). The bound e_c is 8 u times this sum plus the
 sphere's reach; the larger factor covers the rounding of the reach. A quotient q = c / w, with w >= w_least, has an
 error of at most (e_c + |q| e_w) / w_least + 4 u |q|, where |q| is at most 1 on the screen.
 """
@@ -117,8 +117,8 @@ class Level:
     """The P patches of one level of patches, the coarse or the fine one.
 
     `centres`: index of each patch's centre, a vertex (P,).
-    `size`, `give`: (P,) and (P,54), metres. The sphere about a patch's posed centre has the radius size + sum_b give_b
-    2 sin(t_b / 2), where t_b is the angle of joint b = 1..54.
+    `size`, `give`: (P,) and (P,54), metres. They give the radius of the sphere about a patch's posed centre: size +
+    sum_b give_b 2 sin(t_b / 2), where t_b is the angle of joint b = 1..54.
     `blend`: largest distance by which the pose blend shapes of each joint move a vertex (P,54), metres per unit of
     |R - I|.
     `parts`: for each patch, the indices of its patches in the next level; in the last level, of its vertices.

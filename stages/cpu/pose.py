@@ -2,8 +2,8 @@
 
 Motion and camera are sampled at the frame's media time, frame / fps; all numbers that leave this stage are finite. With
 the plan `planned`, a frame that shows nobody, or the same as an earlier frame, skips the stages that draw. A repeated
-frame is not skinned. Each body gets a level of its mesh, then the cheapest level of detail for which the sum of both
-errors is within the budget of pixels.
+frame is not skinned. Each body gets a level of its mesh, and the cheapest level of detail that keeps the sum of both
+errors within the pixel budget.
 """
 
 from __future__ import annotations
@@ -208,7 +208,7 @@ class _Actor:
 class FramePlan:
     """The decisions for a frame.
 
-    `work`: the frame's work.
+    `work`: kind of work that the frame needs.
     `shape`: shape of the tensor; None with nobody in view.
     `density`: density of a planned tensor, else None.
     `seen`: visible avatars by their numbers.
@@ -423,8 +423,8 @@ class PoseStage:
     ) -> SeenAvatar | None:
         """Fill one avatar's part of the header, and return its place on the screen; None if it is not visible.
 
-        An avatar that is far off the screen is not posed. An avatar that the last computed frame did not show is first
-        searched by its patches, before it is skinned.
+        An avatar that is far off the screen is not posed. If the last computed frame did not show the avatar, it is
+        skinned only if its coarse patches may be on the screen.
         """
         pose, translation = moved[actor.index]
         avatar["avatar"], avatar["visible"] = actor.index, False

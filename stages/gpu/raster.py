@@ -56,7 +56,7 @@ HALF_BIAS, FLOAT_BIAS = 15, 127  # biases of the exponents of FP16 and FP32
 
 
 def texture_array(ctx: Any, texture: Floats, filtering: str = "linear", levels: Sequence[Floats] = ()) -> Any:
-    """Return an FP16 array texture of C/4 RGBA layers from `texture` (H,W,C), clamped at its edge.
+    """Return an FP16 array texture of C/4 RGBA layers from `texture` (H,W,C). Reads beyond its edge repeat the edge.
 
     `filtering`: one of FILTERS.
     `levels`: learnt smaller levels, each (h,w,C), the largest first; they replace the levels that the driver computes.
@@ -249,9 +249,8 @@ class PackedAvatar:
 
         `mesh`: whole mesh, number 0.
         `texture`: neural texture (H,W,C).
-        `levels`: smaller levels of the texture, packed, which a deferred pass cannot read; None without any.
+        `levels`: smaller levels of the texture, packed by `pack_levels`; None without any, as in every deferred pass.
         `coarser`: levels of the mesh, numbers 1, 2, ...
-
         Raises BadInputError if a texture has a number beyond FP16, or C is not the pass's number of channels.
         """
         check_texture(texture, packed.channels)
@@ -339,9 +338,7 @@ class RasterStage:
         """Write the tensor (h,w,C) uint8 of each network, empty if the network paints nobody in view. Return metrics.
 
         The metrics are the bytes moved. The least bytes are the pose of the drawn mesh of each visible avatar, and the
-        drawn tensors.
-
-        Raises TrilaneError if a joint is not a finite number, UnitLostError if the context was lost.
+        drawn tensors. Raises TrilaneError if a joint is not a finite number, UnitLostError if the context was lost.
         """
         if slot_in is None or slot_out is None:
             raise ValueError("raster needs an input and an output slot")

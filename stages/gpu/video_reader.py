@@ -155,8 +155,8 @@ class VideoReader:
     def at(self, time_s: float) -> U8 | None:
         """Return the newest frame (h,w,3) that is not after `time_s`; None if an earlier call returned this frame.
 
-        If `time_s` lies before the time of the last frame, the video is opened again. This happens at the first frame
-        of a run that was rehearsed. Raises BadInputError if the file cannot be decoded.
+        If `time_s` lies before the time of the last returned frame, the video is opened again. This happens at the
+        first frame of a run that was rehearsed. Raises BadInputError if the file cannot be decoded.
         """
         if time_s + ROUNDING_S < self._shown_s:
             self.close()
