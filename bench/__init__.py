@@ -1,4 +1,4 @@
-"""Measurements of this machine: a module for each question, with a function `measure`, and shared parts in `lib/`.
+"""Measurements of this machine. Each module answers one question by a function `measure`; `lib/` has shared parts.
 
 This folder may import from every folder except apps/. The parameters of `measure` are options of `trilane bench`.
 """
@@ -12,7 +12,7 @@ from trilane import machine
 from trilane.errors import BadInputError
 from trilane.units import MAX_CHANNELS
 
-#: Least and greatest value of each option, which means the same in every bench. A bench may check a narrower range.
+#: Least and greatest value of each option, for all benches. A bench may check a narrower range.
 LIMITS: dict[str, tuple[float, float]] = {
     "repeats": (1, 100_000),
     "threads": (0, 4 * machine.here.core_count()),

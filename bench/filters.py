@@ -42,8 +42,8 @@ def measure(sizes: tuple[int, ...] = (64, 128, 256, 512), repeats: int = 20) -> 
     `rows` has a row for each size and filter:
     `side`: side of the tensor, pixels.
     `filter`: name of the filter.
-    `raster_ms`: median time of a draw.
-    `steps_mean`: mean absolute difference from the tensor of the filter `linear`, in bytes, over the body's pixels.
+    `raster_ms`: median time to draw the tensor and read it back.
+    `steps_mean`: mean absolute difference of byte values from the tensor of `linear`, over the body's pixels.
     `psnr_db`: PSNR of the network's picture against ground truth; the network was trained with `linear`.
 
     Further keys:

@@ -1,9 +1,9 @@
 """How soon after the producer's last write can the consumer process read all bytes, and when has it read them?
 
-Rule: one definition holds for all variants, which run in interleaved rounds. The producer writes every byte again and
-reads the clock after the last byte. Two variants are compared with the peers. The first is a real run through the
-scheduler. The pipeline of this run is a chain of four stages. Its second stage fills a slot, and its third stage reads
-every byte of the slot; the others do no work. The second variant has the same slot, but no scheduler between the
+Rule: one definition holds for all variants, which run in interleaved rounds. The producer writes the bytes of each
+frame, and reads the clock after the last byte. Two variants are compared with the peers. The first is a real run
+through the scheduler, of a pipeline with four stages in a chain. Its second stage fills a slot, and its third stage
+reads every byte of the slot; the others do no work. The second variant has the same slot, but no scheduler between the
 processes.
 """
 
@@ -61,9 +61,9 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 300, rounds
     `p50_us`, `p99_us`: percentiles of the time until every byte can be read.
     `read_p50_us`, `read_p99_us`: percentiles of the time until every byte was read and checked.
     `max_us`: longest time until every byte can be read.
-    Each percentile is the median of the rounds' percentiles. The keys with `_low_us` and `_high_us` have its 95 %
-    interval; with fewer than six rounds, the least and the largest percentile. With fewer than 299 frames in a round,
-    the p99 is null. Before each hand-over, the consumer waits at least 1 ms, as an idle unit does.
+    Each percentile is the median of the rounds' percentiles. The keys with `_low_us` and `_high_us` have the 95 %
+    interval of this median; with fewer than six rounds, the least and the largest percentile. With fewer than 299
+    frames in a round, the p99 is null. Before each hand-over, the consumer waits at least 1 ms, as an idle unit does.
 
     Trilane has three variants.
     `slot through the scheduler`: as in a run, the message goes to the scheduler's process, through the scheduler's
@@ -78,7 +78,8 @@ def measure(kib: tuple[int, ...] = (256, 4096, 16384), frames: int = 300, rounds
     `pickled queue`: the array goes through multiprocessing.Queue.
 
     `absent`: reason for each peer that is not installed.
-    `met`: whether p50 <= 150 us and p99 <= 500 us at the largest size, by variant of Trilane; null without a p99.
+    `met`: whether p50 <= 150 us and p99 <= 500 us at the largest size, for `slot` and `slot through the scheduler`;
+    null without a p99.
     `p50_largest_over_smallest`: p50 at the largest size divided by p50 at the smallest, by variant of Trilane.
     `slower_us`: p50 of the peer minus p50 of `slot through the scheduler` in the same round. The value is the 95 %
     interval of the median over the rounds, by peer and size.
@@ -232,7 +233,7 @@ def _answer(pipe: Connection) -> Any:
 
 
 def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, int], ChannelPair], dict[str, str]]:
-    """Return (waiting processes by variant and size in KiB, which `stack` ends; the reason for each absent variant)."""
+    """Return (processes by variant and size in KiB, reason for each absent variant). `stack` ends the processes."""
     context = multiprocessing.get_context("spawn")
     pairs, absent = {}, {}
     for variant, make in CHANNELS.items():
@@ -248,9 +249,9 @@ def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, in
 
 
 def _through_pipeline(size: int, frames: int) -> Times:
-    """Run `handoff_pipeline` with slots of `size` KiB, and return its times, in µs.
+    """Run `handoff_pipeline` with slots of `size` KiB. Return the times from raster's end, in µs.
 
-    They are (times from raster's end to infer's begin, times to infer's end).
+    They are (times from raster's end to infer's begin, times from raster's end to infer's end).
     """
     result = run_pipeline(handoff_pipeline(size * 1024), frames, policy="sequential")
     if result.interrupted:
@@ -329,9 +330,10 @@ def against_peers(times: dict[tuple[str, int], list[Times]]) -> dict[str, Any]:
 def _slower(
     times: dict[tuple[str, int], list[Times]], ours: str, until: int
 ) -> dict[str, dict[int, tuple[float, float]]]:
-    """Return the p50 of each peer minus the p50 of the variant `ours`, by peer, by size in KiB.
+    """Return how much longer each peer takes than the variant `ours`, in µs, by peer, by size in KiB.
 
-    Each value is the 95 % interval (low, high) of the median over the rounds, in µs.
+    A round's value is the p50 of the peer minus the p50 of `ours`. The result has the 95 % interval (low, high) of the
+    median over the rounds.
     `until`: index into `Times`: 0 until all bytes can be read, 1 until all were read.
     """
     p50 = {key: np.array([np.percentile(of_round[until], 50) for of_round in of]) for key, of in times.items()}
@@ -374,9 +376,9 @@ class HandoffStage:
 
 
 def check_bytes(payload: U8, value: int) -> None:
-    """Raise TrilaneError if the sum of all bytes is not the sum of as many bytes `value`.
+    """Raise TrilaneError if the bytes of `payload` are not all `value`.
 
-    `payload`: bytes to check; their number is a multiple of 8.
+    Only the sum of the 64-bit words is compared, modulo 2^64. `payload`: bytes to check, a multiple of 8.
     """
     words = payload.view(np.uint64)
     if int(words.sum(dtype=np.uint64)) != len(words) * value * 0x0101010101010101 % 2**64:

@@ -1,7 +1,7 @@
 """How long does a network take on each runtime, run continuously on random inputs?
 
-Rule: Trilane's runtimes and ONNX Runtime in FP32 run in turn on the same cores, a period each. Each has a process of
-its own.
+Rule: Trilane's runtimes and ONNX Runtime in FP32 run in turn on the same cores, for one period each. Each has a process
+of its own.
 """
 
 from __future__ import annotations
@@ -49,15 +49,15 @@ def measure(
 
     `rows` has a row for each network and runtime. A row has the network's settings, and:
     `parameters`: number of parameters.
-    `gmac`: 1e9 multiply-accumulates of a frame.
-    `runtime`, `batch`: name of the runtime, and frames that it infers at once; ONNX Runtime in FP32 always infers one
-    frame at once.
+    `gmac`: multiply-accumulates of a frame, in 1e9.
+    `runtime`, `batch`: name of the runtime, and number of frames that it infers at once; always 1 for ONNX Runtime in
+    FP32.
     `startup_cold_ms`, `startup_warm_ms`: time to import libraries and load the network, with an empty and with a filled
     cache.
     `frames`: number of inferred frames.
     `min_ms`, `mean_ms`, `p50_ms`, `p90_ms`, `p99_ms`, `max_ms`: times over all periods.
     `periods`: least, mean and largest time of each period.
-    `temperature_c`: temperature of the machine's sensor; null if it cannot be read.
+    `temperature_c`: temperature of the machine's sensor at the end; null if it cannot be read.
 
     Rows of INT8 networks also have:
     `int8_over_fp32`: speed divided by the speed of ONNX Runtime in FP32; null if there is no float network.
@@ -94,7 +94,7 @@ def _fixtures(
     size: tuple[str, ...],
     batch: tuple[int, ...],
 ) -> Iterator[tuple[NetworkFixture, onnx.ModelProto | None]]:
-    """Yield (integer network, float network) for each combination of settings; None: the float network is unknown.
+    """Yield (integer network, float network) for each combination of settings. An unknown float network is None.
 
     Raises BadInputError for a wrong size, or a network that cannot be read.
     """
@@ -141,8 +141,7 @@ def _cache(folder: Path) -> Iterator[None]:
 def _measure_periods(variants: dict[str, ProcessVariant], seconds: float, period: float) -> dict[str, dict[str, Any]]:
     """Return the measured times of each variant, by name, in ms.
 
-    The times of a variant have the keys `startup_cold_ms`, `startup_warm_ms`, and `periods`, a list of the times of all
-    runs for each period.
+    Their keys are `startup_cold_ms`, `startup_warm_ms` and `periods`, which has a list of times for each period.
     """
     with runners(variants) as by_name:
         cold = {name: runner.startup_ms for name, runner in by_name.items()}

@@ -1,7 +1,7 @@
 """Are Trilane's runtimes as fast as the libraries themselves, and how near are they to the machine's peak?
 
-Rule: the libraries run as in their own introductory examples. Trilane's runtimes get the same number of threads. All
-variants run in interleaved rounds.
+Rule: the libraries run as in their own introductory examples, with their default number of threads. Trilane's runtimes
+and `benchmark_app` get `threads` threads. All variants run in interleaved rounds.
 """
 
 from __future__ import annotations
@@ -54,8 +54,9 @@ def measure(
 
     `low`, `high`: 95 % interval of each ratio's median; with fewer than six rounds, the least and the largest ratio.
     `peaks`: the two peaks in words.
-    `rows`: median time and number of runs of each variant (`way`). Each variant runs for `seconds` in each round.
-    `gmac`: 1e9 multiply-accumulates of the network.
+    `rows`: median time and number of runs of each variant (`way`). Each variant runs for `seconds` in each round;
+    `benchmark_app` counts as one run.
+    `gmac`: multiply-accumulates of the network, in 1e9.
     `roofline`: result of the bench `roofline`.
     `config`: settings of the bench.
 
@@ -94,8 +95,8 @@ def compared(
 ) -> dict[str, dict[str, Any]]:
     """Return the keys `ratios`, `low` and `high` of the result of `measure`.
 
-    `times`: milliseconds of each run, by round, by variant. `gmac`: 1e9 multiply-accumulates of a run.
-    `layer_gmac_s`: best rate of an INT8 layer, 1e9 multiply-accumulates a second. `instruction_gmac_s`: peak of the
+    `times`: milliseconds of each run, by round, by variant. `gmac`: multiply-accumulates of a run, in 1e9.
+    `layer_gmac_s`: best rate of an INT8 layer, in 1e9 multiply-accumulates a second. `instruction_gmac_s`: peak of the
     instruction set in the same unit; None if unknown.
     """
     medians = {name: np.array([np.median(of_round) for of_round in of_rounds]) for name, of_rounds in times.items()}

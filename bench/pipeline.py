@@ -82,7 +82,7 @@ def measure(
     than 299 frames, the p99 is null.
     `efficiency`: CPU time of the slowest unit for a frame, divided by the frame time.
     `slowest`: unit that takes longest for a frame in the `sequential` runs before and after.
-    `alone_ms`: this time, without the time in which the unit had no core.
+    `alone_ms`: time of `slowest` for a frame in those runs, without the time in which the unit had no core.
     `busiest`: unit with the most work in this run.
     `idle`: share of time without a job, between the first and the last job of `busiest`. The causes of this share are
     `starved` (no input), `undispatched` (input, but no free slot, or not dispatched yet) and `overhead` (dispatched,
@@ -96,7 +96,8 @@ def measure(
     `in_run_over_alone`: time of the unit `slowest` in this run, without the time in which it had no core, divided by
     `alone_ms`.
     `gain_of_bound`: `gain` divided by `bound`.
-    `of_bound_low`, `of_bound_high`: its 95 % interval; with fewer than six rounds, the least and the largest.
+    `of_bound_low`, `of_bound_high`: 95 % interval of `gain_of_bound`; with fewer than six rounds, its least and largest
+    value.
     `dropped`, `lost`: numbers of frames in all rounds.
     `accuracy`: image error of each avatar and its source, or why there are no figures.
 
@@ -193,9 +194,10 @@ def _run_round(checked: Checked, settings: list[Setting]) -> list[dict[str, Any]
 
 
 def _compare(runs: list[dict[str, Any]], after: dict[str, Any]) -> None:
-    """Add the comparisons of `measure` to the figures of each run of a round, whose first run is `sequential`.
+    """Add the comparisons of `measure` to the figures of each run of a round. The first of `runs` is `sequential`.
 
-    Each run is compared with this run and with the next sequential run, `after`; the first run only with itself.
+    The first run is compared only with itself. Each other run is compared with the first run and with `after`, the next
+    sequential run.
     """
     for place, row in enumerate(runs):
         beside = (runs[0], after if place else runs[0])
@@ -263,10 +265,9 @@ def _units_ms(result: RunResult) -> dict[str, float]:
 
 
 def idle_between_jobs(jobs: Sequence[JobRecord]) -> dict[str, float]:
-    """Return a unit's idle shares by cause, and under `idle` their sum.
+    """Return the idle shares of a unit, `starved`, `undispatched` and `overhead` as in `measure`, and their sum `idle`.
 
-    The shares refer to the time from the begin of the unit's first job to the end of its last job. The causes are
-    `starved`, `undispatched` and `overhead`, as in `measure`. `jobs`: all jobs of the unit.
+    The shares refer to the time from the begin of the unit's first job to the end of its last. `jobs`: all its jobs.
     """
     ordered = sorted(jobs, key=lambda job: job.begin_ns)
     span = ordered[-1].end_ns - ordered[0].begin_ns
@@ -407,10 +408,10 @@ def serve(pipe: Connection, asked: Asked) -> None:
         pipe.send(f"{type(error).__name__}: {error}")
 
 
-# Two avatars at once on this machine: do the measured frame times equal those that the virtual clock computes?
+# Two avatars at once on this machine: are the measured frame times the same as the virtual clock's?
 #
 # Rule: both runs are measured at once. Before and after them, sequential runs measure each stage while no other unit
-# works. From these times alone, the frame times of both pipelines are computed, on cores that they share equally.
+# works. Both frame times are computed only from these times, on cores that the two pipelines share equally.
 #
 # The scheduler's own time, `SCHEDULER_NS` a job as in the model of placement, is added to the first stage, which runs
 # on the same core. `strangers` says how busy the machine was: the time for which sequential stages had no core, divided

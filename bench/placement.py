@@ -1,9 +1,9 @@
-"""Is the placement that a run chooses the best one, what does it gain over the rule, and does the model predict it?
+"""Is the placement that a run chooses the fastest, what does it gain over the rule's, and are predictions right?
 
 Rule: first a placement is chosen as in a run. After that, all placements are tried in interleaved rounds, a few frames
 each. The fastest placements run in further rounds, and the further rounds decide. Whole runs compare the chosen
-placement with the placement by the rule for any run. Other numbers of cores are computed in virtual time, and the
-results say so.
+placement with the placement by the rule for any run. For other numbers of cores, frame times are computed in virtual
+time, and the results say so.
 """
 
 from __future__ import annotations
@@ -67,9 +67,9 @@ def measure(
     `how`: reason of the choice: the run's own trial, or the prediction.
     `chosen_over_best`: frame time of the chosen placement divided by the frame time of the best other placement. It is
     the median over the further rounds; up to 1, the chosen placement is the best.
-    `low`, `high`: its 95 % interval; with fewer than six rounds, the least and the largest.
+    `low`, `high`: 95 % interval of `chosen_over_best`; with fewer than six rounds, its least and largest value.
     `rule_over_chosen`: frame time of the rule's placement divided by the frame time of the chosen placement.
-    `rule_low`, `rule_high`: its 95 % interval.
+    `rule_low`, `rule_high`: 95 % interval of `rule_over_chosen`.
     `rank_correlation`: Spearman's rank correlation of the predicted and the tried times of all placements.
     `predicted_over_tried`, `predicted_least`, `predicted_largest`: median, least and largest ratio of these times.
     `others`: share of the cores that other programs had in the further rounds; above a tenth, the row says little.
@@ -119,7 +119,7 @@ def _check(counts: Sequence[int], frames: int, rounds: int, finalists: int, furt
 
 
 class _Trial:
-    """Chooses a placement for a scene on some cores as a run does, and tries all placements.
+    """Chooses a placement for a scene on given cores, as a run does, and tries all placements.
 
     The constructor chooses the placement. It raises TrilaneError if a unit cannot start or a stage fails.
     """

@@ -87,7 +87,7 @@ def measure(
     `name`: name of the scene.
     `fixed_ms`, `planned_ms`: median frame times.
     `speedup`: fixed frame time divided by planned frame time, as the median over the rounds.
-    `speedup_low`, `speedup_high`: its 95 % interval; with fewer than six rounds, the least and the largest.
+    `speedup_low`, `speedup_high`: 95 % interval of `speedup`; with fewer than six rounds, its least and largest value.
     `placements`: cores of the units and the reason for them, by plan.
     `psnr_fixed_db`, `psnr_planned_db`, `ssim_*`, `flip_*`: image errors against the plan `full`; PSNR follows from the
     mean square over all compared frames. The same keys after `box_`: errors in the avatars' rectangles; null if no
@@ -100,7 +100,7 @@ def measure(
 
     Further keys, over all scenes:
     `median_speedup`, `least_speedup`: median and least speedup.
-    `largest_loss_db`: largest PSNR of fixed minus PSNR of planned.
+    `largest_loss_db`: largest loss in a scene, which is the PSNR of fixed minus the PSNR of planned.
     `worst_loss_db`: the same for the worst frame of each plan; null without a truth.
     `sources`: source of the figures.
     `driver`: facts about the OpenGL driver.
@@ -245,8 +245,8 @@ def by_frame(
     camera of the scene.
     The entry of a plan has the keys of `psnr_of_frames`, over the frames with a visible avatar, and `worst_frame`, the
     number of the worst frame. The entry of `planned` has two further keys. `changes`: number of frames whose tensor
-    has another shape than that of the previous frame. `worst_change_db`: least PSNR of these frames; None if the shape
-    never changes. If no frame shows an avatar, the result is None.
+    has another shape than in the previous frame. `worst_change_db`: least PSNR of these frames; None if the shape never
+    changes. If no frame shows an avatar, the result is None.
     """
     errors: dict[str, dict[int, float]] = {plan: {} for plan in chains}
     tensors: dict[int, str] = {}

@@ -1,8 +1,8 @@
 """How much faster is one packed pass than a pass for every four channels and a permute?
 
-Rule: all variants draw the same body in the same poses, in one process, in interleaved rounds. They must give the same
-bytes, except for a share `UNEQUAL` that may differ by one step. The split passes share mesh, texture and triangles with
-the packed pass.
+Rule: all variants draw the same body in the same poses, in one process, in interleaved rounds. The variants in
+`COMPARED` must give the same bytes, except for a share `UNEQUAL` that may differ by 1. The split passes share mesh,
+texture and triangles with the packed pass.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def measure(size: int = 512, channels: int = 16, repeats: int = 40, threads: int
     `raster_ms`: median time of the stage raster as in a run on this driver. With a software driver, the CPU unit skins
     the body, and the time of skinning does not count.
     `packed_ms`, `split_ms`: median times of the packed pass and of the split passes.
-    `ratios`: `split_over_packed`, the second of these times divided by the first.
+    `ratios`: `split_over_packed`, which is `split_ms` divided by `packed_ms`.
     `rows`: median, minimum and 90th percentile of each variant (`way`) over `repeats` draws.
     `covered`: share of the pixels that the body covers.
     `driver`: facts about the OpenGL driver.

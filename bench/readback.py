@@ -158,7 +158,7 @@ RING = 3
 
 
 class Readback:
-    """Reads part of a framebuffer of 32-bit unsigned words into a slot: the driver copies while the caller waits.
+    """Reads part of a framebuffer of 32-bit unsigned words into a slot. The caller waits until the driver has copied.
 
     `lag`: number of further submits after which the bytes arrive.
     """
@@ -166,7 +166,7 @@ class Readback:
     lag = 0
 
     def __init__(self, ctx: Any, most_bytes: int) -> None:
-        """Do nothing: no memory is needed."""
+        """Do nothing: no memory is needed. `most_bytes`: size of the largest tensor, for variants with buffers."""
 
     def submit(self, target: Any, box: Box, words: int, tensor: U8) -> None:
         """Start a read.
@@ -210,7 +210,7 @@ class OrphanPboReadback(PboReadback):
 class RingReadback(Readback):
     """A readback through a ring of pixel buffers with fences.
 
-    The bytes of a buffer are copied to their slot only when the buffer is needed for a new read.
+    A buffer's bytes are copied to their slot only when the next read needs the buffer, `lag` submits later.
     """
 
     lag = RING - 1

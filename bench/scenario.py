@@ -61,7 +61,8 @@ def measure(
     `verdict`: VALID or INVALID. A run is valid if it lasted `seconds`, had as many queries as its percentile needs and,
     for a server, had few enough late answers.
     `because`: reasons why the run is invalid, by the judge `trilane`.
-    `queries`, `seconds`, `rate`: number of queries, duration, and queries a second.
+    `queries`, `seconds`, `rate`: number of queries, duration, and queries a second; under `loadgen`, a query has one
+    frame.
     `p50_ms`, `max_ms`: median and largest latency of the queries.
     `percentile`: share of the queries that is judged.
     `percentile_ms`: latency that this share of all queries does not exceed; null for too few queries.
@@ -329,7 +330,7 @@ def _poisson(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
 
 
 def _all_at_once(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
-    """Ask all queries at once: as many as the pipeline answers in `load.seconds`, by the rate of a few before."""
+    """Ask as many queries at once as the pipeline answers in `load.seconds`. A few earlier queries show its rate."""
     few = queries_needed(load.percentile)
     queries.ask(requests, few)
     queries.wait()
@@ -363,10 +364,10 @@ def tail(queries: int, late: int, share: float) -> float:
 
 
 def queries_needed(percentile: float, late: int = 1) -> int:
-    """Return how many queries show, with `CONFIDENCE`, that a share of all queries keeps a limit of the latency.
+    """Return how many queries are needed to show, with `CONFIDENCE`, that the share `percentile` keeps a latency limit.
 
-    `percentile`: this share, such as 0.99. `late`: number of queries that may exceed the limit. With one late query, 64
-    queries are needed for 0.90, and 662 for 0.99.
+    `percentile`: share of all queries, such as 0.99. `late`: number of queries that may exceed the limit. With one late
+    query, 64 queries are needed for 0.90, and 662 for 0.99.
     """
     numbers = range(MAX_FRAMES)
     return bisect_left(numbers, True, late + 1, key=lambda n: tail(n, late, 1 - percentile) <= 1 - CONFIDENCE)

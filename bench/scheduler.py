@@ -184,7 +184,7 @@ def _trilane_variants(graph: Graph, service: Service, frames: int) -> dict[str, 
 def _simpy_variants(graph: Graph, service: Service, frames: int) -> tuple[dict[str, Run], dict[str, dict[str, str]]]:
     """Return (functions that run the models in SimPy, by variant; facts for the result of `measure`).
 
-    Without SimPy the facts are the key `absent`, else nothing.
+    Without SimPy there are no functions, and the facts are the key `absent`. With SimPy there are no facts.
     """
     try:
         models = _models()
@@ -226,7 +226,7 @@ def _row(variant: str, frames: int, events: int, seconds: list[float], processed
 
 
 def _traces(seed: int) -> list[str]:
-    """Do the same run `REPEATS` times, with a death of the DSP unit, and return a digest of each run's steps."""
+    """Do `REPEATS` equal runs in which the DSP unit dies. Return a digest of each run's steps and report."""
     settings = Settings(SEED_FRAMES, "deadline", period_ns=PERIOD_NS, deadline_ns=3 * PERIOD_NS)
     digests, faults = [], [(1_000 * MS + seed * 7 * MS, "dsp")]
     for _ in range(REPEATS):
@@ -246,7 +246,7 @@ def _replayed(events: str) -> dict[str, Any]:
 
 # The avatar's pipeline in SimPy, for comparison: the same chain, slots, held jobs and order as the `pipelined` policy.
 #
-# Rule: the models only compute when each frame is presented: no ledger, no faults, no other policies.
+# Rule: the models only compute when each frame is presented. They have no ledger, no faults and no other policies.
 # `SimpyPipeline` is written as SimPy's users write; `LeanPipeline` is as lean as SimPy allows.
 
 
@@ -297,10 +297,10 @@ class SimpyPipeline:
 class LeanPipeline:
     """The model of `SimpyPipeline` with one timeout for each job, and with callbacks in place of processes.
 
-    SimPy only keeps the clock and the order of events. Slots, held jobs and queues are plain numbers and lists. Times
-    equal those of `SimpyPipeline` to the nanosecond, unless two events have the same time. The model is only right for
-    chains whose edges drop nothing, so that frames stay in order. A unit takes the oldest waiting frame, which waits at
-    the last of the unit's stages that have one. Parameters and attributes: see `SimpyPipeline`.
+    SimPy only keeps the clock and the order of events. Slots, held jobs and queues are plain numbers and lists. Both
+    models have the same times to the nanosecond, unless two events have the same time. The model is only right for
+    chains whose edges drop nothing, so that frames stay in order. A unit takes its oldest waiting frame, which is the
+    first frame at the last of its stages where frames wait. Parameters and attributes: see `SimpyPipeline`.
     """
 
     def __init__(self, simpy: Any, graph: Graph, service: Service, frames: int, period_ns: int) -> None:

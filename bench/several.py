@@ -64,7 +64,7 @@ def measure(
     `margin`: pixels of the tensor between two avatars.
     `loss_db_median`, `loss_db_worst`: PSNR without neighbours minus PSNR with neighbours, in dB.
     `psnr_db_alone`: median PSNR without neighbours.
-    `bytes_mean`, `bytes_max`: mean and largest difference of the two pictures in an avatar's cell, in bytes.
+    `bytes_mean`, `bytes_max`: mean and largest difference of byte values between both pictures of an avatar's cell.
     `cell_height`: median height of a cell in tensor pixels.
 
     Further keys:
@@ -116,7 +116,7 @@ class _CrowdFixture:
         """Return a tuple of five numbers for each avatar that is visible in `view`.
 
         The first two are the PSNR in dB with and without neighbours. The next two are the mean and the largest
-        difference of the two pictures in bytes. The last is the height of the avatar's cell in tensor pixels.
+        difference of byte values between both pictures. The last is the height of the avatar's cell in tensor pixels.
         """
         everyone = self._picture(view, range(len(view.joints)))
         rows = []

@@ -1,4 +1,4 @@
 """The GLSL sources that the GPU unit and the training draw with.
 
-It holds data only and uses nothing.
+This folder holds only data, and uses nothing.
 """

@@ -2,7 +2,7 @@
 // Reads the premultiplied picture, averaged over the pixel's footprint with TAPS x TAPS bilinear reads.
 
 uniform sampler2D picture;
-uniform vec4 inside; // left, top, right, bottom that may be read
+uniform vec4 inside; // limits of the reads: left, top, right, bottom, 0..1 of the texture
 
 in vec2 v_uv;
 out vec4 pixel;

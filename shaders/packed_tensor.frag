@@ -14,10 +14,10 @@ uint word(vec4 real) {
 }
 
 #ifdef DEFERRED
-// All channels of a texel lie side by side, so a pixel reads three cache lines, not eight. A uvec4 holds eight of them:
+// All channels of a texel lie side by side, so a pixel reads three cache lines, not eight. A uvec4 has eight channels:
 // the low halves of its words are four channels, the high halves are the next four.
 uniform usampler2D neural;
-uniform float unit; // factor on the texture's numbers, because their bits are read as those of a float
+uniform float unit; // factor on the texture's numbers, because the bits of FP16 are read as bits of FP32
 uniform sampler2D uv_image;
 
 vec4 low(uvec4 halves) {

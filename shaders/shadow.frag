@@ -1,8 +1,7 @@
 #version 330
-// Writes by what a contact shadow multiplies sRGB numbers, as alpha, and what is then taken from them, as colour.
-// Light times k turns the sRGB number s into (s + 0.055) k^(1/2.4) - 0.055. So sRGB bytes are blended as they are, as if
-// in linear light; this leaves out the straight part of sRGB, the darkest tenth of a shade.
-// The shadow falls smoothly to 0 at the rim.
+// Draws a contact shadow, which falls smoothly to 0 at the rim. The blending multiplies sRGB numbers by alpha, and
+// subtracts the colour. Light times k turns the sRGB number s into (s + 0.055) k^(1/2.4) - 0.055. Therefore the result
+// is as if blended in linear light, except for numbers below 0.04, where sRGB is a straight line.
 
 in vec2 v_place;
 flat in float v_strength; // at most 0.72

@@ -1,6 +1,6 @@
 #version 330
-// Writes one layer of four channels, quantised as the packed pass does, one byte to a colour channel: the baseline of
-// `trilane bench raster` that draws the tensor in several passes.
+// Writes four channels of the tensor, quantised as in the packed pass, one byte to each colour channel.
+// `trilane bench raster` compares the packed pass with such passes.
 
 uniform sampler2DArray neural;
 uniform float scale;

@@ -1,6 +1,6 @@
 #version 330
-// Averages SAMPLES x SAMPLES linear-light samples a pixel with a tent filter two pixels wide, weighted by alpha, and
-// writes sRGB with straight alpha. SAMPLES is even. Beyond the border the outermost samples repeat.
+// Turns SAMPLES x SAMPLES samples a pixel, in linear light, into sRGB with straight alpha. A pixel is the mean under a
+// tent filter two pixels wide, weighted by alpha. SAMPLES is even. Beyond the border the outermost samples repeat.
 
 uniform sampler2D samples;
 out vec4 pixel;

@@ -1,10 +1,10 @@
 """The avatar's stages, one folder per unit, with their packets, assets, configuration and pipeline.
 
-It may use `scene/`, `avatars/`, `hw_profiles/`, `pipeline/` and the layers below them. This file imports nothing, so
-that the fork server reads the names below without waiting for a slow import.
+This folder may use `scene/`, `avatars/`, `hw_profiles/`, `pipeline/` and the layers below them. This file imports
+nothing, so that the fork server reads the names below without waiting for a slow import.
 """
 
-#: Factory of each stage; all parts of a network that is cut have the same one.
+#: Factory of each stage. If the network is cut, each part is a stage with the factory of `infer`.
 FACTORIES = {
     "pose": "trilane.stages.cpu.pose:build",
     "raster": "trilane.stages.gpu.raster:build",

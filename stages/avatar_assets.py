@@ -1,7 +1,7 @@
 """The assets of a run of the avatar: arrays that the parent loads, and that every unit maps.
 
-Rule: files are opened once. The prefix of a name says what the array belongs to: `body0/` and `avatar0/` to the first
-distinct bundle, `network0/` to the first distinct network, `scene/` to the scene.
+Rule: files are opened once. An array belongs to what its name begins with: `body0/`, `avatar0/` and `meshes0/` are the
+first distinct bundle, `network0/` is the first distinct network, `scene/` is the scene.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class AvatarData:
 
     `shaped`: body with the avatar's shape.
     `texture`: neural texture (H,W,C) float32.
-    `levels`: smaller levels of the texture, packed by `pack_levels`; None if it has none.
+    `levels`: smaller levels of the texture, packed by `pack_levels` of avatars/bundle.py; None if it has none.
     `mesh_levels`: levels of the mesh, the finest first.
     """
 
@@ -51,7 +51,7 @@ class AvatarData:
 
 
 def load_avatar(bundle: Bundle) -> AvatarData:
-    """Load the content of `bundle` that a run needs. Raises BadInputError."""
+    """Load the content of `bundle` that a run needs. Raises BadInputError for a file that cannot be read."""
     shaped = bundle.shaped_body()
     texture, network, levels = bundle.read_texture(), bundle.read_network(), bundle.read_levels()
     return AvatarData(bundle, shaped, texture, network, levels, bundle.read_mesh_levels(shaped))
@@ -60,7 +60,7 @@ def load_avatar(bundle: Bundle) -> AvatarData:
 def networks_of_avatars(avatars: Sequence[AvatarData]) -> list[int]:
     """Return, for each of `avatars`, the number of the network that paints it.
 
-    Avatars share a network, and therefore a tensor, if its file and the encoding of its input are the same.
+    Avatars share a network, and therefore a tensor, if they have equal network files and encodings of the input.
     """
     kinds = [(one.network.digest, one.bundle.manifest.network.input) for one in avatars]
     known = list(dict.fromkeys(kinds))
@@ -167,11 +167,9 @@ def networks_of(assets: Assets) -> list[NetworkFile]:
 
 
 def painting(networks: Sequence[NetworkFile], shape: Shape, facts: Mapping[str, str]) -> Network:
-    """Return all `networks`, each on a tensor of `shape`, as one network for predictions.
+    """Return all `networks` as one network for predictions, whose input is as high as all their tensors together.
 
-    Its input is as high as all tensors together.
-
-    `facts`: keys that identify the network in reports.
+    `shape`: (height, width) of each network's tensor. `facts`: keys that identify the network in reports.
     """
     work = one_after_the_other([count_work(reshaped(network, *shape).model) for network in networks])
     channels = max(network.channels for network in networks)

@@ -93,8 +93,8 @@ FRAMES = 12  # frames of a rehearsal, spread evenly over the scene; the first tw
 def thread_counts(cores: int, rule: Placement) -> dict[str, list[int]]:
     """Return, by unit, the numbers of threads besides 1 with which the unit is measured.
 
-    Each unit is measured with its number in `rule`. The network's unit is also measured with 2 to 4 threads, and with a
-    thread for half of the cores, for all but two, for all but one, and for all cores.
+    Each unit is measured with its number in `rule`. The network's unit is also measured with 2 to 4 threads. Further
+    numbers of its threads are half of the cores, all but two, all but one, and all cores.
 
     `cores`: number of cores.
     `rule`: placement that suits any run, with the cores that the options choose.
@@ -111,7 +111,6 @@ def measured_times(checked: Checked, cores: Sequence[CpuCore], rule: Placement, 
     `cores`: available cores.
     `rule`: placement whose numbers of threads are measured too.
     `starter`: unit starter.
-
     Raises TrilaneError if a unit cannot start or a stage fails, KeyboardInterrupt if interrupted.
     """
     fastest = [core.number for core in sorted(cores, key=lambda core: (-core.permille, core.number))]
@@ -180,7 +179,7 @@ def tried(
 def _thrown_away(checked: Checked) -> Iterator[RunConfig]:
     """Yield the configuration of `checked` with one tensor shape and a run folder that is removed afterwards.
 
-    A single shape is prepared faster than many. No shape of the same size has more than 25/16 of its area.
+    A single shape is prepared faster than many. The other shapes of a size have at most 25/16 of this shape's area.
     """
     with tempfile.TemporaryDirectory(prefix="trilane-rehearsal-") as folder:
         height, width = one_shape(checked.config)
@@ -189,6 +188,6 @@ def _thrown_away(checked: Checked) -> Iterator[RunConfig]:
 
 
 def one_shape(config: RunConfig) -> Shape:
-    """Return the most square tensor shape, apart from shapes that are only used when frames would be late."""
+    """Return the most square tensor shape. Shapes with at most half of the largest area are left out."""
     large = [shape for shape in config.buckets if 2 * shape[0] * shape[1] > config.max_tensor_pixels]
     return min(large, key=lambda shape: (abs(shape[0] - shape[1]), shape))

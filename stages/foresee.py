@@ -51,7 +51,6 @@ def tensor_works(scene: Scene, policy: str, losses: Sequence[SizeLoss]) -> tuple
     """Return (`RunConfig.works` of a scene under `policy`, note for a person, which may be empty).
 
     `losses`: loss of PSNR of each avatar in tensors below full size; without figures if it was not measured.
-
     Raises BadInputError if the scene has an error budget and an avatar has no measured errors.
     """
     if not scene.plans_tensor:
@@ -74,7 +73,7 @@ def tensor_works(scene: Scene, policy: str, losses: Sequence[SizeLoss]) -> tuple
     return (within if paced else within[-1:]), said
 
 
-#: Number of frames to examine: divided by the number of avatars, and the least number of the result.
+#: Number of frames to examine for one avatar. For n avatars, this number is divided by n, but not below LEAST_FRAMES.
 FORESEEN_FRAMES, LEAST_FRAMES = 96, 24
 #: Largest distance in frames between two examined frames with which changes are foreseen.
 MOST_APART = 15
@@ -155,11 +154,11 @@ class Painted:
 def foresee(
     scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], painted: Painted, budgets: Sequence[TensorBudget]
 ) -> Foreseen:
-    """Return the tensor shapes that `scene` needs.
+    """Return the tensor shapes that `scene` needs, and the changes between them if they can be foreseen.
 
     `bodies`: bodies of its avatars, in order.
     `painted`: networks that paint the avatars.
-    `budgets`: budgets of its tensors, the largest first. The run may step down to the smaller ones, if memory has room
+    `budgets`: budgets of its tensors, the largest first. The run may step down to smaller budgets, if memory has room
     for their shapes.
     """
     count = min(scene.frames, max(FORESEEN_FRAMES // len(bodies), LEAST_FRAMES))
@@ -250,7 +249,7 @@ def foreseen_rects(
 
 
 def bytes_per_pixel(network: NetworkFile) -> float:
-    """Return the bytes of memory per pixel of its tensor that the prepared `network` takes.
+    """Return how many bytes of memory the prepared `network` takes for each pixel of its tensor.
 
     There are COPIES copies of each of the network's byte tensors.
     """

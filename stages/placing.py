@@ -1,13 +1,13 @@
-"""Chooses the cores of a run's units: as asked; else by the shortest frames, tried or predicted; else by a rule.
+"""Chooses the cores of a run's units: by request, by the shortest tried or predicted frames, or by a rule.
 
 A run that is long enough is rehearsed first. The rehearsal measures the time that each unit needs for a frame, with
 each number of threads that it may have. The few placements with the shortest predicted frames are then tried with real
 frames. Both results are kept for the next run with the same network, shapes, runtime, output and machine. The rule of
 `trilane.hw_profiles.host` places a run that is too short to gain by a rehearsal or is held to a chip's pace.
 
-Nothing is tried while other programs use the cores: a floating unit avoids these programs, but a pinned unit waits for
-them, so frame times would depend more on the programs than on the placements. In this case the prediction decides, a
-note says so, and the next run may try placements again.
+Nothing is tried while other programs use the cores. A floating unit avoids these programs, but a pinned unit waits for
+them. Therefore frame times would depend more on the programs than on the placements. In this case the prediction
+decides, a note says so, and the next run may try placements again.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ def placed(
     `checked`: run to place.
     `policy`: policy of the run.
     `starter`: unit starter.
-    `driver`: OpenGL driver, which the times depend on.
+    `driver`: name of the OpenGL driver, on which the times depend.
     `say`: function that is called with a message before a measurement that takes seconds.
     Raises TrilaneError if a unit cannot start or a stage fails, KeyboardInterrupt if interrupted.
     """
@@ -178,7 +178,7 @@ def _reason(facts: Mapping[str, Any]) -> str:
 def rehearsed(
     checked: Checked, starter: UnitStarter, driver: str = "", say: Callable[[str], None] = lambda _: None
 ) -> tuple[Rehearsed, str]:
-    """Return (the times that place a run of `checked`, when they were measured, UTC). They may be an earlier run's.
+    """Return (measured or cached times by which a run of `checked` is placed, date and time of the measurement, UTC).
 
     Parameters and errors are as in `placed`.
     """
@@ -228,7 +228,7 @@ def _made_from(checked: Checked, cores: Sequence[CpuCore], rule: Placement) -> l
 
 #: Number of rounds in which placements are tried. After TRY_S seconds no round starts, except the first LEAST_ROUNDS.
 ROUNDS, LEAST_ROUNDS, TRY_S = 6, 3, 5.0
-#: Largest share of the cores that other programs may use while placements are compared, and how long it is measured.
+#: Largest share of the cores that other programs may use while placements are compared, and seconds of measuring it.
 QUIET_ENOUGH, LOOK_S = 0.1, 0.25
 PREDICTED = "the least predicted frame time"
 TRYING = "trying {} placements with frames of the scene (once for this avatar, scene and machine) ..."

@@ -28,7 +28,8 @@ class CastView:
     """One visible avatar in one frame.
 
     `index`: number of the avatar in the scene. `folder`: folder of the avatar's bundle.
-    `pose`, `translation`: pose (55,3) and translation (3,) from `Mover.sample`. `world`: matrix (4,4) of the `Mover`.
+    `pose`, `translation`: pose (55,3) and translation (3,) from `Mover.sample`. `world`: matrix (4,4) from the body's
+    space to the world.
     `joints`: skinning matrices (55,3,4), as the pose stage computes them.
     `box`: rectangle of the picture around the avatar and its clothes; it may reach beyond the picture.
     `depth`: camera z of the pelvis. `view`: view matrix (4,4). `projection`: matrix (4,4) of the projection to the box.
@@ -238,9 +239,8 @@ def _reads(begin: float, end: float, count: int, side: int, taps: int) -> tuple[
     """Return (first, weights): how a layer is resampled along one axis of a picture.
 
     The n pixels of the picture with centres in [begin, end) get values; `first` is the number of the first of them. Row
-    k of `weights` (n, count) says how much each pixel of the layer counts for pixel `first` + k of the picture, by
-    `taps` reads.
-    `side`: pixels of the picture along the axis.
+    k of `weights` (n, count) has the weights of the layer's pixels for pixel `first` + k of the picture.
+    `count`: pixels of the layer. `side`: pixels of the picture. `taps`: reads for a pixel of the picture.
     """
     first, last = (min(max(int(np.ceil(place - 0.5)), 0), side) for place in (begin, end))
     middles = np.arange(first, last)[:, None] + 0.5

@@ -1,9 +1,8 @@
 """The fixture that the GPU benches draw, its ground truth, and the timing of variants in interleaved rounds.
 
-Rule: the default body fills the height of a square picture. Only the size and the number of channels vary; all other
-numbers are the same every time. The functions of runs and of training make avatars and ground truth. A busy machine
-affects all variants alike. As in a run, successive inputs differ and slots alternate, because caches would speed up
-repetitions.
+Rule: the default body fills the height of a square picture. Only the size and the numbers of channels and weights vary;
+all other numbers are the same every time. Avatars and ground truth come from the same functions as in runs and in
+training. As in a run, successive inputs differ and slots alternate, because caches would speed up repetitions.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ class Fixture:
     """The body that a bench draws, with its neural texture and its camera.
 
     `shaped`: default body after its shape blend shapes.
-    `poses`: joints of the body in each of INPUTS poses.
+    `poses`: posed joints of the body, for each of INPUTS poses.
     `arrays`: mesh of the body for the GPU.
     `view`, `projection`: matrices of the camera, (4,4) float64.
     `texture`: neural texture (512,512,C) float64, with the same numbers every time.

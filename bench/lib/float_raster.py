@@ -1,4 +1,4 @@
-"""A reference rasteriser in float64 NumPy. The pictures of the stage raster are compared with its pictures.
+"""A rasteriser in float64 NumPy, whose pictures are the reference for the pictures of the stage raster.
 
 Rule: pixel centres are at half-integers. The rasteriser uses the top-left rule and a less-than depth test. Unlike a
 driver, it neither rounds coordinates nor snaps vertices to a grid. Triangles are evaluated in homogeneous coordinates
@@ -128,7 +128,7 @@ def _fragments(
     """Return (pixel, depth, triangle, share) of all fragments: a fragment is one pixel that one triangle covers.
 
     Each array has a row for each of P fragments. `pixel` (P,): index of the pixel in row-major order. `depth` (P,): z/w
-    of the point. `triangle` (P,): number of the triangle. `share` (P,3): shares of the triangle's corners in the point.
+    of the point. `triangle` (P,): number of the triangle. `share` (P,3): barycentric coordinates, perspective-correct.
     `corners`: result of `_target_corners` for the corners of each triangle, (F,3,4). `shape`, `cull`: see `rasterise`.
     """
     low, size = _boxes(corners, shape)
@@ -193,5 +193,5 @@ def _cross(points: F64, first: int, second: int) -> F64:
 
 
 def _determinant(points: F64) -> F64:
-    """Return a determinant (F,) for each triangle, which is positive if it winds clockwise in the picture."""
+    """Return a determinant for each triangle, (F,): positive if the triangle winds clockwise in the picture."""
     return np.asarray((_cross(points, 1, 2) * points[:, 0][:, [0, 1, 3]]).sum(axis=-1))

@@ -1,10 +1,10 @@
 """Pictures by the plan `full`, in which everything is modelled, and true pictures. Other plans are compared with both.
 
-Rule: the plan `full` is a second, slow implementation, as far as possible. The body has every weight and every blend
-shape in float64. A tensor pixel is the unrounded mean of SAMPLES x SAMPLES reads of the neural texture. Each avatar has
-a tensor of its own, whose size is near the size that its network was trained for. The tensor lies on the picture's
-grid: a pixel of the tensor covers a square of pixels of the picture, or the other way round. The network is in FP32.
-The network's picture is blended in linear light, in float64, over the run's own background.
+Rule: the plan `full` is a second, slow implementation, which shares little code with the stages. The body has every
+weight and every blend shape in float64. A tensor pixel is the unrounded mean of SAMPLES x SAMPLES reads of the neural
+texture. Each avatar has a tensor of its own, whose size is near the size that its network was trained for. The tensor
+lies on the picture's grid: a pixel of the tensor covers a square of pixels of the picture, or the other way round. The
+network is in FP32. Its picture is blended in linear light, in float64, over the run's own background.
 
 A true picture shows the clothed body itself, drawn like a training sample. An avatar's network was trained to paint
 this picture. Therefore the true picture shows how good every plan is, including `full`. Only bundled avatars have true
@@ -112,7 +112,7 @@ def _shift(by: F64) -> F64:
 
 @dataclass(frozen=True)
 class _Avatar:
-    """The parts of an avatar that the plan `full` draws with. `area`: tensor pixels of its FP32 network's training."""
+    """The parts of an avatar that the plan `full` draws with. `area`: pixels of its network's tensor in training."""
 
     body: FullBody
     mesh: MeshArrays
@@ -126,7 +126,7 @@ class FullPictures:
     """Makes pictures of the avatars in `cast` by the plan `full`."""
 
     def __init__(self, cast: Cast) -> None:
-        """Load the networks. Raises BadInputError if a file cannot be read, MissingPartError without PyTorch."""
+        """Load the networks. Raises BadInputError for an unreadable file, MissingPartError if PyTorch is lacking."""
         self._cast = cast
         self._avatars = {folder: _avatar(data) for folder, data in cast.avatars.items()}
 
@@ -164,7 +164,7 @@ def fineness(shape: Shape, area: int) -> Fraction:
     own = shape[0] * shape[1]
     larger, smaller = max(own, area), min(own, area)
     times = isqrt(larger // smaller)
-    # The larger of the two whole numbers around the root is nearer, as a ratio, beyond their geometric mean.
+    # If the root is above the geometric mean of the whole numbers around it, the larger number is nearer, as a ratio.
     times += larger > smaller * times * (times + 1)
     return Fraction(times) if area > own else Fraction(1, times)
 
@@ -218,7 +218,7 @@ class TruePictures:
         return blended(background, self.layers(number))
 
     def layers(self, number: int) -> list[RasterLayer]:
-        """Return a layer for each visible avatar in frame `number`. Its pixels are pixels of the picture."""
+        """Return a layer for each visible avatar in frame `number`. The layers' pixels are pixels of the picture."""
         layers = []
         for seen in self._cast.seen(number):
             rgba = self._clothed[seen.folder].render(seen.joints, seen.view, seen.projection, seen.box.shape) / 255.0
@@ -243,9 +243,9 @@ def _clothed(data: AvatarData, ctx: Any) -> ClothedBody:
 
 # The FP32 network of an avatar, with which the plan `full` paints.
 #
-# Rule: every picture states its source. If the avatar's manifest names the float network that the avatar was quantised
-# from, by its digest, and the file is here, this network is used. Otherwise the integer network runs with its weights
-# in float32, without rounding between its layers. In that case, `full` has the error of quantised weights too.
+# Rule: results name the source of the network. If the avatar's manifest names the float network that the avatar was
+# quantised from, by its digest, and the file is in WEIGHTS, this network is used. Otherwise the integer network runs
+# with its weights in float32, without rounding between its layers, and `full` has the error of quantised weights too.
 
 #: Folder in which Trilane keeps the weights of float networks.
 WEIGHTS = Path(__file__).resolve().parents[2] / "training"
@@ -255,7 +255,7 @@ Paint = Callable[[F64], F32]
 
 
 def float_network(bundle: Bundle) -> tuple[Paint, str]:
-    """Return (FP32 network of `bundle`, source of the network in words).
+    """Return (FP32 network of `bundle` as a function, source of the network in words).
 
     Raises BadInputError if a file cannot be read, MissingPartError if the network needs PyTorch, which is absent.
     """
@@ -332,9 +332,10 @@ def as_written(network: NetworkFile) -> Paint:
 
 
 def _painted(model_of: Callable[..., onnx.ModelProto], settings: onnxruntime.SessionOptions | None) -> Paint:
-    """Return a function that runs a model of a network with an input of real numbers by ONNX Runtime.
+    """Return a function that runs a network on real numbers by ONNX Runtime.
 
-    `model_of`: function that returns the model for a tensor's height and width.
+    `model_of`: function of a tensor's height and width. It returns the network's model with the input `IN`.
+    `settings`: settings of the sessions; None for ONNX Runtime's defaults.
     """
     session_of = cache(
         lambda *shape: onnxruntime.InferenceSession(

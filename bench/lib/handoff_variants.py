@@ -314,8 +314,8 @@ class _IceoryxConsumer:
 
 
 SLOT, BARE = "slot", "slot, 256 KiB of it written"
-#: Variant -> its channel. `SLOT` is Trilane's, with a message from process to process. `BARE` is the same, but only a
-#: small part of the slot is written, so that writing hardly changes the caches.
+#: Variant -> function of the size in bytes and the context of multiprocessing, which makes the channel. `BARE` is like
+#: `SLOT`, but only a small part of the slot is written, so that writing hardly changes the caches.
 CHANNELS: dict[str, Callable[[int, SpawnContext], Channel]] = {
     SLOT: SlotChannel,
     BARE: SlotChannel,

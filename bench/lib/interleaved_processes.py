@@ -83,8 +83,8 @@ class ProcessVariant:
     `kind`: key of `KINDS`.
     `network`: path of the ONNX file.
     `runtime`: name of the runtime, for the kind `runtime`; "" for other kinds.
-    `threads`: number of threads; None for the library's default.
-    `spin`: whether the threads may spin between runs.
+    `threads`: number of threads; None for 1 thread of the kind `runtime`, and for the library's default of other kinds.
+    `spin`: whether the threads of the kind `runtime` may spin between runs.
     """
 
     kind: str
@@ -98,7 +98,7 @@ class Runner:
     """The process of a variant, as the parent process sees it.
 
     `startup_ms`: time that the process took to import libraries and load the network.
-    The constructor waits for this time. It raises TrilaneError if the process does not start.
+    The constructor waits until the process is ready. It raises TrilaneError if the process does not start.
     """
 
     def __init__(self, pipe: Connection, name: str) -> None:
@@ -163,7 +163,7 @@ def _timed(runs: Runs, count: int) -> list[float]:
 
 
 def _runtime(variant: ProcessVariant) -> Runs:
-    """Return endless calls that each infer once with the Trilane runtime of `variant`, with slots bound once."""
+    """Return endless calls that each infer once with Trilane's runtime `variant.runtime`. Slots are bound once."""
     from trilane.avatars.network_file import read_network
     from trilane.bench.lib.networks import random_tensors
     from trilane.stages.dsp.runtime import RuntimeOptions, load_runtime
@@ -183,9 +183,9 @@ def _runtime(variant: ProcessVariant) -> Runs:
 
 
 def _ort_default(variant: ProcessVariant) -> Runs:
-    """Return endless calls that each infer once as in ONNX Runtime's introductory example.
+    """Return endless calls that each infer once, as in ONNX Runtime's introductory example.
 
-    They run with its defaults but the threads of `variant`.
+    All settings are ONNX Runtime's defaults, except the number of threads if `variant` has one.
     """
     import onnxruntime
 
@@ -204,9 +204,9 @@ def _ort_default(variant: ProcessVariant) -> Runs:
 
 
 def _openvino_default(variant: ProcessVariant) -> Runs:
-    """Return endless calls that each infer once as in OpenVINO's introductory example.
+    """Return endless calls that each infer once, as in OpenVINO's introductory example.
 
-    They run with its defaults but the threads of `variant`.
+    All settings are OpenVINO's defaults, except the number of threads if `variant` has one.
     """
     from trilane.stages.dsp.runtime import quiet_openvino
 

@@ -37,7 +37,7 @@ class NetworkFixture:
 
     `label`: settings of the network by name, as in the rows of a bench.
     `integer`: quantised network, with bytes as input and output.
-    `parameters`: number of parameters. `gmac`: 1e9 multiply-accumulates of a frame.
+    `parameters`: number of parameters. `gmac`: multiply-accumulates of a frame, in 1e9.
     """
 
     label: dict[str, Any]

@@ -1,8 +1,8 @@
-"""The composited frames of a run, made by its own stages, one after the other in this process.
+"""The composited frames of a run, made by the run's own stages, one after the other in this process.
 
 Rule: the pipeline's factories build the stages, and the stages are bound as in a unit's process. Therefore a frame has
-the same bytes as in a run. Frames may be made in any order. Therefore no frame reuses an earlier frame's picture. A
-frame without a visible avatar takes the pipeline's bypass, as in a run.
+the same bytes as in a run. Frames may be made in any order, because no frame reuses an earlier frame's picture. A frame
+without a visible avatar takes the pipeline's bypass, as in a run.
 """
 
 from __future__ import annotations

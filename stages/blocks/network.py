@@ -1,9 +1,9 @@
 """A network as a stage: `onnx = "net.onnx"` of a pipeline file, in a runtime that reads and writes the slots.
 
-Rule: the stage passes an input to the runtime in place if its number type and its number of elements are those of the
-network. Otherwise the input is a picture, and the stage first converts it into its own memory, like the block
-`prepare`. An input with `sync = "latest"` is zeros while it has no frame, or only one older than `max_age_ms`. The
-runtime writes outputs to the memory of their slots.
+Rule: if an input has the number type and the number of elements that the network reads, the runtime reads it in its
+slot. Otherwise the input is a picture, and the stage first converts it into its own memory, like the block `prepare`.
+An input with `sync = "latest"` is zeros while it has no frame, or only one older than `max_age_ms`. The runtime writes
+outputs to the memory of their slots.
 
 The module runs networks of any number types, inputs and outputs, in each of the runtimes:
 
@@ -12,14 +12,14 @@ The module runs networks of any number types, inputs and outputs, in each of the
     call()
 
 Rule: the runtime `cuda` copies inputs to the GPU and outputs back. The other runtimes read and write the arrays
-themselves. A runtime runs the whole network or refuses it; no runtime falls back to another. The number types are those
-of the file: a float network is computed in floats, unlike an avatar's network.
+themselves. A runtime runs the whole network or refuses it; no runtime falls back to another. The file decides the
+number types: a float network is computed in floats, unlike an avatar's network.
 
 `calls_of` measures isolated calls of a network on this machine, on distinct inputs, in a process like a unit of a run.
 A measurement is cached under everything that it depends on, so that a changed machine, package or network is measured
 again. An integer network runs like an avatar's network if it is no stage of a pipeline file (`as_stage`) and no shapes
-are given. All other networks run with their own number types. A stage of a pipeline file runs in the runtime of the
-stage, any other network in ONNX Runtime.
+are given. All other networks run with their own number types. Networks of avatars and of stages run in the runtime that
+the caller gives, all others in ONNX Runtime.
 """
 
 from __future__ import annotations
@@ -278,8 +278,8 @@ def calls_of(
 
     `shapes`: shapes of inputs by name, in place of the file's shapes.
     `runtime`: runtime of an avatar's integer network if `shapes` is empty; other networks run in ONNX Runtime.
-    `counts`: each count of threads to measure.
-    `cores`: ids of the cores to use; a call with n threads runs on the last n of them.
+    `counts`: numbers of threads to measure.
+    `cores`: numbers of the cores to use; a call with n threads runs on the last n of them.
     `say`: function that is called before a measurement, which takes seconds.
     `as_stage`: whether the network is a stage of a pipeline file, which always runs in `runtime`.
 
@@ -360,9 +360,9 @@ def build_calls(settings: Mapping[str, Any], unit: UnitContext) -> CallStage:
 
 
 def _calls(path: Path, shapes: Shapes, runtime: str, options: RuntimeOptions) -> list[Callable[[], object]]:
-    """Return functions that call any network on random inputs and throw its outputs away.
+    """Return functions that each call the network in `path` on random inputs, and throw its outputs away.
 
-    Raises BadInputError for a graph that the runtime cannot load, or whose inputs are no numbers.
+    Raises BadInputError for a graph that the runtime cannot load, or with an input that has no numbers or fixed shape.
     """
     graph = parse_network(path).graph
     held = {each.name for each in graph.initializer}

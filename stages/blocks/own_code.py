@@ -3,8 +3,8 @@
 `factory(settings)` is called once in the unit's process and returns a callable. The callable is called for each frame
 with an array for each input: a named port as a keyword argument, a single input without a name as the only argument.
 The argument of an input with `sync = "latest"` is None while it has no frame, or only one older than `max_age_ms`. The
-callable returns a dict of arrays by port, or the array of the only port. A callable with a parameter `out` gets there
-the arrays to fill, by port, and may return None.
+callable returns a dict of arrays by port, or the array of the only port. If the callable has a parameter `out`, this
+parameter gets the arrays to fill, by port, and the callable may return None.
 
 If a bypass begins at the stage, the callable may have an attribute `skips`, which is read after each frame: true sends
 the frame to the bypass. If the callable has a method `forget`, the method is called when the next frame must not rely
@@ -39,7 +39,10 @@ OUT, SKIPS, FORGET = "out", "skips", "forget"
 
 
 class OwnCode(PortedStage):
-    """A stage that calls the user's own code. Raises BadInputError for a module or factory that does not exist."""
+    """A stage that calls the user's own code.
+
+    Raises BadInputError for a module or factory that does not exist, or for a factory that returns no callable.
+    """
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         super().__init__(settings)
@@ -102,7 +105,10 @@ class OwnCode(PortedStage):
         return found
 
     def _guarded(self, call: Callable[..., Any], *args: Any, **named: Any) -> Any:
-        """Return the result of `call`. An error in the user's code becomes a TrilaneError with stage, file and line."""
+        """Return the result of `call`, the user's code.
+
+        An error becomes a TrilaneError with stage, file and line. A ModuleNotFoundError stays as it is.
+        """
         try:
             return call(*args, **named)
         except (TrilaneError, ModuleNotFoundError):

@@ -11,8 +11,8 @@ The block `overlay` draws these outputs on a picture:
 of several channels is the class, and channel 0 is the background. A pixel of a single float channel belongs to the mask
 if it is above 0.5. A single integer channel contains classes.
 - `depth`: one channel, drawn from its least number (blue) to its largest (red).
-- `boxes`: rows of x0, y0, x1, y1 and maybe a score, in pixels of the picture, or from 0 to 1. A box with score 0 is not
-drawn.
+- `boxes`: rows of x0, y0, x1, y1 and maybe a score. Places are in pixels of the picture; if none is above 1, they are
+shares of its sides. A box whose score is not above 0 is not drawn.
 
 Mask and depth are stretched over the picture.
 """
@@ -124,7 +124,7 @@ _DEFAULTS: Final = {"mean": 0.0, "sd": 1.0}
 
 
 def _each(values: Sequence[float] | None, channels: int, other: float, where: str) -> NDArray[np.float64]:
-    """Return a value for each channel (channels,)."""
+    """Return a value for each channel (channels,). `other`: value of all channels if `values` is None."""
     given = [other] if values is None else list(values)
     if len(given) not in (1, channels):
         expected = f"1 or {channels}, one for each channel"

@@ -1,5 +1,5 @@
 """The CPU unit: the pose stage, with the crop and the tensor's layout, and the present stage.
 
-It may use the modules that all stages share and the layers below `stages/`, but neither `stages/gpu/` nor
+This folder may use the modules that all stages share and the layers below `stages/`, but neither `stages/gpu/` nor
 `stages/dsp/`.
 """

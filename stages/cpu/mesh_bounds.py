@@ -19,7 +19,7 @@ it. Joint b turns about its centre c_b by its own angle t_b, so |G_b c - G_paren
 error of the outermost one are projected again in float64, which finds the truly outermost vertex.
 
 The rounding error follows from u = 2**-24. A clip coordinate c = r . v + d is a sum of three products of rounded
-factors and d, so its error is at most 6 u (sum |r_k| |v_k| + |d|). The bound e_c is 8 u times this sum plus the
+factors and d. Its error is at most 6 u (sum |r_k| |v_k| + |d|). The bound e_c is 8 u times this sum plus the
 sphere's reach; the larger factor covers the rounding of the reach. A quotient q = c / w, with w >= w_least, has an
 error of at most (e_c + |q| e_w) / w_least + 4 u |q|, where |q| is at most 1 on the screen.
 """
@@ -91,7 +91,7 @@ class Outermost:
     def _side(self, row: F32, reach: float, sign: int, slack: float) -> I64 | None:
         """Return the indices of the vertices that may be outermost on one side; None if one may be off the screen.
 
-        `sign`: 1 for the lowest coordinates, -1 for the highest. `slack`: largest error of a quotient, twice.
+        `sign`: 1 for the lowest coordinates, -1 for the highest. `slack`: twice the largest error of a quotient.
         """
         scratch, least, most = self._scratch
         place = np.subtract(row, np.float32(reach), out=scratch) if sign > 0 else np.negative(row, out=scratch)
@@ -117,8 +117,8 @@ class Level:
     """The P patches of one level of patches, the coarse or the fine one.
 
     `centres`: index of each patch's centre, a vertex (P,).
-    `size`, `give`: (P,) and (P,54), metres. The sphere about a patch's posed centre has the radius size + sum_b give_b
-    2 sin(t_b / 2), where t_b is the angle of joint b = 1..54.
+    `size`, `give`: (P,) and (P,54), metres. They give the radius of the sphere about a patch's posed centre: size +
+    sum_b give_b 2 sin(t_b / 2), where t_b is the angle of joint b = 1..54.
     `blend`: largest distance by which the pose blend shapes of each joint move a vertex (P,54), metres per unit of
     |R - I|.
     `parts`: for each patch, the indices of its patches in the next level; in the last level, of its vertices.
@@ -240,7 +240,7 @@ class _Extent:
             np.maximum(self.high, high.max(axis=0), out=self.high)
 
     def widened_by(self, low: F64, high: F64) -> Mask:
-        """Return a mask (N,) of the boxes from `low` to `high` (N,2), NDC, that would move a side inside the screen."""
+        """Return a mask (N,) of the boxes from `low` to `high` (N,2), NDC, that move a side which is on the screen."""
         return np.asarray(
             (((low < self.low) & (self.low > -1.0)) | ((high > self.high) & (self.high < 1.0))).any(axis=1)
         )

@@ -1,9 +1,9 @@
-"""The pose stage: it computes from a frame's number all data that the other stages need about the frame.
+"""The pose stage: from a frame's number, it computes all data that the other stages need about the frame.
 
-Motion and camera are sampled at the frame's media time, frame / fps; all numbers that leave this stage are finite. If a
-frame shows nobody, or the same as an earlier frame, nothing is skinned, and the frame skips the stages that draw. Each
-body gets a level of its mesh, then the cheapest level of detail for which the sum of both errors is within the budget
-of pixels.
+Motion and camera are sampled at the frame's media time, frame / fps; all numbers that leave this stage are finite. With
+the plan `planned`, a frame that shows nobody, or the same as an earlier frame, skips the stages that draw. A repeated
+frame is not skinned. Each body gets a level of its mesh, and the cheapest level of detail that keeps the sum of both
+errors within the pixel budget.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class SeenAvatar:
     `error_px`: bound on the error of the level of detail and of the level of the mesh together, pixels of the picture.
     `mesh`: level of the mesh, 0 for the whole mesh.
     `triangles`: number of triangles of this level of the mesh.
-    `share`: number of vertices of this level over that of the whole mesh.
+    `share`: number of vertices of this level, divided by the whole mesh's number.
     """
 
     rect: Rect
@@ -138,7 +138,6 @@ class ModelledBody:
         """Return the levels of mesh and detail for a frame, with the bound on their error.
 
         `posed`: pose of the frame.
-
         `clip`: projection @ view (4,4).
         `output`: (height, width) of the picture.
         `before`: level of the mesh in the previous frame; None if there was none.
@@ -199,7 +198,7 @@ class _Actor:
     body: ModelledBody
 
     def pivot(self, translation: F64) -> F64:
-        """Return the place of the body's root joint in the scene (3,). `translation`: place before `mover.world`."""
+        """Return the place (3,) of the root joint in the world, metres. `translation`: from `Mover.sample`, (3,)."""
         return np.asarray(
             self.mover.world[:3, :3] @ (self.body.shaped.joints[0] + translation) + self.mover.world[:3, 3]
         )
@@ -209,7 +208,7 @@ class _Actor:
 class FramePlan:
     """The decisions for a frame.
 
-    `work`: the frame's work.
+    `work`: kind of work that the frame needs.
     `shape`: shape of the tensor; None with nobody in view.
     `density`: density of a planned tensor, else None.
     `seen`: visible avatars by their numbers.
@@ -245,7 +244,7 @@ OF_THE_FRAME = {*(name for name, _ in FRAME_FIELDS), "media_time_s", "work"}
 
 
 class PoseStage:
-    """Stage `pose` of the CPU unit: no input edge, an output edge of headers.
+    """Stage `pose` of the CPU unit. It has no input edge; its output edge carries headers and skinned vertices.
 
     `plan`: plan of the last frame.
     """
@@ -424,8 +423,8 @@ class PoseStage:
     ) -> SeenAvatar | None:
         """Fill one avatar's part of the header, and return its place on the screen; None if it is not visible.
 
-        An avatar that is far off the screen is not posed. An avatar that the last computed frame did not show is first
-        searched by its patches, before it is skinned.
+        An avatar that is far off the screen is not posed. If the last computed frame did not show the avatar, it is
+        skinned only if its coarse patches may be on the screen.
         """
         pose, translation = moved[actor.index]
         avatar["avatar"], avatar["visible"] = actor.index, False

@@ -81,9 +81,9 @@ class Segment:
     def digest(self, frame: int, pixels: NDArray[np.uint8], repeats: bool = False) -> None:
         """Write the digest of `pixels`, (height, width, 3) and C-contiguous.
 
-        `repeats`: whether the pixels equal those of the last call.
+        `repeats`: whether the pixels equal the last call's pixels, whose digest is then used.
 
-        Raises UnwrittenError, also if the file was removed.
+        Raises UnwrittenError if the disk is full or fails, or if the video file was removed.
         """
         if not repeats:
             self._digest = hashlib.sha256(pixels.data).hexdigest()
@@ -93,10 +93,10 @@ class Segment:
         require_name(self._path, self._digests.fileno())
 
     def add(self, frame: int, pixels: NDArray[np.uint8], repeats: bool = False) -> None:
-        """Add frame number `frame` to the video. Raises UnwrittenError.
+        """Add frame number `frame` to the video. Raises UnwrittenError if the disk is full or fails.
 
         `pixels`: (height, width, 3) RGB.
-        `repeats`: whether the pixels equal those of the last call, which are already converted for the encoder.
+        `repeats`: whether the pixels equal the last call's pixels, which are already converted for the encoder.
         """
         if not repeats:
             rgb = av.VideoFrame.from_numpy_buffer(pixels, format="rgb24")
@@ -144,7 +144,10 @@ class PresentStage:
         self._kept = KeptFrames(config.out_dir, config.kept)
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
-        """Make the views of the slots, and the encoder. Raises ValueError for outputs, or UnwrittenError."""
+        """Make the views of the slots, and the encoder.
+
+        Raises ValueError if there are outputs, UnwrittenError if somebody removed the folder of segments.
+        """
         if outputs:
             raise ValueError("the present stage has no output edge")
         size = self._height * self._width * 3
@@ -159,7 +162,10 @@ class PresentStage:
                 raise UnwrittenError(path, FileNotFoundError(errno.ENOENT, REMOVED)) from error
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
-        """Present `inputs[slot_in]` as frame `frame`, and return metrics. Raises ValueError if `slot_in` is None."""
+        """Present `inputs[slot_in]` as frame `frame`, and return metrics.
+
+        Raises ValueError if `slot_in` is None, UnwrittenError as `Segment.digest` does.
+        """
         if slot_in is None:
             raise ValueError("the present stage needs an input slot")
         if self._window is not None and self._window.is_looked_at:
@@ -196,14 +202,17 @@ KEPT_FOLDER = "kept"
 
 
 class KeptFrames:
-    """Keeps the frames `numbers`, ascending, as arrays in `folder`/`KEPT_FOLDER`."""
+    """Keeps the frames `numbers`, ascending, as arrays in `folder`/`KEPT_FOLDER`.
+
+    If a frame is not presented, the next presented frame is kept in its place.
+    """
 
     def __init__(self, folder: Path, numbers: Sequence[int]) -> None:
         self._folder, self._numbers = folder / KEPT_FOLDER, list(numbers)
         self._next = self._numbers.pop(0) if self._numbers else None
 
     def see(self, frame: int, pixels: U8) -> None:
-        """Keep `pixels` (h,w,3) of frame `frame` if it is the next of the numbers."""
+        """Keep `pixels` (h,w,3) of frame `frame` if the frame is the next of the numbers or follows it."""
         if self._next is None or frame < self._next:
             return
         self._folder.mkdir(exist_ok=True)

@@ -57,7 +57,7 @@ def gpu_session(where: str, model: str | bytes, device: Mapping[str, str]) -> on
 
 @cache
 def _check_gpu() -> None:
-    """Raise MissingPartError if the CUDA provider cannot be loaded, because ONNX Runtime reports no error then."""
+    """Raise MissingPartError if the CUDA provider cannot be loaded. ONNX Runtime itself raises no error for this."""
     values = [helper.make_tensor_value_info(name, TensorProto.UINT8, [1]) for name in ("x", "y")]
     graph = helper.make_graph([helper.make_node("Identity", ["x"], ["y"])], "probe", values[:1], values[1:])
     probe = helper.make_model(graph, opset_imports=[helper.make_opsetid("", PROBE_OPSET)], ir_version=PROBE_IR)

@@ -71,7 +71,7 @@ def _from_arrays(arrays: Arrays, where: str) -> list[NetworkPart]:
 
 
 def crossing_bytes(config: RunConfig, network: NetworkFile) -> list[int]:
-    """Return the bytes that cross each cut of `network`, for the tensor shape with the most. Raises BadInputError."""
+    """Return the most bytes that cross each cut of `network`, over all tensor shapes. Raises BadInputError."""
     if not config.cuts:
         return []
     shapes = [[part.crossing_out for part in parts_for(config, network, shape)[:-1]] for shape in config.buckets]
@@ -136,14 +136,11 @@ class BoundPart:
 class InferStage:
     """A `trilane.pipeline.stage.Stage` that runs whole networks, or a part of a single network.
 
-    A network turns H·W·C bytes into H·W·4.
-
-    A frame has one inference for each network that paints somebody in view. Avatars with the same network share its
-    tensor, each in its `tensor_rect`.
+    A network turns H·W·C bytes into H·W·4. A frame has one inference for each network that paints somebody in view.
+    Avatars with the same network share its tensor, each in its `tensor_rect`.
 
     `networks`: networks of the avatars, by number.
     `part`: index of the part to run, if the configuration cuts the only network.
-
     Its constructor and `bind` raise BadInputError and MissingPartError.
     """
 
@@ -244,7 +241,6 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> InferStage:
 
 
 def _bound(session: Session, part: NetworkPart, source: U8, target: U8, weights: int) -> BoundPart:
-    """Return `part`, bound to the slots `source` and `target`."""
     given, handed_on = views(source, part.crossing_in), views(target, part.crossing_out)
     inputs, outputs = [given[name] for name in part.inputs], [handed_on[name] for name in part.outputs]
     passed = [(given[name], handed_on[name]) for name in handed_on if name not in part.outputs]

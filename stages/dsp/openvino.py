@@ -56,8 +56,8 @@ class OpenvinoSession:
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OpenvinoSession:
     """Return `network` compiled for the threads of `options`, from the cache if it was compiled before.
 
-    Raises BadInputError if OpenVINO cannot load it. Raises it also if OpenVINO would run a layer in float that is not
-    in `float_layers` of the network.
+    Raises BadInputError if OpenVINO cannot load the network, or would run further layers in float than the network's
+    `float_layers`.
     """
     settings = {
         "PERFORMANCE_HINT": "LATENCY",

@@ -75,8 +75,8 @@ class OrtSession:
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
     """Return `network` compiled for the threads of `options`.
 
-    Raises BadInputError if ONNX Runtime cannot load it. Raises it also if ONNX Runtime would run a layer in float that
-    is not in `float_layers` of the network.
+    Raises BadInputError if ONNX Runtime cannot load the network, or would run further layers in float than the
+    network's `float_layers`.
     """
     with tempfile.TemporaryDirectory(prefix="trilane-ort-") as folder:
         optimised = Path(folder) / "optimised.onnx"
@@ -95,7 +95,7 @@ def version() -> str:
 
 
 def check_integer(optimised: onnx.ModelProto, network: IntegerNetwork) -> None:
-    """Raise BadInputError if layers of `optimised` compute in float that are not in `float_layers` of `network`.
+    """Raise BadInputError if `optimised` has further float layers than `float_layers` of `network`.
 
     The error names these layers. `optimised`: optimised graph of `network`.
     """

@@ -144,7 +144,7 @@ def load_runtime(name: str) -> Runtime:
 def quiet_openvino() -> Any:
     """Return the module `openvino`, imported without its telemetry; all code imports OpenVINO by this function.
 
-    A direct import reports to its maker's server, and stores an id in the home folder. Without the package
+    With telemetry, an import reports to the maker's server, and stores an id in the home folder. Without the package
     `openvino_telemetry`, OpenVINO uses its own stand-in, which does neither.
     """
     cast(dict[str, Any], sys.modules).setdefault("openvino_telemetry", None)

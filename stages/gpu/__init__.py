@@ -1,4 +1,4 @@
 """The GPU unit: the raster stage, which fills the network's input, and the composite stage, which draws the frame.
 
-It may use `scene/crop.py`, the modules that all stages share, and the layers below `stages/`.
+This folder may use `scene/crop.py`, the modules that all stages share, and the layers below `stages/`.
 """

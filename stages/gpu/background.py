@@ -324,7 +324,7 @@ def _video(path: Path) -> Footage:
 
 
 def _times(container: Any, path: Path) -> list[float]:
-    """Return the times of the frames in seconds, ascending. Nothing is decoded. Raises BadInputError for a cut file."""
+    """Return the times of the frames in seconds, ascending, not decoded. Raises BadInputError for a cut-off file."""
     stream = video_stream(container, path)
     times, count = set(), 0
     for packet in container.demux(stream):

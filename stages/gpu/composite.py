@@ -69,7 +69,7 @@ class DrawnFrames:
         self._slots: dict[int, tuple[Drawing | None, int]] = {}
 
     def slot_of(self, drawing: Drawing | None, preferred: int) -> int | None:
-        """Return a slot that has `drawing`, preferably the slot `preferred`; None without such a slot or drawing."""
+        """Return a slot that has `drawing`, if possible `preferred`; None if no slot has it or `drawing` is None."""
         if drawing is None:
             return None
         held = [slot for slot, (there, _) in self._slots.items() if there == drawing]
@@ -241,12 +241,12 @@ class CompositeStage:
 
         The metrics are the bytes moved, and four numbers that are 1 or 0:
         - `nobody`: nobody is on the screen;
-        - `reused`: the picture of an earlier frame is shown, and is the right one;
+        - `reused`: the avatars' picture of the right earlier frame is shown again;
         - `stale`: the right picture never came, so an older one is shown;
-        - `copied`: the frame was copied from an earlier frame, not drawn.
+        - `copied`: the frame was copied from an equal frame in a slot, not drawn.
 
-        The least bytes are the new parts of the background, of the network's picture in the `tensor_rect`s of visible
-        avatars, and the frame if no slot had it.
+        The least bytes are new pictures, and the frame if no slot had it. New pictures are the background's, and the
+        networks' in the `tensor_rect`s of visible avatars. Raises UnitLostError if the context was lost.
         """
         if slot_in is None or slot_out is None:
             raise ValueError("composite needs an input and an output slot")

@@ -3,14 +3,14 @@
 The room is the built-in background: a wooden floor at y = 0 and walls, as a mesh and three textures. Rule: mesh and
 textures are computed from constants and a fixed seed, and the room always contains the camera.
 
-Background bytes are copied unchanged, as sRGB; all other layers are blended over them in linear light. A shadow only
-multiplies light, which a sum on sRGB numbers does too, so its bytes are not converted. The planes come from the scene
-file; nothing is detected here. A contact shadow is a disc under a joint, which grows and fades with the joint's height
-above the floor.
+Background bytes are copied unchanged, as sRGB; all other layers are blended over them in linear light. Only shadows are
+blended on sRGB numbers, by a formula with the same result (`shadow.frag`). The planes come from the scene file; nothing
+is detected here. A contact shadow is a disc under a joint, which grows and fades with the joint's height above the
+floor.
 
 A body fills about half of its rectangle, and a software driver takes as long for a transparent pixel as for any other.
-Therefore the network's picture is drawn in bands of rows. Each band has only the columns between its first and its last
-texel that is not transparent, and a margin of the texels that a screen pixel also reads.
+Therefore the network's picture is drawn in bands of rows. Each band has only the columns from its first to its last
+texel that is not transparent. A margin is added, because a screen pixel reads several texels.
 """
 
 from __future__ import annotations
@@ -49,10 +49,7 @@ VERSION = "room textures 2"  # raise it when the textures change
 
 @dataclass(frozen=True)
 class Extent:
-    """The inside of the room.
-
-    `low`, `high`: opposite corners (x, y, z), metres; the floor is y = 0.
-    """
+    """The inside of the room. `low`, `high`: opposite corners (x, y, z), metres; the floor is y = 0."""
 
     low: tuple[float, float, float] = (-4.0, 0.0, -4.0)
     high: tuple[float, float, float] = (4.0, 3.0, 4.0)
@@ -60,9 +57,7 @@ class Extent:
     def holding(self, eye: F64) -> Extent:
         """Return this room if it contains a camera; otherwise a larger room that does.
 
-        Walls and ceiling have at least a distance of MARGIN_M from the camera.
-
-        `eye`: position of the camera (3,), metres.
+        Walls and ceiling are at least MARGIN_M from the camera. `eye`: position of the camera (3,), metres.
         """
         low = (min(self.low[0], eye[0] - MARGIN_M), self.low[1], min(self.low[2], eye[2] - MARGIN_M))
         high = tuple(max(side, float(at) + MARGIN_M) for side, at in zip(self.high, eye, strict=True))
@@ -75,7 +70,6 @@ class RoomMesh:
     """The mesh of the room.
 
     All triangles face inwards; they are indices of vertices (M,3) uint32.
-
     `vertices`: position (3), uv (2), light (3) of each vertex (N,8) float32.
     `floor`: triangles of the floor.
     `boards`: triangles of the walls with the skirting board and its shade.
@@ -100,10 +94,7 @@ def room_mesh(extent: Extent) -> RoomMesh:
 
 
 def room_textures() -> tuple[U8, U8, U8]:
-    """Return the textures of (floor, boards, paint).
-
-    They are cached, because computing their noise takes a good part of a second.
-    """
+    """Return the textures of (floor, boards, paint), from the cache, because their noise takes long to compute."""
     made = {"floor": floor_texture, "boards": wall_texture, "paint": paint_texture}
     stored = cached_arrays(VERSION, (), lambda: {name: make() for name, make in made.items()})
     return stored["floor"], stored["boards"], stored["paint"]
@@ -280,10 +271,7 @@ class RoomPainter:
     """Draws the built-in room. If a camera leaves the room, the room is made larger."""
 
     def __init__(self, ctx: Any, eyes: Sequence[Floats] = ()) -> None:
-        """Make the room.
-
-        `eyes`: camera positions (3,), metres, that the room contains from the beginning.
-        """
+        """Make the room. `eyes`: camera positions (3,), metres, that the room contains from the beginning."""
         self._ctx = ctx
         self._program = build_program(ctx, "room.vert", "room.frag")
         floor, boards, paint = room_textures()
@@ -354,7 +342,7 @@ class ShadowPainter:
         self._discs = ctx.vertex_array(self._program, [])
 
     def draw(self, view: Floats, projection: Floats, blobs: F32) -> None:
-        """Darken the current target with discs.
+        """Darken the current target with discs, which a camera below the floor does not see.
 
         `view`, `projection`: OpenGL matrices (4,4).
         `blobs`: x, z, radius in metres, and strength 0 to 0.72 of each disc (N,4) float32.
@@ -373,7 +361,7 @@ class ShadowPainter:
 
 
 class AvatarPainter:
-    """Draws the network's picture, which is uploaded once a frame, avatar by avatar into their crop rectangles.
+    """Draws the parts of a network's picture into the avatars' crop rectangles. The picture is uploaded once a frame.
 
     `shapes`: shapes (height, width) of the pictures that may come.
     """
@@ -444,7 +432,7 @@ class AvatarPainter:
 
 
 def taps_of(cell: tuple[int, int], pixels: tuple[float, float]) -> int:
-    """Return the number of texels along a side that are averaged for a screen pixel.
+    """Return the number of reads along a side that are averaged for a screen pixel, 1 to MAX_TAPS.
 
     `cell`: (height, width) of the part of the picture that is drawn.
     `pixels`: (height, width) on the screen.

@@ -8,8 +8,8 @@ Functions of this file make all copies of a frame's data between the CPU's memor
 A context has one counter, because the stages that draw with it do one job at a time. A software driver copies within
 the same memory, and such copies count too.
 
-A target's first row in memory is the top row of the image. Therefore `target_clip` flips y in the projection; no other
-code flips it.
+A target's first row in memory is the top row of the image. Therefore `target_clip` flips y in the projection, and
+`avatar.vert` flips y of crop rectangles.
 """
 
 from __future__ import annotations
@@ -213,8 +213,7 @@ def build_program(ctx: Any, vertex: str | Path, fragment: str | Path, **defines:
     `ctx`: OpenGL context.
     `vertex`, `fragment`: files of `trilane.shaders`, or paths.
     `defines`: preprocessor definitions of both shaders.
-
-    Raises TrilaneError with the compiler's log.
+    Raises TrilaneError with the compiler's log if a shader does not compile.
     """
     try:
         return ctx.program(shader_source(vertex, **defines), shader_source(fragment, **defines))
@@ -269,9 +268,7 @@ FLIP_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 def target_clip(view: Floats, projection: Floats) -> bytes:
     """Return the matrix `clip_from_world` of a target whose first row is the top row, as bytes of a GLSL `mat4`.
 
-    The bytes are column-major float32.
-
-    `view`, `projection`: OpenGL matrices (4,4).
+    The bytes are column-major float32. `view`, `projection`: OpenGL matrices (4,4).
     """
     clip = FLIP_Y @ np.asarray(projection, np.float64) @ np.asarray(view, np.float64)
     return clip.T.astype(np.float32).tobytes()

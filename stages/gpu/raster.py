@@ -56,7 +56,7 @@ HALF_BIAS, FLOAT_BIAS = 15, 127  # biases of the exponents of FP16 and FP32
 
 
 def texture_array(ctx: Any, texture: Floats, filtering: str = "linear", levels: Sequence[Floats] = ()) -> Any:
-    """Return an FP16 array texture of C/4 RGBA layers from `texture` (H,W,C), clamped at its edge.
+    """Return an FP16 array texture of C/4 RGBA layers from `texture` (H,W,C). Reads beyond its edge repeat the edge.
 
     `filtering`: one of FILTERS.
     `levels`: learnt smaller levels, each (h,w,C), the largest first; they replace the levels that the driver computes.
@@ -171,7 +171,7 @@ class PackedPass:
         triangle.
         `filtering`: one of FILTERS. A deferred pass has no derivatives of u and v, so it takes only `linear`.
 
-        Raises BadInputError.
+        Raises BadInputError for another filter or number of channels.
         """
         if filtering not in FILTERS:
             raise BadInputError("texture filter", repr(filtering), f"one of {', '.join(FILTERS)}")
@@ -249,9 +249,8 @@ class PackedAvatar:
 
         `mesh`: whole mesh, number 0.
         `texture`: neural texture (H,W,C).
-        `levels`: smaller levels of the texture, packed, which a deferred pass cannot read; None without any.
+        `levels`: smaller levels of the texture, packed by `pack_levels`; None without any, as in every deferred pass.
         `coarser`: levels of the mesh, numbers 1, 2, ...
-
         Raises BadInputError if a texture has a number beyond FP16, or C is not the pass's number of channels.
         """
         check_texture(texture, packed.channels)
@@ -339,9 +338,7 @@ class RasterStage:
         """Write the tensor (h,w,C) uint8 of each network, empty if the network paints nobody in view. Return metrics.
 
         The metrics are the bytes moved. The least bytes are the pose of the drawn mesh of each visible avatar, and the
-        drawn tensors.
-
-        Raises TrilaneError if a joint is not a finite number, UnitLostError if the context was lost.
+        drawn tensors. Raises TrilaneError if a joint is not a finite number, UnitLostError if the context was lost.
         """
         if slot_in is None or slot_out is None:
             raise ValueError("raster needs an input and an output slot")
@@ -393,7 +390,7 @@ def _placement(pose: NDArray[np.void], avatar: Any, vertices: NDArray[np.float32
 def build(settings: Mapping[str, Any], unit: UnitContext) -> RasterStage:
     """Build the raster stage of the configuration in `settings`. Raises BadInputError, MissingPartError.
 
-    The kind of the driver, hardware or software, decides only whether the pass is deferred.
+    On a software driver, the pass is deferred if the filter is `linear` and no texture has learnt levels.
     """
     config = RunConfig.model_validate(settings["config"])
     ctx = unit.shared(CONTEXT, lambda: open_context(unit.settings.threads))

@@ -204,7 +204,7 @@ def _arrays(shaped: ShapedBody) -> Arrays:
 
 
 def enough_weights(body: Body) -> int:
-    """Return the smallest of 4, 8 and 12 weights that loses at most LARGEST_LOSS of each vertex; 12 if none does."""
+    """Return the least number of weights, 4, 8 or 12, with which no vertex loses more than LARGEST_LOSS; else 12."""
     left = -np.sort(-body.weights, axis=1)
     lost = {k: float(left[:, k:].sum(axis=1).max(initial=0.0)) for k in WEIGHT_COUNTS}
     return next((k for k in WEIGHT_COUNTS if lost[k] <= LARGEST_LOSS), WEIGHT_COUNTS[-1])

@@ -50,7 +50,7 @@ def to_srgb(codes: NDArray[np.uint16], transfer: str, is_wide: bool) -> U8:
 
     `codes`: R'G'B' from 0 to 65535, (h,w,3).
     `transfer`: PQ or HLG.
-    `is_wide`: whether the primaries are those of BT.2020; else they are those of sRGB.
+    `is_wide`: whether the primaries are BT.2020's; otherwise they are sRGB's.
     """
     light = _eotf(transfer)[codes >> 4]
     if transfer == HLG:
@@ -118,10 +118,7 @@ def roll_off(light: F64) -> F64:
 
 @cache
 def _srgb() -> U8:
-    """Return the sRGB bytes of lights (STEPS,).
-
-    Entry i is for light (i / (STEPS - 1)) ** 2.
-    """
+    """Return sRGB bytes (STEPS,). Entry i is for the light (i / (STEPS - 1)) ** 2."""
     light = (np.arange(STEPS) / (STEPS - 1)) ** 2
     curve = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.power(light, 1 / 2.4) - 0.055)
     return (curve * 255 + 0.5).astype(np.uint8)
@@ -158,8 +155,8 @@ class VideoReader:
     def at(self, time_s: float) -> U8 | None:
         """Return the newest frame (h,w,3) that is not after `time_s`; None if an earlier call returned this frame.
 
-        If `time_s` lies before the time of the last frame, the video is opened again. This happens at the first frame
-        of a run that was rehearsed. Raises BadInputError if the file cannot be decoded.
+        If `time_s` lies before the time of the last returned frame, the video is opened again. This happens at the
+        first frame of a run that was rehearsed. Raises BadInputError if the file cannot be decoded.
         """
         if time_s + ROUNDING_S < self._shown_s:
             self.close()
@@ -298,7 +295,7 @@ class Pixels(NamedTuple):
 
     `aspect`: width of a pixel divided by its height.
     `transfer`: PQ or HLG; empty for a video of the usual range.
-    `is_wide`: whether the primaries are those of BT.2020.
+    `is_wide`: whether the primaries are BT.2020's.
     """
 
     aspect: float = 1.0
