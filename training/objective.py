@@ -1,4 +1,4 @@
-"""The objective that training minimises: the loss terms, including those that need networks (VGG-16, discriminators).
+"""The objective that training minimises: the loss terms, also terms that need networks (VGG-16, discriminators).
 
 Rule: a term that needs a network, or blurred pictures, is computed only if it has a weight. The same step on the same
 pictures gives the same numbers.
@@ -392,8 +392,8 @@ class Adversary:
     def terms(self, output: Tensor, target: Tensor, behind: Tensor) -> dict[str, Tensor]:
         """Return the loss terms `adversarial` and `features`, which the avatar minimises.
 
-        The more the discriminators take `output` for ground truth, the smaller is `adversarial`. `features` is the mean
-        difference between the features of `output` and of `target` (feature matching).
+        `adversarial` is small if the discriminators take `output` for ground truth. `features` is the mean absolute
+        difference between the discriminators' features of `output` and of `target` (feature matching).
 
         `output`, `target`: (N, 4, H, W) in 0..1, colour and mask, straight alpha.
         `behind`: background (N, 3, H, W) of both.
@@ -412,7 +412,7 @@ class Adversary:
     def learn(self, output: Tensor, target: Tensor, behind: Tensor) -> float:
         """Train the discriminators by one step, and return their mean error before the step, in bits.
 
-        A discriminator that guesses has an error of 1 bit. The parameters are those of `terms`.
+        A discriminator that guesses has an error of 1 bit. `terms` describes the parameters.
         """
         wrong = [
             (bits(mine.score, true=False) + bits(theirs.score, true=True)) / 2

@@ -172,7 +172,7 @@ class NoiseGraph:
         return value.astype(np.float32)
 
     def store(self, node: onnx.NodeProto) -> None:
-        """Add nodes that clip the tensor that `node` stores, and that round it if it has values between the steps."""
+        """Add nodes that clip the tensor that `node` stores, and that round its values if some lie between the steps."""
         x, y = node.input[0], node.output[0]
         lowest, highest, step = self.bytes_of(node)
         low, high = self._limit(f"{y}.low", lowest), self._limit(f"{y}.high", highest)
