@@ -407,7 +407,7 @@ def frame(first: F64, second: F64) -> F64:
 
 
 def align(a: F64, b: F64) -> F64:
-    """Return the smallest rotation (3, 3) that turns `a` (3,) to the direction of `b` (3,); not for opposite vectors."""
+    """Return the smallest rotation (3, 3) that gives `a` (3,) the direction of `b` (3,); not for opposite vectors."""
     axis = np.cross(a, b)
     return about(axis, float(np.arctan2(np.linalg.norm(axis), a @ b)))
 

@@ -320,7 +320,7 @@ def nearest(points: F64, vertices: F64, count: int = 8) -> NDArray[np.int64]:
 
 
 def _lights(sheets: list[_Sheet], normals: list[F64]) -> list[F64]:
-    """Return, for each sheet, the share (N,) of ambient light that `sheets` let through to its vertices."""
+    """Return, for each sheet, the share (N,) of ambient light that all `sheets` let through to its vertices."""
     vertices = np.vstack([sheet.vertices for sheet in sheets])
     areas = np.concatenate([vertex_areas(sheet.vertices, sheet.faces) for sheet in sheets])
     step = -(-len(vertices) // EMITTERS)

@@ -54,8 +54,8 @@ def first_texture(body: BodyArrays, groups: list[ShapeGroup], side: int, channel
 def mean_colours(groups: list[ShapeGroup], side: int, body: BodyArrays) -> NDArray[np.float64]:
     """Return the weighted mean colour (side, side, 3) in 0..1 of the pixels that show each texel.
 
-    A texel that no pixel shows takes the mean colour of its neighbours that are shown, because it may lie between the
-    pixels of every view. If none is shown, the texel is filled along the surface of `body`.
+    A texel that no pixel shows may lie between the pixels of every view. It takes the mean colour of its neighbours
+    that are shown. If none is shown, the texel is filled along the surface of `body`.
 
     Clothes stand off the body, so a texel shows a different point of the clothes in every view. The mean is still
     sharp, because close views and views along the surface's normal have the largest weights (`head_on`).

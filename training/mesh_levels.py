@@ -6,8 +6,8 @@ where it can be largest (`avatars/mesh_levels.py`): at vertices, and where an ed
 level in UV. If the distance is too large, a vertex beside the worst place of each triangle is locked, and the mesh is
 simplified again.
 
-At a seam, the level's edge is a chord of the whole mesh's outline in UV. A vertex that the level leaves out is paired
-with the nearest point of a chord if the vertex is on a seam or beyond a chord.
+At a seam, the level's edge is a chord of the whole mesh's outline in UV. A left-out vertex on a seam or beyond a chord
+is paired with the nearest point of a chord.
 """
 
 from __future__ import annotations
@@ -149,8 +149,8 @@ class Corners:
     def _in_triangles(self, corners: I64, level: I64) -> tuple[tuple[I64, F64], I64]:
         """Return (pairs, corners (K,) that are in a pair).
 
-        A pair consists of one of `corners` (M,), and a point with the same texel in a triangle of `level` (G,3) that
-        does not have this corner. Pairs are (`corners`, `shares`) as in `Pairs`.
+        A pair consists of one of `corners` (M,) and a point that shows the same texel. The point lies in a triangle of
+        `level` (G,3) that does not have this corner. Pairs are (`corners`, `shares`) as in `Pairs`.
         """
         point, (a, b, c) = self.uv[corners], (self.uv[level[:, k]] for k in range(3))
         box = np.stack([a, b, c])

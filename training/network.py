@@ -33,8 +33,8 @@ from trilane.unet_tables import (
     squeeze_channels,
 )
 
-# The encoders in PyTorch. An encoder turns a tensor (N, C, H, W), with H and W multiples of 32, into features at
-# strides 2, 4, 8, 16 and 32, finest first. Its attribute `channels` has the numbers of channels of these features.
+# The encoders in PyTorch. An encoder turns a tensor (N, C, H, W) into features at strides 2, 4, 8, 16 and 32, finest
+# first. H and W are multiples of 32. Its attribute `channels` has the numbers of channels of these features.
 #
 # Rule: channel counts, kernels and strides come from `trilane.unet_tables`; this file builds layers from the tables.
 

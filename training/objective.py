@@ -71,8 +71,8 @@ class Objective:
 
 # MS-SSIM of pictures in PyTorch, with gradients: similarity at five scales.
 #
-# Rule: windows lie wholly inside the picture. Scales at which the picture is smaller than a window are left out, and
-# the weights of the remaining scales are scaled to a sum of 1.
+# Rule: windows lie wholly inside the picture. Scales at which the picture is smaller than a window are left out. The
+# weights of the other scales are scaled to a sum of 1.
 
 #: Weights of the scales, finest first: Wang, Simoncelli, Bovik, Multiscale structural similarity, 2003, section 3.2.
 SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)

@@ -24,8 +24,8 @@ from trilane.training.clothing import Layer
 NEAR_M, FAR_M = 0.05, 100.0
 #: Least distance of a camera from the joint that it aims at.
 NEAREST_M = 0.45
-#: For each band, the joints that a camera may aim at, and the least and greatest height in metres, at the distance of
-#: the joint, that fills the screen.
+#: For each band: joints that a camera may aim at, and least and greatest height that fills the screen. Heights are in
+#: metres, at the distance of the joint.
 BANDS: dict[str, tuple[tuple[str, ...], float, float]] = {
     "far": (("pelvis", "spine1"), 4.5, 10.0),
     "full_body": (("pelvis", "spine1"), 1.9, 3.4),

@@ -259,7 +259,7 @@ class _Masked(torch.optim.Optimizer):
     def _kept(self, parameter: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
         """Return `parameter`, a mask of its elements without a gradient, and the values to restore at these elements.
 
-        There are values of the parameter and of its moments. Moments that do not exist yet begin at 0.
+        The list has the parameter's values first, and then its moments' values. Missing moments count as 0.
         """
         unseen = parameter.grad == 0
         if self.state[parameter]:

@@ -137,8 +137,8 @@ def framing_view(rng: np.random.Generator, yaw: float, points: F64, projection: 
     """Return the view matrix (4,4) of a camera whose picture is nearly filled by `points` (N,3).
 
     The camera aims at the middle of the points' bounding box. Let (x, y, z) be a point relative to this aim, in camera
-    axes, and t the tangent of half the field of view. The point is in the picture if the camera's distance from the aim
-    is at least |x| / t + z (and the same for y).
+    axes, and t the tangent of half the field of view. The point is in the picture if the camera is at least |x| / t + z
+    away from the aim (and the same for y).
 
     `yaw`: direction of the camera about the body, in radians. `projection`: matrix (4,4) of the camera.
     """

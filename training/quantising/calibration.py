@@ -124,8 +124,8 @@ def share_ranges(model: onnx.ModelProto, ranges: Any) -> None:
     """Give the inputs and the output of each Concat one range, in place, so that the Concat rounds nothing.
 
     With different ranges, runtimes that fuse a Concat into the layers before it would clamp at other values than
-    runtimes that do not fuse. The ranges of a Concat stay if one of its tensors is rectified and the common range would
-    include negative values, because the tensor would lose its clamp at 0.
+    runtimes that do not fuse. The ranges of a Concat stay if a rectified tensor would get a range with negative values,
+    because it would lose its clamp at 0.
 
     `ranges`: ONNX Runtime's TensorsData.
     """

@@ -239,8 +239,7 @@ def _pairs(
 ) -> Iterator[tuple[onnx.NodeProto, onnx.NodeProto]]:
     """Yield pairs (Conv, next Conv) with only a ReLU between them.
 
-    A pair is skipped if a second operator reads the output of the first Conv or of the ReLU. A pair is also skipped if
-    one of the Convs has groups, or has weights or a bias that are not constants or that another operator reads.
+    A pair is skipped if a second operator reads the output of the first Conv or of the ReLU. Both Convs are `_plain`.
     `weights`: constants of `graph`, by name.
     """
     users: dict[str, list[onnx.NodeProto]] = {}
