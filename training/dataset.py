@@ -55,8 +55,7 @@ def motion_poses(motions: Sequence[Motion]) -> PoseSource:
 class Planned(Protocol):
     """A planned sample of the synthetic person or of a capture.
 
-    `crop`: crop, whose shape is that of the tensor. `band`: index of the band. `picture`: number of the frame that the
-    sample shows.
+    `crop`: crop with the shape of the tensor. `band`: index of the band. `picture`: number of the shown frame.
     """
 
     @property
@@ -222,7 +221,10 @@ def create_group(folder: Path, shape: Shape, bands: NDArray[np.int8]) -> ShapeGr
 
 
 def open_groups(folder: Path, person: int = 0, writable: bool = False) -> list[ShapeGroup]:
-    """Return all groups of the data set in `folder`, which shows the person of number `person`, by tensor shape."""
+    """Return all groups of the data set in `folder`, sorted by tensor shape.
+
+    `person`: number of the person whom the samples show. `writable`: whether changes go to the files.
+    """
     mode: Any = "r+" if writable else "r"
     groups = []
     for place in sorted(folder.iterdir(), key=lambda path: parse_shape(path.name)):
@@ -283,10 +285,7 @@ Batch = tuple[ShapeGroup, NDArray[np.int64]]
 
 @dataclass(frozen=True)
 class Phase:
-    """The steps of a phase: from step `first`, up to but without step `end`.
-
-    `labels`: labels of the samples of all groups, as `batches` takes them.
-    """
+    """The steps of a phase, from `first` to `end` - 1. `labels`: labels of each group's samples, as in `batches`."""
 
     first: int
     end: int
@@ -309,6 +308,8 @@ def batch_stream(groups: list[ShapeGroup], settings: TrainingSettings, count: in
 
 def phases(groups: list[ShapeGroup], settings: TrainingSettings, count: int) -> list[Phase]:
     """Return the three phases of a training of `count` steps; a phase may have no steps.
+
+    If no sample is half-size, the first phase reads all samples.
 
     Raises BadInputError when a phase with steps has no sample.
     """
@@ -348,7 +349,7 @@ def zoom(group: ShapeGroup) -> NDArray[np.float64]:
 
 
 def _labels(groups: list[ShapeGroup], settings: TrainingSettings) -> list[NDArray[np.int64]]:
-    """Return the labels (N,) of the samples of each group, see `batches`, that implement the settings of batches."""
+    """Return the labels (N,) of each group's samples, as `batches` takes them, by the settings in `[batches]`."""
     options = settings.batches
     rng = np.random.default_rng((settings.seed, 3))
     found = []

@@ -54,8 +54,8 @@ def first_texture(body: BodyArrays, groups: list[ShapeGroup], side: int, channel
 def mean_colours(groups: list[ShapeGroup], side: int, body: BodyArrays) -> NDArray[np.float64]:
     """Return the weighted mean colour (side, side, 3) in 0..1 of the pixels that show each texel.
 
-    A texel that no pixel shows takes the mean colour of its neighbours that are shown, because it may lie between the
-    pixels of every view. If none is shown, the texel is filled along the surface of `body`.
+    A texel that no pixel shows may lie between the pixels of every view. It takes the mean colour of its neighbours
+    that are shown. If none is shown, the texel is filled along the surface of `body`.
 
     Clothes stand off the body, so a texel shows a different point of the clothes in every view. The mean is still
     sharp, because close views and views along the surface's normal have the largest weights (`head_on`).
@@ -106,7 +106,7 @@ def head_on(uv: NDArray[np.float64], covered: NDArray[np.bool_], side: int) -> N
 
 
 def used_texels(body: BodyArrays, side: int, margin: int) -> NDArray[np.bool_]:
-    """Return which texels (side, side) bilinear samples of the body's texture can use, grown by `margin` texels.
+    """Return which texels (side, side) a bilinear sample on the body can read, grown by `margin` texels.
 
     `side`: side of the texture in texels.
     """
@@ -204,7 +204,9 @@ def lay_out(values: F64, faces: Ints, uv: F64, uv_faces: Ints, side: int) -> tup
 
 
 def fill_gaps(image: NDArray[Any], known: NDArray[np.bool_]) -> NDArray[np.float64]:
-    """Return `image` (S,S,C) with unknown texels filled by push-pull: from the mean of ever larger blocks around them.
+    """Return `image` (S,S,C) with unknown texels filled (push-pull).
+
+    Such a texel gets the mean of the known texels in its smallest block (2x2, 4x4, ...) that has any.
 
     `known`: (S,S), whether a texel is known.
     """
@@ -213,9 +215,9 @@ def fill_gaps(image: NDArray[Any], known: NDArray[np.bool_]) -> NDArray[np.float
 
 
 def fill_beside(image: NDArray[Any], known: NDArray[np.bool_]) -> tuple[F64, NDArray[np.bool_]]:
-    """Return (`image` (S,S,C) with the neighbours of known texels filled, which texels (S,S) are known then).
+    """Return (`image` (S,S,C) with the neighbours of known texels filled, which texels (S,S) are known or filled).
 
-    A texel that is filled gets the mean of the known texels among its eight neighbours.
+    A filled texel gets the mean of the known texels among its eight neighbours.
 
     `known`: (S,S), whether a texel is known.
     """
@@ -250,9 +252,9 @@ def _pulled(total: F64, weight: F64) -> F64:
 
 
 def _barycentric(corners: F64, counts: Ints, x: Ints, y: Ints) -> tuple[F64, F64, F64]:
-    """Return the three barycentric weights, (N,) each, of points in their faces.
+    """Return the three barycentric weights, (N,) each, of the points `x`, `y` (N,) in their faces.
 
-    `counts` (F,): number of successive points of each face.
+    `corners` (F,3,2): corners of each face. `counts` (F,): number of successive points of each face.
     """
     (bx, by), (cx, cy) = (corners[:, 1] - corners[:, 0]).T, (corners[:, 2] - corners[:, 0]).T
     area = np.where(counts > 0, bx * cy - cx * by, 1.0)

@@ -4,8 +4,8 @@ Offsets move the skin's vertices. They cannot close the gap between two legs, no
 Therefore such a garment has vertices, faces and texture coordinates of its own. The body's arrays hold the skin first,
 then the garments. Everything that reads a body draws a garment as it draws the skin.
 
-Rule: a garment takes the largest rectangle of the texture that neither the body nor an earlier garment uses. The mesh
-encloses a volume, so that triangles that face away are not drawn: an open garment has a lining.
+Rule: a garment takes the largest rectangle of the texture that neither the body nor an earlier garment uses. Triangles
+that face away from the camera are not drawn, so the mesh must enclose a volume. Therefore an open garment has a lining.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from trilane.writing import write_atomically
 OPEN = frozenset({"skirt"})
 #: Distance of a lining from the outside, metres, and the share of the garment's texture that the lining has.
 LINING_M, LINING_SHARE = 0.004, 0.25
-#: Side of the grid of texels on which free rectangles are searched, and the free texels around each.
+#: Side of the grid of texels on which free rectangles are searched, and texels that stay free at a rectangle's edges.
 SIDE, MARGIN = 512, 4
 BODY = "body.npz"
 
@@ -39,9 +39,9 @@ BODY = "body.npz"
 class _Sheet:
     """A garment's mesh.
 
-    `vertices`: (N,3), metres at rest. `faces`: (F,3). `weights`: skin weights (N,55). `across`, `along`: texture
-    coordinates (T,) in 0..1, around a ring and from ring to ring. `uv_faces`: (F,3) indices of them. `size`: length
-    around a ring and length from the first to the last ring, metres.
+    `vertices`: (N,3), metres at rest. `faces`: (F,3). `weights`: skinning weights (N,55). `across`, `along`: texture
+    coordinates (T,) in 0..1, around a ring and from ring to ring. `uv_faces`: (F,3) indices of texture coordinates.
+    `size`: length around a ring, and length from the first to the last ring, metres.
     """
 
     vertices: F64
@@ -102,9 +102,10 @@ def _dressed(path: Path, look: Look, hanging: list[str]) -> dict[str, Any]:
 
 
 def _sheet(vertices: F64, weights: F64, lined: bool) -> _Sheet:
-    """Return the mesh of a garment that is stitched from rings of ANGLES vertices, from below to above.
+    """Return the mesh of a garment that is stitched from rings of ANGLES vertices, the lowest ring first.
 
-    `vertices`: (N,3), metres. `weights`: (N,55). `lined`: whether the mesh gets a lining, which joins both ends.
+    `vertices`: (N,3), metres. `weights`: (N,55). `lined`: whether the mesh gets a lining from the last ring back to the
+    first.
     """
     rings, own = vertices.reshape(-1, ANGLES, 3), weights.reshape(-1, ANGLES, weights.shape[1])
     outside = len(rings)
@@ -145,7 +146,7 @@ def _placed(sheet: _Sheet, free: Mask) -> tuple[F64, Mask]:
 
     The longer side of the sheet lies along the longer side of the rectangle. Raises BadInputError without enough room.
 
-    `free`: row 0 is at v = 0.
+    `free`: (S,S), whether a texel is free; row 0 is at v = 0.
     """
     left, bottom, right, top = largest_rectangle(free)
     if min(right - left, top - bottom) <= 2 * MARGIN:

@@ -224,10 +224,7 @@ SHADE, CHROMA = 0.12, 0.12
 
 
 def background(kind: str, shape: Shape, rng: np.random.Generator) -> F32:
-    """Return one background (h,w,3) in 0..1 of `shape` (height, width).
-
-    `kind`: a name of `KINDS`.
-    """
+    """Return a background (h,w,3) in 0..1 of `shape` (height, width). `kind`: a name of `KINDS`."""
     return KINDS[kind](shape, rng)
 
 

@@ -85,7 +85,7 @@ def byte_texture(
 
 
 def _without_holes(image: NDArray[Any], unseen: Mask, body: BodyArrays) -> F64:
-    """Return `image` (S,S,C) with `unseen` texels filled, and texels off the body's faces that lie next to these."""
+    """Return `image` (S,S,C) with `unseen` texels filled. Texels beside them that are on no face are filled too."""
     side = image.shape[0]
     nearest = np.arange(side) * len(unseen) // side
     hole = margin = unseen[np.ix_(nearest, nearest)]
@@ -119,8 +119,8 @@ def ranges_of(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> B
 def write_float_network(folder: Path, avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int) -> dict[str, str]:
     """Write the input of `trilane avatar quantise` to `folder`: the float network, and inputs to calibrate on.
 
-    Return the paths of both files under the keys `float_network` and `frames`. The inputs are the first of those that
-    `integer_network` uses with the same arguments.
+    Return the paths of both files under the keys `float_network` and `frames`. With the same arguments,
+    `integer_network` uses these inputs and further ones.
     """
     model, frames = _calibration(avatar, groups, seed, WRITTEN_FRAMES)
     files = {"float_network": folder / FLOAT_NETWORK, "frames": folder / FRAMES}
@@ -133,7 +133,7 @@ def write_float_network(folder: Path, avatar: TrainableAvatar, groups: list[Shap
 def _calibration(
     avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int, count: int
 ) -> tuple[onnx.ModelProto, list[NDArray[np.float32]]]:
-    """Return the float network of `avatar`, and at most `count` inputs (H, W, C) of its shape, of all persons."""
+    """Return the float network of `avatar`, and at most `count` random inputs (H, W, C) for it, of any person."""
     shape = max(groups, key=lambda group: (group.shape == CALIBRATION_SHAPE, len(group))).shape
     places = [(group, number) for group in groups if group.shape == shape for number in range(len(group))]
     chosen = np.sort(np.random.default_rng(seed).permutation(len(places))[:count])
@@ -230,13 +230,13 @@ SEED = 17
 def float_model(bundle: Bundle, weights: Path) -> onnx.ModelProto:
     """Return the float network of `bundle` for inputs of `CALIBRATION_SHAPE`. Raises BadInputError.
 
-    `weights`: file of `save_network`.
+    `weights`: file that `save_network` wrote.
     """
     return export_onnx(float_network_of(bundle, weights), *CALIBRATION_SHAPE)
 
 
 def training_views(renderer: SampleRenderer, bundle: Bundle, views: int) -> list[F32]:
-    """Return `views` inputs (H,W,C) of the network of `bundle`, in random poses, with bands as often as in training."""
+    """Return `views` inputs (H,W,C) of the network of `bundle`, in random poses and bands, drawn as for training."""
     rng = np.random.default_rng((SEED, 0))
 
     def sample(number: int) -> Sample:
@@ -257,7 +257,7 @@ def held_out_views(renderer: SampleRenderer, bundle: Bundle, views: int) -> list
 
 
 def _tensors(renderer: SampleRenderer, bundle: Bundle, sample: Callable[[int], Sample], wanted: int) -> Iterator[F32]:
-    """Yield `wanted` inputs (H,W,C) of the network of `bundle`, of samples with a tensor of `CALIBRATION_SHAPE`."""
+    """Yield `wanted` inputs (H,W,C) of the network of `bundle`. Samples of other shapes are passed over."""
     levels = levels_of(bundle)
     found = (one for one in map(sample, count()) if one.crop.shape == CALIBRATION_SHAPE)
     for _, one in zip(range(wanted), found, strict=False):

@@ -2,11 +2,12 @@
 
 meshoptimizer collapses edges onto existing vertices, keeps UV seams, and weighs UV as an attribute. Its error is a mean
 over quadrics, so single texels may move far. Therefore the distance between the whole mesh and the level is measured
-where it can be largest: wherever edges of the two cross in UV, and at vertices (`avatars/mesh_levels.py`). If the
-distance is too large, a vertex beside the worst place of each triangle is locked, and the mesh is simplified again.
+where it can be largest (`avatars/mesh_levels.py`): at vertices, and where an edge of the mesh crosses an edge of the
+level in UV. If the distance is too large, a vertex beside the worst place of each triangle is locked, and the mesh is
+simplified again.
 
-At a seam, the level's edge is a chord of the whole mesh's outline in UV. A vertex of the seam that is left out is
-paired with the nearest point of a chord; so is a left-out vertex that lies beyond the chord.
+At a seam, the level's edge is a chord of the whole mesh's outline in UV. A left-out vertex on a seam or beyond a chord
+is paired with the nearest point of a chord.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ from trilane.errors import MissingPartError
 from trilane.stages.gpu.skinned_mesh import split_corners
 from trilane.training.random_views import random_pose
 
-#: For each level, the most in metres that it may move a point of the surface, at rest and in `POSES` random poses.
+#: For each level, the largest distance in metres by which it may move a point, at rest and in `POSES` random poses.
 TOLERANCES_M = (0.002, 0.005, 0.015, 0.04)
 POSES = 6
 #: Weight of an error in UV, scaled to metres, relative to an error in position.
@@ -136,7 +137,7 @@ class Corners:
 
         `level`: triangles (G,3) of the level, indices of corners.
         """
-        # Kept corners too: where a level is folded over itself in UV, they may lie in triangles that lack them.
+        # Kept corners are included: if a level folds over itself in UV, one may lie in a triangle of other corners.
         inside, is_inside = self._in_triangles(np.unique(self.triangles), level)
         left_out = np.setdiff1d(self.triangles, level)
         edges, uses = _edges(level)
@@ -148,8 +149,8 @@ class Corners:
     def _in_triangles(self, corners: I64, level: I64) -> tuple[tuple[I64, F64], I64]:
         """Return (pairs, corners (K,) that are in a pair).
 
-        A pair has one of `corners` (M,), and a point of a triangle of `level` (G,3) that shows the same texel but does
-        not have this corner. Pairs are (`corners`, `shares`) as in `Pairs`.
+        A pair consists of one of `corners` (M,) and a point that shows the same texel. The point lies in a triangle of
+        `level` (G,3) that does not have this corner. Pairs are (`corners`, `shares`) as in `Pairs`.
         """
         point, (a, b, c) = self.uv[corners], (self.uv[level[:, k]] for k in range(3))
         box = np.stack([a, b, c])
@@ -210,7 +211,7 @@ class Corners:
         return np.asarray(np.sqrt(square))
 
     def to_lock(self, pairs: Pairs, level: I64, moved: F64, tolerance_m: float, locked: Mask) -> Mask:
-        """Return which corners (N,) to lock next: those of `locked`, and corners of the pairs that are too far apart.
+        """Return which corners (N,) to lock next: all in `locked`, and corners of pairs whose points are too far apart.
 
         `pairs`, `level`: pairs and triangles (G,3) of the level.
         `moved`: distance (P,) between the points of each pair, in metres.
@@ -285,8 +286,8 @@ def make_mesh_levels(shaped: ShapedBody) -> Iterator[MeshLevel]:
 def simplify_within(mesh: Corners, tolerance_m: float) -> tuple[I64, Pairs]:
     """Simplify `mesh`; return (triangles (G,3) of the level, pairs of the level with the whole mesh).
 
-    The points of a pair are at most `tolerance_m` apart. If no round of MOST_ROUNDS achieves this, the result is from
-    the round with the smallest largest distance.
+    The points of a pair are at most `tolerance_m` apart. If none of MOST_ROUNDS rounds achieves this, the round whose
+    largest distance is the smallest gives the result.
     """
     locked = np.zeros(len(mesh.uv), bool)
     best: tuple[float, I64, Pairs] | None = None

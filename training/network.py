@@ -33,8 +33,8 @@ from trilane.unet_tables import (
     squeeze_channels,
 )
 
-# The encoders in PyTorch. An encoder turns a tensor (N, C, H, W), with H and W multiples of 32, into features at
-# strides 2, 4, 8, 16 and 32, finest first. Its attribute `channels` has the numbers of channels of these features.
+# The encoders in PyTorch. An encoder turns a tensor (N, C, H, W) into features at strides 2, 4, 8, 16 and 32, finest
+# first. H and W are multiples of 32. Its attribute `channels` has the numbers of channels of these features.
 #
 # Rule: channel counts, kernels and strides come from `trilane.unet_tables`; this file builds layers from the tables.
 
@@ -226,7 +226,7 @@ CHANNEL_STEP = 4
 
 
 class GroupNorm(nn.GroupNorm):
-    """`nn.GroupNorm` from operators that can be quantised: an instance norm, and then a depthwise 1x1 convolution."""
+    """`nn.GroupNorm`, built from operators that can be quantised: an instance norm and a depthwise 1x1 convolution."""
 
     def forward(self, x: Tensor) -> Tensor:
         n, c, h, w = x.shape
@@ -336,8 +336,8 @@ def _check(encoder: str, norm: str, width: int, channels: int) -> None:
 # bytes that store these outputs after quantisation.
 
 BYTE_STEPS = 255
-#: Noise is a slice of a fixed array of random values, whose start is random and below this number. This takes a fifth
-#: of the time of drawing new values.
+#: Noise is a slice of a fixed array of random values. The slice begins at a random index below this number. A slice
+#: takes a fifth of the time of drawing new values.
 STARTS = 1 << 16
 
 
@@ -349,7 +349,6 @@ def add_activation_noise(network: nn.Module, steps: float) -> None:
     bank = torch.empty(0)
 
     def noise_for(output: Tensor) -> Tensor:
-        """Return uniform noise in -1..1 with the shape of `output`."""
         nonlocal bank
         if len(bank) < output.numel() + STARTS or bank.dtype != output.dtype or bank.device != output.device:
             drawn = torch.rand(output.numel() + STARTS, generator=torch.Generator().manual_seed(0))

@@ -1,4 +1,4 @@
-"""The objective that training minimises: the loss terms, including those that need networks (VGG-16, discriminators).
+"""The objective that training minimises: the loss terms, also terms that need networks (VGG-16, discriminators).
 
 Rule: a term that needs a network, or blurred pictures, is computed only if it has a weight. The same step on the same
 pictures gives the same numbers.
@@ -71,8 +71,8 @@ class Objective:
 
 # MS-SSIM of pictures in PyTorch, with gradients: similarity at five scales.
 #
-# Rule: windows lie wholly inside the picture. Scales at which the picture is smaller than a window are left out, and
-# the weights of the remaining scales are scaled to a sum of 1.
+# Rule: windows lie wholly inside the picture. Scales at which the picture is smaller than a window are left out. The
+# weights of the other scales are scaled to a sum of 1.
 
 #: Weights of the scales, finest first: Wang, Simoncelli, Bovik, Multiscale structural similarity, 2003, section 3.2.
 SCALES = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)
@@ -392,8 +392,8 @@ class Adversary:
     def terms(self, output: Tensor, target: Tensor, behind: Tensor) -> dict[str, Tensor]:
         """Return the loss terms `adversarial` and `features`, which the avatar minimises.
 
-        The more the discriminators take `output` for ground truth, the smaller is `adversarial`. `features` is the mean
-        difference between the features of `output` and of `target` (feature matching).
+        `adversarial` is small if the discriminators take `output` for ground truth. `features` is the mean absolute
+        difference between the discriminators' features of `output` and of `target` (feature matching).
 
         `output`, `target`: (N, 4, H, W) in 0..1, colour and mask, straight alpha.
         `behind`: background (N, 3, H, W) of both.
@@ -412,7 +412,7 @@ class Adversary:
     def learn(self, output: Tensor, target: Tensor, behind: Tensor) -> float:
         """Train the discriminators by one step, and return their mean error before the step, in bits.
 
-        A discriminator that guesses has an error of 1 bit. The parameters are those of `terms`.
+        A discriminator that guesses has an error of 1 bit. `terms` describes the parameters.
         """
         wrong = [
             (bits(mine.score, true=False) + bits(theirs.score, true=True)) / 2

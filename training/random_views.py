@@ -24,8 +24,8 @@ from trilane.training.clothing import Layer
 NEAR_M, FAR_M = 0.05, 100.0
 #: Least distance of a camera from the joint that it aims at.
 NEAREST_M = 0.45
-#: For each band, the joints that a camera may aim at, and the least and greatest height in metres, at the distance of
-#: the joint, that fills the screen.
+#: For each band: joints that a camera may aim at, and least and greatest height that fills the screen. Heights are in
+#: metres, at the distance of the joint.
 BANDS: dict[str, tuple[tuple[str, ...], float, float]] = {
     "far": (("pelvis", "spine1"), 4.5, 10.0),
     "full_body": (("pelvis", "spine1"), 1.9, 3.4),
@@ -152,10 +152,10 @@ class Cropper:
         self._bounds = MeshBounds(shaped, standoff_m=CLOTHES_STANDOFF_M, pose_blend=pose_blend)
 
     def crop_of(self, posed: Posed, view: View, size: str | float) -> Crop | None:
-        """Return the crop of a tensor of `size`: its size as `shape_buckets` takes it, or its density.
+        """Return the crop of the body, as `crop` does, with a tensor of `size`.
 
-        A density is the number of tensor pixels for one pixel of the picture, along a side. The tensor then has the
-        side of `TENSOR_SIDES` that comes nearest to it. `crop` has the other parameters.
+        `size`: text that `shape_buckets` takes, or density: tensor pixels for one pixel of the picture, along a side.
+        The side of `TENSOR_SIDES` that fits a density best is chosen.
         """
         if isinstance(size, str):
             return self.crop(posed, view, shape_buckets(size))
@@ -187,7 +187,7 @@ class Cropper:
 
 
 class ClothedSurface:
-    """The surface of all `layers` of a clothed body, as balls around the vertices that cover all triangles."""
+    """The surface of all `layers` of a clothed body. Balls around its vertices cover all its triangles."""
 
     def __init__(self, layers: Sequence[Layer]) -> None:
         self._rest = np.concatenate([layer.vertices for layer in layers])
@@ -210,8 +210,8 @@ class ClothedSurface:
 def vertex_reach(vertices: F64, faces: NDArray[np.int64]) -> F64:
     """Return the radius (N,), metres, of a ball around each vertex, so that the balls cover all triangles.
 
-    A point of a triangle is at most the longest edge / √3 away from the nearest corner. The middle of an equilateral
-    triangle is exactly so far away.
+    A point of a triangle is at most the longest edge / √3 away from the nearest corner. In an equilateral triangle, the
+    middle is exactly that far away.
 
     `vertices`: (N,3), metres. `faces`: (F,3).
     """

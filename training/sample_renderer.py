@@ -1,7 +1,7 @@
 """Renders training samples of the default body: the UV image of the body, and a picture of the clothed body.
 
-Rule: crop, tensor shape and rasterisation are those of the pipeline. A sample depends only on its seed. No near plane
-cuts the body or its clothes.
+Rule: crop, tensor shape and rasterisation are the same as in the pipeline. A sample depends only on its seed. No near
+plane cuts the body or its clothes.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class SampleRenderer:
         `shaped`: body. The UV image is drawn with the body's offsets, if any; clothes are put on the skin.
         `threads`: number of threads of a software OpenGL driver; None for the driver's default.
         `samples`: number of samples of the ground truth along each side of a pixel, even.
-        `look`: clothes and colours. The shape of the body is that of `shaped`.
+        `look`: clothes and colours. Its shape coefficients are not used: `shaped` has a shape already.
         Raises MissingPartError without OpenGL.
         """
         body = shaped.body
@@ -125,7 +125,7 @@ class SampleRenderer:
 
 # The UV image of a skinned mesh: u and v of every pixel, as float32 or as bytes.
 #
-# Rule: vertices, rasterisation and pixel centres are those of the GPU unit's packed pass. There is no antialiasing.
+# Rule: vertices, rasterisation and pixel centres are the same as in the GPU unit's packed pass, without antialiasing.
 
 
 class _MeshTarget:
@@ -185,7 +185,7 @@ class UvBytes:
         self._target = _MeshTarget(ctx, mesh, "uv_only.frag", 2, "f1")
 
     def render_into(self, tensor: U8, joints: F32, view: Floats, projection: Floats, shape: tuple[int, int]) -> None:
-        """Write u and v of every pixel as round(255 x), row 0 on top; 0 off the mesh.
+        """Write round(255 u) and round(255 v) of every pixel, row 0 on top; 0 off the mesh.
 
         `tensor`: (h * w * 2,) uint8, written as (h, w, 2).
         `joints`: skinning matrices (55,3,4).

@@ -35,14 +35,14 @@ from trilane.writing import write_atomically
 WARM_UP = 0.02
 #: Number of steps that are measured to estimate the duration of a training.
 MEASURED = 4
-#: The random seed of a step has the step's number above this many bits of the training's seed.
+#: The random seed of a step has the training's seed in this many low bits, and the step's number above them.
 SEED_BITS = 31
 
 
 def first_state(avatar: TrainableAvatar, settings: TrainingSettings, vgg: Vgg16 | None = None) -> TrainingState:
     """Return the state of a training of `avatar` before the first step. `avatar` is prepared in place.
 
-    `vgg`: network of the perceptual loss; None if the loss has none.
+    `vgg`: network of the perceptual loss; None if MS-SSIM replaces it or the loss has no such term.
     """
     device = chosen_device(settings.device)
     average = copy.deepcopy(avatar.to(device)).eval()
@@ -259,7 +259,7 @@ class _Masked(torch.optim.Optimizer):
     def _kept(self, parameter: Tensor) -> tuple[Tensor, Tensor, list[Tensor]]:
         """Return `parameter`, a mask of its elements without a gradient, and the values to restore at these elements.
 
-        The values are those of the parameter and its moments. Moments that do not exist yet begin at 0.
+        The list has the parameter's values first, and then its moments' values. Missing moments count as 0.
         """
         unseen = parameter.grad == 0
         if self.state[parameter]:
@@ -295,7 +295,7 @@ CLASSES: dict[tuple[str, bool], type[torch.optim.Optimizer]] = {
 def optimiser_of(avatar: TrainableAvatar, settings: TrainingSettings) -> torch.optim.Optimizer:
     """Return an optimiser with three groups: kernels, the network's other weights, and the texture.
 
-    The network's other weights have no weight decay. A network that is kept has no parameters in the groups.
+    The network's other weights have no weight decay. If the network is kept, the first two groups are empty.
     """
     options = settings.optimiser
     kernels = [p for p in avatar.network.parameters() if p.ndim > 1 and p.requires_grad]
@@ -412,8 +412,8 @@ def _add_moments(optimiser: torch.optim.Optimizer) -> None:
 # How far a training's loss fell: the loss of the same samples, before the first step and after the last.
 #
 # Rule: both losses are measured alike. The terms of the discriminators are left out, because discriminators change with
-# each step. The loss is that of the averaged weights, which become the bundle, over the same backgrounds. Measuring it
-# changes nothing in the training.
+# each step. The loss is measured on the averaged weights, which become the bundle, with the same backgrounds. The
+# measurement changes nothing in the training.
 
 
 def probe_loss(state: TrainingState, groups: list[ShapeGroup]) -> float:

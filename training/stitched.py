@@ -1,7 +1,7 @@
 """Surfaces that are stitched from rings and not raised from the body's mesh: shoes, a skirt, hair that falls.
 
-Rule: a ring is an outline of the body's vertices in or above a slice, as seen from above, and is widened; no coordinate
-is a constant. Faces join each ring to the next.
+Rule: a ring is the widened outline of vertices of the body, as seen from above. It lies at one height, and encloses
+vertices at that height or above. No coordinate is a constant. Faces join each ring to the next.
 """
 
 from __future__ import annotations
@@ -73,7 +73,9 @@ def _ring(foot: F64, height: float, margin: float) -> F64:
 def _stitch(rings: int, capped: bool) -> NDArray[np.int64]:
     """Return the faces (F,3) between consecutive rings, and a fan that closes the first ring.
 
-    The centres of the first and last ring follow the rings as two vertices.
+    Two vertices follow the rings: the centres of the first and the last ring.
+
+    `capped`: whether a fan closes the last ring too.
     """
     here = np.arange(ANGLES)
     after = (here + 1) % ANGLES
@@ -102,13 +104,13 @@ def _walls(rings: int) -> NDArray[np.int64]:
 
 # A skirt: rings around both legs and the hips, from the hem up to the waist. It is open at the hem and at the waist.
 #
-# Rule: cloth falls, so that a ring goes around all that is above it too. Above the hips the skirt follows the trunk;
-# below, each side follows its thigh, and the middle both.
+# Rule: cloth falls, so a ring also encloses everything above it. Above the hips the skirt follows the trunk. Below the
+# hips, each side follows its thigh, and the middle follows both thighs.
 
 WAIST_M, HEM_M = 0.105, 0.02  # heights of waist and hem above the pelvis and the knee
 SKIRT_STEP_M = 0.016
 PLEATS, PLEAT_M = 8, 0.012
-#: From the middle of the body to where the skirt follows one thigh alone, relative to the joint of the hip.
+#: Distance from the body's middle at which the skirt follows one thigh alone, in distances of the hip joint.
 PARTED = 1.05
 
 
@@ -133,7 +135,7 @@ def skirt(vertices: F64, joints: F64) -> Stitched:
 
 
 def skirt_weights(points: F64, trunk: F64, joints: F64) -> F64:
-    """Return the skin weights (N,55) of the `points` (N,3) of a skirt.
+    """Return the skinning weights (N,55) of the `points` (N,3) of a skirt.
 
     `trunk`: weights (N,55) of the body under the points. `joints`: body at rest, (55,3).
     """
@@ -193,7 +195,7 @@ def long_hair(vertices: F64, joints: F64, eye: F64) -> Stitched:
 
 
 def long_hair_weights(points: F64, joints: F64) -> F64:
-    """Return the skin weights (N,55) of the `points` (N,3) of long hair: from the head by the neck to the spine.
+    """Return the skinning weights (N,55) of the `points` (N,3) of long hair, for the joints head, neck and spine3.
 
     `joints`: body at rest, (55,3).
     """

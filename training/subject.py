@@ -1,6 +1,6 @@
 """The subject of a training: the clothed default body or the person of a capture, with offsets of clothes and hair.
 
-Rule: only this module treats the two kinds of subjects differently.
+Rule: a `Subject` hides most differences between the two kinds from other modules.
 """
 
 from __future__ import annotations
@@ -60,9 +60,8 @@ class Person:
 class Subject:
     """The subject of a training, with the renderers of its samples.
 
-    `shaped`: body of `person`, with its offsets. `renderer`: plans and renders samples. `opener`: function that opens
-    another such renderer, in any process, for a body with the offsets that `opener` is given. `facts`: facts for the
-    manifest.
+    `shaped`: body of `person`, with its offsets. `renderer`: plans and renders samples. `opener`: function that takes
+    offsets of the body and opens another such renderer, in any process. `facts`: facts for the manifest.
     `truth`: the renderer, if it can draw the ground truth of any pose and view; None for a capture.
     `frames`: the renderer, if it shows frames of a capture; else None. `held_out`: numbers of the held-out frames.
     `unseen`: texels (S,S) of the body that no training frame shows; None if `truth` can show all.
@@ -170,20 +169,20 @@ def _checked(capture: Capture, threads: int) -> tuple[list[CheckedFrame], TexelC
 # Rule: an offset is measured only at vertices on the outline of the body, because a mask shows offsets only there.
 # Other vertices get their offsets from neighbours on the surface.
 #
-# The offsets are those of "SMPL+D" (Alldieck et al., Video Based Reconstruction of 3D People Models, CVPR 2018), but
-# they are found by sampling the mask along the normals, not by gradient descent.
+# "SMPL+D" has the same offsets (Alldieck et al., Video Based Reconstruction of 3D People Models, CVPR 2018). There they
+# are found by gradient descent, here by sampling the mask along the normals.
 
 #: Range along the surface's normal in which the mask's outline is searched, and step of the search, metres.
 INWARD_M, OUTWARD_M, STEP_M = -0.03, 0.1, 0.002
 #: A vertex may be at the outline if the sine of the angle between its surface and the ray to the camera is below this.
 RIM = 0.2
-#: A vertex is at the outline if the body is drawn this many pixels inside of it and not drawn as far outside.
+#: A vertex is at the outline if the body is drawn this many pixels inwards from it, and not this many pixels outwards.
 BESIDE_PX = 1.5
 #: Least number of pixels that a metre along the normal must span: fewer pixels are too inaccurate.
 LEAST_PX_PER_M = 120.0
 #: Number of measurements with which a vertex has the full weight.
 ENOUGH = 12
-#: Weight of the squared difference between neighbours, relative to that of a vertex with the full weight.
+#: Weight of the squared difference between neighbours, if the full weight of a measured vertex is 1.
 STIFFNESS = 0.6
 #: Number of smoothing steps of the normals, so that raised surfaces do not fold.
 NORMAL_ROUNDS = 6
@@ -248,7 +247,7 @@ def smooth_normals(vertices: F64, faces: Ints) -> F64:
 def measured_heights(shaped: ShapedBody, normals: F64, outline: Outline) -> tuple[Ints, F64, F64]:
     """Return N vertices at the outline: indices (N,), distances (N,) to the mask's outline, weights (N,).
 
-    A distance is along the vertex's normal, in metres. A weight is the number of pixels that a metre along it spans.
+    A distance is along the vertex's normal, in metres. A weight is the number of pixels for a metre along the normal.
 
     `normals`: smoothed normals (V,3) at rest.
     """
@@ -319,7 +318,7 @@ class _Pixels:
 
 
 def _posed(shaped: ShapedBody, normals: F64, outline: Outline) -> tuple[F64, F64, F64]:
-    """Return the posed vertices, the posed `normals` and the true normals of the posed mesh, (V,3) each, world."""
+    """Return the posed vertices, the posed `normals`, and normals computed from the posed mesh; each (V,3), world."""
     rest = shaped.vertices.astype(np.float64)
     if outline.feature is not None and shaped.body.posedirs is not None:
         rest = rest + (shaped.body.posedirs.reshape(-1, len(outline.feature)) @ outline.feature).reshape(-1, 3)
@@ -333,7 +332,7 @@ def _posed(shaped: ShapedBody, normals: F64, outline: Outline) -> tuple[F64, F64
 def _ends(values: F64) -> tuple[F64, NDArray[np.bool_]]:
     """Return where each row of `values` (N,K) first falls below 0.5, as an index (N,), and whether it does (N,).
 
-    The index is interpolated. A row that begins below 0.5 or reaches NaN first does not fall.
+    The index is interpolated. A row that begins below 0.5, or reaches NaN first, does not count as falling.
     """
     inside = values >= 0.5
     first = np.argmin(inside, axis=1)
@@ -391,7 +390,7 @@ def measured_offsets(
 ) -> F32:
     """Return the offsets (V,3), metres, from the skin of `subject` to the surface that the masks show.
 
-    The parameters are those of `subject_with_offsets`.
+    `subject_with_offsets` describes the parameters.
     """
     samples = plan_training(subject.renderer, VIEWS, seed + SEED)
     report(_cost(subject, samples))

@@ -20,7 +20,7 @@ class BodyArrays:
 
     `vertices`: (V,3), in metres. `faces`: (F,3) indices of vertices.
     `uv`: texture coordinates (T,2). `uv_faces`: (F,3) indices of `uv`.
-    `weights`: skin weights (V,55). `joints`: (55,3), in metres.
+    `weights`: skinning weights (V,55). `joints`: (55,3), in metres.
     """
 
     vertices: F64
@@ -103,8 +103,8 @@ class Smoother:
 def shell(vertices: F64, faces: Ints, offset: F64, least: F64, rounds: int) -> F64:
     """Return the vertices (V,3) of a smooth surface over a mesh, which bridges hollows as cloth does.
 
-    First the mesh is raised along smoothed normals. Then each round smooths the surface, and raises vertices that have
-    sunk below their least height again, along the normals.
+    The mesh is raised along smoothed normals. After that, each round smooths the surface. If vertices sink below their
+    least height, the round raises them to it along the normals.
 
     `vertices` (V,3), `faces` (F,3): the mesh.
     `offset`: height (V,), in metres, to which the mesh is raised first.

@@ -328,7 +328,8 @@ def _first_avatar(people: Sequence[Trained], places: TrainingPlaces, settings: T
 def _first_image(person: Trained, number: int, settings: TrainingSettings) -> F32:
     """Return the texture (S,S,C) from which the training of `person`, whose number is `number`, starts.
 
-    The texture of an avatar is taken as it is, except for texels that only this person's body uses, for a garment.
+    If the settings name a bundled avatar, its texture is taken. Texels that only the body of `person` uses, such as a
+    garment's, begin as in a new texture.
     """
     name = person.subject.facts.get(KEY) if settings.texture == "look" else settings.texture
     body = body_arrays(person.subject.shaped)

@@ -229,7 +229,7 @@ SAVED_WEIGHTS = "weights that this network's training saved"
 
 
 def load_network(network: UNet, path: Path) -> UNet:
-    """Load the weights in a file of `save_network` into `network`, and return `network`. Raises BadInputError."""
+    """Load the weights that `save_network` wrote to `path` into `network`; return `network`. Raises BadInputError."""
     try:
         with np.load(path, allow_pickle=False) as arrays:
             saved = {name: torch.from_numpy(arrays[name]) for name in arrays.files}
@@ -248,7 +248,7 @@ def load_network(network: UNet, path: Path) -> UNet:
 
 
 def float_network_of(bundle: Bundle, weights: Path) -> UNet:
-    """Return the network of `bundle` with the weights of a file of `save_network`. Raises BadInputError."""
+    """Return the network of `bundle` with the weights that `save_network` wrote to a file. Raises BadInputError."""
     entry = bundle.manifest.network
     return load_network(UNet(entry.encoder, entry.norm, entry.width, entry.channels, input_skip=True), weights)
 
@@ -386,7 +386,7 @@ def float_painter(network: UNet, *levels: torch.Tensor) -> Painter:
 def float_painter_of(bundle: Bundle, weights: Path) -> Painter:
     """Return a painter that runs the float network of `bundle` on the texture of `bundle`. Raises BadInputError.
 
-    `weights`: file of `save_network`.
+    `weights`: file that `save_network` wrote.
     """
     return float_painter(float_network_of(bundle, weights), *levels_of(bundle))
 
@@ -474,7 +474,7 @@ class ByteGrid:
 class _Rounded(torch.autograd.Function):
     """Rounds values to multiples of a step, between two ends. Gradients pass inside the ends and are 0 outside.
 
-    As one operator with one kept tensor, this takes about half the time of its steps one by one with autograd.
+    This operator keeps one tensor, and takes about half the time of separate operators with autograd.
     """
 
     @staticmethod

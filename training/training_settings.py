@@ -133,7 +133,7 @@ LOSSES: dict[str, dict[str, Any]] = {
 #: Usual values of a training that continues a trained network, and of one that begins with a new network.
 TRAINED: dict[str, Any] = {"small_until": 0.0, "freeze_norms_at": 0.3}
 NEW: dict[str, Any] = {"small_until": 0.12, "freeze_norms_at": 0.6}
-#: A training of a new network in fewer minutes than this has cheap steps and high learning rates, by default
+#: By default, a training of a new network in fewer minutes than this has cheap steps and high learning rates
 #: (docs/decisions/avatar-training.md).
 SHORT_MINUTES = 5.0
 MOST_MINUTES = 100_000

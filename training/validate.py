@@ -1,6 +1,6 @@
 """Validates an avatar: evaluates the files of its bundle on held-out samples and writes the result into its manifest.
 
-Rule: the figures depend only on bundle, seeds, motions, size and runtimes. The digests are those of the files that were
+Rule: the figures depend only on bundle, seeds, motions, size and runtimes. The digests belong to the files that were
 read.
 """
 
@@ -64,7 +64,7 @@ class PackedRenderer(Protocol):
     mesh: SkinnedMesh
 
     def placed(self, sample: Any) -> tuple[F64, Placement]:
-        """Return (view matrix (4,4) of `sample`, its body's pose, crop and place in the tensor)."""
+        """Return (view matrix (4,4) of `sample`, placement of its body in the tensor)."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +127,7 @@ def integer_painter(renderer: PackedRenderer, bundle: Bundle, runtime: str, thre
 
 
 BUILTIN_HELD_OUT = "builtin:walk-wave-turn"
-#: Seeds of a validation. The worst of the 96 samples of a seed differs by several dB from seed to seed, hence several.
+#: Seeds of a validation. One seed is not enough: the worst of its 96 samples differs by several dB from seed to seed.
 SEEDS = (1, 2, 3, 4, 5, 6, 7, 8)
 PER_BAND = 24
 #: Name of the float network's painter; the other painters have the names of runtimes.
@@ -141,9 +141,9 @@ class ValidationPlan:
     """The plan of an avatar's evaluation.
 
     `held_out`: motions that the poses are taken from, `builtin:NAME` or files. `seeds`: seeds of the samples.
-    `per_band`: number of samples for each band and seed. `runtimes`: names of runtimes; the figures of the first one
-    are those of the avatar. `size`: tensor size, as `shape_buckets` takes it. `threads`: number of threads of a
-    software OpenGL driver and of each runtime. `revision`, `modified`: as in `MadeWith`.
+    `per_band`: number of samples for each band and seed. `runtimes`: names of runtimes; the avatar's figures come from
+    the first one. `size`: tensor size, as `shape_buckets` takes it. `threads`: number of threads of a software OpenGL
+    driver and of each runtime. `revision`, `modified`: as in `MadeWith`.
     """
 
     held_out: tuple[str, ...] = (BUILTIN_HELD_OUT,)
@@ -269,8 +269,8 @@ def _arranged(figures: Mapping[str, dict[str, Any]], runtimes: tuple[str, ...], 
 DIGITS = 2
 #: Sides of squares with as many pixels as the tensor may have. The largest is 7/4 of a network's usual 256.
 TENSOR_SIDES = (48, 64, 96, 128, 160, 192, 256, 320, 384, 448)
-#: Sides of squares with as many pixels of the picture as the body covers, and the band of their views: in pictures of
-#: 480 to 720 rows, most bodies of that size are seen so.
+#: Sizes of bodies, as sides of squares with as many picture pixels as the body covers, and the band of the views. In
+#: pictures of 480 to 720 rows, most bodies of a size are seen in this band.
 PICTURE_SIDES: dict[int, Band] = {
     64: "far",
     96: "far",
@@ -288,7 +288,7 @@ def measure_sizes(
 ) -> BySize:
     """Measure the image error of `bundle` by size of body and tensor.
 
-    `plan`: plan of the validation. The views are those of its first seed, painted on its first runtime.
+    `plan`: plan of the validation. The views of its first seed are painted on its first runtime.
     `renderer`: renderer from `open_renderer`.
     `look`: called after every view.
     Raises BadInputError, MissingPartError.
@@ -322,7 +322,7 @@ def measure_sizes(
 
 
 def on_picture(crop: Crop, view: View, side: int) -> Crop:
-    """Return `crop` with as many pixels as the picture has there, if the body covers `side` x `side` of its pixels."""
+    """Return `crop` with the shape that it has in a picture on which the body covers `side` x `side` pixels."""
     wide, high = (view.projection[axis, axis] / crop.projection[axis, axis] for axis in (0, 1))
     pixels = wide * high * OUTPUT_ROWS * round(OUTPUT_ROWS * view.aspect)  # of the crop, where the body has crop.pixels
     scale = side * math.sqrt(pixels / crop.pixels / math.prod(crop.shape))

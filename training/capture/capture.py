@@ -108,7 +108,8 @@ def open_capture(folder: Path, track: Track = iter) -> Capture:
 
     `track`: function that gets the numbers of the frames, and yields them again while it shows progress.
 
-    Raises BadInputError for a capture.toml that cannot be read, and FaultyCaptureError with all faults of other files.
+    Raises BadInputError for a capture.toml that cannot be read. Raises FaultyCaptureError with all faults of its keys;
+    if there are none, with all faults of the other files.
     """
     return _Opening(folder, read_capture_file(folder)).opened(track)
 
@@ -158,7 +159,7 @@ class _Opening:
     def _matched(self, frames: Pictures, masks: Pictures) -> list[int]:
         """Return, for each frame, the number of its mask. A frame without a mask gets -1 and a fault.
 
-        If frames and masks are both files in folders, the names of the files match them, else their numbers.
+        Two folders are matched by the names of their files. If one of the two is a video, numbers are matched.
         """
         if isinstance(frames, PictureFolder) and isinstance(masks, PictureFolder):
             by_stem = {Path(name).stem: number for number, name in enumerate(masks.names)}
@@ -368,7 +369,7 @@ def read_fit(where: str, arrays: Arrays, body: Body, flat_hand_mean: bool) -> tu
 
 
 def _numbers(where: str, array: NDArray[Any], faults: list[Fault]) -> F64:
-    """Return `array` as a flat row; if it has anything but finite numbers, add to `faults` and return zeros."""
+    """Return `array` as a flat row. If a value is not finite or above `MAX_VALUE`, add to `faults` and return zeros."""
     if array.dtype.kind not in "fiu":
         faults.append(Fault(where, f"dtype {array.dtype}", "numbers"))
         return np.zeros(array.size)

@@ -81,7 +81,7 @@ EXPECTED = "a capture file (TOML): docs/captures.md"
 NEAR_M, FAR_M = 0.05, 100.0
 Side = Literal["front", "left", "back", "right"]
 Row = Annotated[tuple[Finite, Finite, Finite], LISTED]
-#: Rotation from the axes of an OpenCV camera (y down, looks along +Z) to those of an OpenGL camera (y up, along -Z).
+#: Rotation from the axes of OpenCV cameras (y down, looks along +Z) to the axes of OpenGL cameras (y up, along -Z).
 OPENGL_FROM_OPENCV: F64 = np.diag([1.0, -1.0, -1.0])
 
 
@@ -181,8 +181,8 @@ def _fault(details: dict[str, Any]) -> Fault:
 
 # Pictures of a capture: a folder of files, or a video.
 #
-# Rule: a picture is read as it is stored. A picture with other channels than expected is refused, never converted. A
-# video is decoded forwards: if its pictures are read in order, each is decoded once.
+# Rule: a file is read as it is stored. A file with other channels than expected is refused, never converted. A video is
+# decoded to RGB or grey, and refused only with alpha. If its pictures are read in order, each is decoded once.
 
 ENDINGS = (".png", ".jpg", ".jpeg")
 VIDEO_ENDINGS = (".mp4", ".mkv", ".mov", ".avi", ".webm")
@@ -196,9 +196,9 @@ MODES = {
     "RGBA": "four channels (RGBA)",
     "CMYK": "four channels (CMYK)",
 }
-#: For each kind of picture: (allowed modes of Pillow, expected and remedy for the error about another mode, PyAV format
-#: into which a video's pictures are decoded).
 FRAME, MASK = "frame", "mask"
+#: For each kind of picture: (allowed modes of Pillow, expected and remedy of the error for another mode, PyAV format
+#: into which a video's pictures are decoded).
 STORED: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     FRAME: (
         ("RGB",),
@@ -211,10 +211,7 @@ STORED: dict[str, tuple[tuple[str, ...], str, str, str]] = {
 
 
 class Pictures(Protocol):
-    """Frames or masks of a capture.
-
-    `names`: name of each picture, in the order of their numbers.
-    """
+    """Frames or masks of a capture. `names`: name of each picture, in the order of their numbers."""
 
     names: tuple[str, ...]
 
@@ -275,7 +272,7 @@ class PictureVideo:
             raise BadInputError(path, "a video without frames", f"a video of {kind}s")
 
     def read(self, number: int) -> U8:
-        """Return picture `number`, as `Pictures.read`. If an earlier call read it or a later one, reopen the video."""
+        """Return picture `number`, as `Pictures.read` describes. If it was decoded before, reopen the video."""
         if number < self._next or not self._next:
             self._stream, self._next = self._frames(), 0
         frame = None

@@ -33,7 +33,7 @@ from trilane.training.surface import vertex_areas
 TRIES = 1000
 #: Number of frames that are kept decoded, because successive samples often use the same frame.
 KEPT = 4
-#: One of so many successive frames is held out of training.
+#: Of this many successive good frames, one is held out of training.
 HELD_OUT_EVERY = 10
 
 
@@ -157,7 +157,7 @@ def held_out_frames(count: int, bad: Sequence[int]) -> tuple[list[int], list[int
 
 # The body of a capture as the pipeline rasterises it: UV images of its fits.
 #
-# Rule: mesh, skinning and raster are those of the pipeline. A body with pose blend shapes is drawn with them.
+# Rule: the body is drawn with the pipeline's mesh, skinning and raster, and with pose blend shapes if it has any.
 
 
 class BodyRaster:
@@ -286,7 +286,7 @@ def projected(points: ArrayLike, clip: F64, shape: Shape) -> F64:
 def unmirrored(by: F64, target: Shape) -> tuple[F64, bool]:
     """Return (map `by` (3,3) without its mirroring, whether drawn columns must be reversed afterwards).
 
-    A mirroring camera would reverse the winding of triangles, and the raster would cull the wrong triangles. To reverse
+    A mirroring camera would reverse the winding of triangles, and the raster would cull the wrong triangles. Reversing
     the columns of the drawn picture is exact, because pixel centres lie symmetrically.
 
     `target`: (height, width) of the drawn picture.
@@ -339,7 +339,7 @@ def _inverse(matrix: F64) -> F64:
 
 
 class VertexCentres:
-    """Chooses random vertices among those that a band's joints move most; the probability of a vertex is by area."""
+    """Chooses random vertices of the parts that a band's joints move. A vertex's probability is its share of area."""
 
     def __init__(self, shaped: ShapedBody) -> None:
         self._shaped = shaped
@@ -391,10 +391,7 @@ class ViewRule:
 
 @dataclass(frozen=True)
 class SampleCamera:
-    """A frame's camera.
-
-    `view`, `projection`: matrices (4,4).
-    """
+    """A frame's camera. `view`, `projection`: matrices (4,4). `lens`: lens in pixels of the frame."""
 
     view: F64
     projection: F64

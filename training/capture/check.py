@@ -87,7 +87,7 @@ def coverage_of(capture: Capture) -> TexelCoverage:
 
 # Regions of a body's surface, by name, for reports on what a capture shows.
 #
-# Rule: every vertex is in exactly one region. Regions follow from the body at rest: joints, skin weights and normals.
+# Rule: every vertex is in exactly one region. Regions follow from joints, skinning weights and normals at rest.
 
 #: For each region, prefixes of the names of the joints that move its vertices most. The first matching region counts.
 BY_JOINT = {

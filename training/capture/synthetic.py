@@ -37,9 +37,9 @@ JITTER = 0.3
 FILLED = 0.94
 MOST_FARTHER = 1.3
 FAST_PNG = 1
-#: Distance in pixels between the random values that move a mask's outline, and between those of the background.
+#: Distance in pixels between the random values that move a mask's outline, and between the background's random values.
 MASK_PATCH_PX, BACKGROUND_PATCH_PX = 24, 160
-#: A straight edge after a Gaussian blur has a tenth of its height at this many standard deviations.
+#: At this many standard deviations from a straight edge, a Gaussian blur has a tenth of the edge's height.
 TENTH_AT = 1.2816
 
 
@@ -137,8 +137,8 @@ def framing_view(rng: np.random.Generator, yaw: float, points: F64, projection: 
     """Return the view matrix (4,4) of a camera whose picture is nearly filled by `points` (N,3).
 
     The camera aims at the middle of the points' bounding box. Let (x, y, z) be a point relative to this aim, in camera
-    axes, and t the tangent of half the field of view. The point is in the picture if the camera's distance from the aim
-    is at least |x| / t + z (and the same for y).
+    axes, and t the tangent of half the field of view. The point is in the picture if the camera is at least |x| / t + z
+    away from the aim (and the same for y).
 
     `yaw`: direction of the camera about the body, in radians. `projection`: matrix (4,4) of the camera.
     """
@@ -174,10 +174,9 @@ def turned_at_random(rng: np.random.Generator, pose: F64, most_deg: float) -> F6
 
 
 def moved_outline(rng: np.random.Generator, mask: U8, most_px: float) -> U8:
-    """Return `mask` (h,w), 255 or 0, with its outline moved in or out by up to `most_px` pixels.
+    """Return `mask` (h,w) as 255 and 0, with its outline moved in or out by up to `most_px` pixels.
 
-    The mask is blurred. Then its pixels above a level become 255; the level, 0.1 to 0.9, varies smoothly over the
-    picture.
+    The mask is blurred, and pixels above a level become 255. The level, 0.1 to 0.9, varies smoothly over the picture.
     """
     blurred = np.asarray(Image.fromarray(mask).filter(ImageFilter.GaussianBlur(most_px / TENTH_AT)), np.float64) / 255
     level = 0.5 + 0.4 * _patches(rng, (mask.shape[0], mask.shape[1]), MASK_PATCH_PX, 1)[..., 0]
@@ -185,10 +184,7 @@ def moved_outline(rng: np.random.Generator, mask: U8, most_px: float) -> U8:
 
 
 def _patches(rng: np.random.Generator, shape: Shape, side: int, channels: int) -> F64:
-    """Return random values (h,w,channels) in -1..1 that vary smoothly.
-
-    `side`: pixels between independent values.
-    """
+    """Return random values (h,w,channels) in -1..1 that vary smoothly. `side`: pixels between independent values."""
     coarse = rng.uniform(-1, 1, (channels, shape[0] // side + 2, shape[1] // side + 2)).astype(np.float32)
     planes = [np.asarray(Image.fromarray(plane).resize(shape[::-1], Image.Resampling.BILINEAR)) for plane in coarse]
     return np.stack(planes, axis=-1).astype(np.float64)

@@ -124,8 +124,8 @@ def share_ranges(model: onnx.ModelProto, ranges: Any) -> None:
     """Give the inputs and the output of each Concat one range, in place, so that the Concat rounds nothing.
 
     With different ranges, runtimes that fuse a Concat into the layers before it would clamp at other values than
-    runtimes that do not fuse. The ranges of a Concat stay if one of its tensors is rectified and the common range would
-    include negative values, because the tensor would lose its clamp at 0.
+    runtimes that do not fuse. The ranges of a Concat stay if a rectified tensor would get a range with negative values,
+    because it would lose its clamp at 0.
 
     `ranges`: ONNX Runtime's TensorsData.
     """
@@ -213,8 +213,7 @@ def power_of_two_weights(model: onnx.ModelProto, ranges: Any, reduce_range: bool
     result has, by the name of the weights, a scale for each output channel, as ONNX Runtime's `TensorQuantOverrides`.
 
     `ranges`: ranges from `power_of_two_ranges`.
-    `reduce_range`: whether weights have one bit less than 8. If all runtimes round alike, weights are even numbers of
-    steps, which takes one more bit.
+    `reduce_range`: whether weights stay within ±64 steps instead of ±126.
 
     Raises CannotRoundAlikeError if a layer's weights are too large.
     """
@@ -258,7 +257,7 @@ def _bias_of(
 def _stored_as(model: onnx.ModelProto) -> dict[str, str]:
     """Return, for each tensor by name, the name of the tensor that is stored as bytes in its place.
 
-    If a Relu is the only reader of a tensor, it is the Relu's output, else the tensor itself.
+    If only one node reads the tensor and this is a Relu, the Relu's output is stored, else the tensor itself.
     """
     readers: dict[str, list[onnx.NodeProto]] = {}
     for node in model.graph.node:

@@ -172,7 +172,7 @@ class NoiseGraph:
         return value.astype(np.float32)
 
     def store(self, node: onnx.NodeProto) -> None:
-        """Add nodes that clip the tensor that `node` stores, and that round it if it has values between the steps."""
+        """Add nodes that clip the tensor that `node` stores, and that round it if it may lie between the steps."""
         x, y = node.input[0], node.output[0]
         lowest, highest, step = self.bytes_of(node)
         low, high = self._limit(f"{y}.low", lowest), self._limit(f"{y}.high", highest)
@@ -255,8 +255,8 @@ def session(model: onnx.ModelProto) -> Any:
 # Rule: only two facts are taken from the integer network: the places where it rounds, and whether its steps are powers
 # of two. The range of a stored tensor covers the tensor's float values on this input, and has 255 steps. The weights of
 # an output channel have `LARGEST_WEIGHT` steps to either side of 0; biases are exact. If steps are powers of two, each
-# step is `POWER_OF_TWO` times as wide. The reason: a step that is rounded up to a power of two grows by at most this
-# factor, and weights that are only even multiples have steps wider by this factor. The steps of the picture are 1/255.
+# step is `POWER_OF_TWO` times as wide: rounding up to a power of two widens a step by at most this factor, and even
+# multiples widen the steps of weights by this factor. The steps of the picture are 1/255.
 
 #: Greatest ratio between a step that was rounded up to a power of two and the step itself.
 POWER_OF_TWO = 2

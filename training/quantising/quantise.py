@@ -100,8 +100,8 @@ def quantise(
     `model`: network with one float32 input (1, C, H, W), and one output (1, 4, H, W) in 0..1 from a Sigmoid.
     `frames`: real inputs (H, W, C) float32 for the calibration; 1 to 1000 frames.
     `method`: calibration method, a name of `CALIBRATION_METHODS`.
-    `reduce_range`: whether weights have one bit less than 8. If all runtimes round alike, weights are even numbers of
-    steps, which takes one more bit.
+    `reduce_range`: whether weights have 7 bits instead of 8. If all runtimes round alike, weights use only even numbers
+    of steps, so 6 or 7 bits count.
     `keep_float`: names of nodes that stay in float.
 
     Raises BadInputError for wrong frames, an unknown method or layer, or a network that is not finite.
@@ -168,7 +168,10 @@ def _measured(model: onnx.ModelProto, frames: Sequence[F32], method: str) -> tup
 
 
 def _calibrated(model: onnx.ModelProto, ranges: Any, reduce_range: bool, keep_float: Sequence[str]) -> _Calibrated:
-    """Return `model` rounded so that all runtimes round alike; if this is impossible, `model` with measured ranges."""
+    """Return `model` rounded so that all runtimes round alike.
+
+    If this is impossible, return `model` with its measured ranges, after `share_ranges` has changed them.
+    """
     if not keep_float and may_round_alike(model):
         rounded, widened = copy.deepcopy(model), copy.deepcopy(ranges)
         power_of_two_ranges(rounded, widened)
@@ -194,7 +197,7 @@ def _check_frames(model: onnx.ModelProto, frames: Sequence[NDArray[np.float32]])
 
 
 def _describe(model: onnx.ModelProto, keep_float: Sequence[str]) -> None:
-    """Remove all metadata, and all operator sets but ONNX's. Then list the layers `keep_float` in the metadata."""
+    """Replace all metadata by the list of the layers `keep_float`, and remove all operator sets but ONNX's."""
     for entry in [entry for entry in model.opset_import if entry.domain not in ("", "ai.onnx")]:
         model.opset_import.remove(entry)
     del model.metadata_props[:]
@@ -236,8 +239,7 @@ def _pairs(
 ) -> Iterator[tuple[onnx.NodeProto, onnx.NodeProto]]:
     """Yield pairs (Conv, next Conv) with only a ReLU between them.
 
-    A pair is skipped if a second operator reads the output of the first Conv or of the ReLU. A pair is also skipped if
-    one of the Convs has groups, or has weights or a bias that are not constants or that another operator reads.
+    A pair is skipped if a second operator reads the output of the first Conv or of the ReLU. Both Convs are `_plain`.
     `weights`: constants of `graph`, by name.
     """
     users: dict[str, list[onnx.NodeProto]] = {}
@@ -291,7 +293,7 @@ QUANTISED_OPERATORS = [
 
 @contextmanager
 def _no_axis_warnings() -> Iterator[None]:
-    """Suppress the quantiser's warning that a vector, such as a norm's scale, has no second axis, which is right."""
+    """Suppress the quantiser's warning that a vector, such as a norm's scale, has no second axis: it needs none."""
 
     def other(record: logging.LogRecord) -> bool:
         return "is out-of-range for weight" not in record.getMessage()
@@ -312,8 +314,7 @@ def insert_scales_and_zero_points(
     `model`: float network.
     `ranges`: ranges of the model's tensors, ONNX Runtime's TensorsData.
     `overrides`: scales of weights by name, ONNX Runtime's `TensorQuantOverrides`.
-    `reduce_range`: whether weights have one bit less than 8. If all runtimes round alike, weights are even numbers of
-    steps, which takes one more bit.
+    `reduce_range`: whether weights have 7 bits instead of 8.
     `keep_float`: names of nodes that stay in float.
     """
     quantiser = QDQQuantizer(
@@ -372,7 +373,10 @@ def replace_ends_by_bytes(model: onnx.ModelProto) -> None:
 
 
 def _nhwc_to_real(inner: list[onnx.NodeProto], source: str, quantised: str) -> list[onnx.NodeProto]:
-    """Return nodes that dequantise and transpose the input, and make the other nodes read their output."""
+    """Return nodes that dequantise and transpose the input `source`.
+
+    The nodes `inner` are changed in place: they read the new nodes' output instead of dequantising `quantised`.
+    """
     readers = [node for node in inner if quantised in node.input]
     scale, zero_point = readers[0].input[1:3]
     nchw = readers[0].output[0]
