@@ -18,8 +18,22 @@ from scipy.spatial import cKDTree
 from trilane.arrays import F64
 from trilane.body.joints import JOINT_INDEX
 from trilane.errors import BadInputError
-from trilane.training.stitched import HEM_M, Stitched, long_hair, long_hair_weights, shoe, skirt, skirt_weights
-from trilane.training.surface import BodyArrays, Smoother, obscurance, shell, smoothstep, vertex_areas, vertex_normals
+from trilane.training.surface import (
+    HEM_M,
+    BodyArrays,
+    Smoother,
+    Stitched,
+    long_hair,
+    long_hair_weights,
+    obscurance,
+    shell,
+    shoe,
+    skirt,
+    skirt_weights,
+    smoothstep,
+    vertex_areas,
+    vertex_normals,
+)
 
 #: Key of the look's name in an avatar's provenance.
 KEY = "look"

@@ -22,8 +22,7 @@ from trilane.body.body import SKIN_KEY, load_body
 from trilane.errors import BadInputError
 from trilane.training.clothing import HANGING, Look, find_landmarks, look_named, nearest
 from trilane.training.first_texture import used_texels
-from trilane.training.stitched import ANGLES
-from trilane.training.surface import body_arrays
+from trilane.training.surface import ANGLES, body_arrays
 from trilane.writing import write_atomically
 
 #: Garments that are open above and below.

@@ -283,7 +283,7 @@ def calibrations(
     from rich.progress import track
     from rich.table import Table
 
-    from trilane.training.quantising.calibration_table import COUNTS, calibration_table, recommendation
+    from trilane.training.quantising.quantise import COUNTS, calibration_table, recommendation
 
     methods = method or CALIBRATION_METHODS
     console = stderr_console()
@@ -299,7 +299,7 @@ def calibrations(
     rows = list(track(table_rows, "quantising", steps, console=console, disable=not console.is_terminal))
     line = recommendation(rows)
     if plot is not None:
-        from trilane.training.quantising.calibration_table import plot_calibrations
+        from trilane.training.quantising.quantise import plot_calibrations
 
         plot_calibrations(rows, line, plot)
     if json:
@@ -323,7 +323,7 @@ def _material(source: Path | None, frames: Path | None, avatar: str | None) -> t
     Raises BadInputError for any other choice and for a bad file, and MissingPartError if a part for drawing is missing.
     """
     from trilane.avatars.network_file import parse_network
-    from trilane.training.quantising.calibration_table import COUNTS, EVALUATED
+    from trilane.training.quantising.quantise import COUNTS, EVALUATED
 
     if avatar is not None and source is None and frames is None:
         from trilane.apps.avatar_files import drawn_material

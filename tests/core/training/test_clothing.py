@@ -43,13 +43,14 @@ from trilane.training.random_views import (
     random_pose,
     random_view,
 )
-from trilane.training.stitched import ANGLES, shoe
 from trilane.training.surface import (
+    ANGLES,
     BodyArrays,
     Smoother,
     body_arrays,
     obscurance,
     shell,
+    shoe,
     smoothstep,
     vertex_areas,
     vertex_normals,

@@ -21,8 +21,7 @@ from trilane.training import hanging
 from trilane.training.clothing import DANCER, HANGING, find_landmarks
 from trilane.training.first_texture import used_texels
 from trilane.training.hanging import LINING_M, dressed_body, largest_rectangle
-from trilane.training.stitched import ANGLES
-from trilane.training.surface import BodyArrays, body_arrays, vertex_normals
+from trilane.training.surface import ANGLES, BodyArrays, body_arrays, vertex_normals
 
 DEFAULT_BODY = bundle_folder("default") / "body.npz"
 

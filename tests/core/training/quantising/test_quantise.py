@@ -15,11 +15,10 @@ import pytest
 from onnx import TensorProto, helper, numpy_helper
 
 from trilane.errors import BadInputError
-from trilane.training.quantising import calibration_table as table
+from trilane.training.quantising import quantise as table
 from trilane.training.quantising.calibration import saturated, share_ranges, widen
-from trilane.training.quantising.calibration_table import plot_calibrations
 from trilane.training.quantising.noise_model import _sqnr_db, layer_report
-from trilane.training.quantising.quantise import equalised, quantise
+from trilane.training.quantising.quantise import equalised, plot_calibrations, quantise
 from trilane.units import CALIBRATION_METHODS
 
 
