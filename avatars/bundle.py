@@ -313,7 +313,7 @@ def split_levels(packed: NDArray[Any] | None, width: int) -> list[NDArray[Any]]:
 
 
 def check_levels(packed: NDArray[Any], texture: NDArray[Any], where: object) -> None:
-    """Raise BadInputError if `packed` cannot have the levels of `texture` (H,W,C): wrong shape, or another dtype.
+    """Raise BadInputError if `packed` cannot hold the levels of `texture` (H,W,C): wrong shape, or another dtype.
 
     `packed`: array from `pack_levels`.
     `where`: file that the error names.

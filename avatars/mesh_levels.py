@@ -82,7 +82,7 @@ class MeshLevel:
 
     @cached_property
     def least_m(self) -> float:
-        """The largest distance at rest, in metres. In no pose is `metres` less."""
+        """The largest distance at rest, in metres; `metres` is never less, in any pose."""
         return float(self.rest.max())
 
     def reduced(self, shaped: ShapedBody) -> ShapedBody:
@@ -179,7 +179,7 @@ def save_mesh_levels(file: Path | BinaryIO, shaped: ShapedBody, levels: Sequence
 
 
 def read_mesh_levels(path: Path, shaped: ShapedBody) -> tuple[MeshLevel, ...]:
-    """Return the levels of the mesh in the file `path`, finest first. `shaped`: body of which they must be.
+    """Return the levels of the mesh in the file `path`, finest first. `shaped`: body to which they must belong.
 
     Raises BadInputError if the file is missing or damaged, is for another body, or has impossible numbers.
     """

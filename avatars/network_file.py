@@ -103,7 +103,7 @@ def constants_of(model: onnx.ModelProto) -> Mapping[str, TensorProto]:
 
 
 def check_integer_layers(network: IntegerNetwork) -> None:
-    """Raise BadInputError if a layer has inputs that are not dequantised integers. Layers of `float_layers` may."""
+    """Raise BadInputError if a layer that `float_layers` does not list has inputs that are not dequantised integers."""
     makers = {out: node for node in network.model.graph.node for out in node.output}
     float_layers = []
     for node in network.model.graph.node:

@@ -199,10 +199,10 @@ class SizeLoss:
     curve: tuple[tuple[int, int], ...] = ()
 
     def at(self, work: int) -> float | None:
-        """Return the loss in dB of a tensor with `work` thousandths of the largest tensor's pixels.
+        """Return the loss in dB of a tensor with `work` thousandths of the full size's pixels.
 
-        Return 0 for the full size, else the loss at the next smaller size that was measured; None if no smaller size
-        was measured.
+        The loss is 0 at the full size. For another size, it is the loss at the next smaller size that was measured;
+        None if no smaller size was measured. Without figures, the result is None.
         """
         if work >= WHOLE and self.by_work:
             return 0.0
@@ -240,8 +240,9 @@ def size_loss(bundle: Bundle, avatars: int) -> SizeLoss:
 
 
 def curve_of(table: Mapping[int, Mapping[int, float]], tolerance: float) -> tuple[tuple[int, int], ...]:
-    """Return the smallest tensor that is large enough by `table`, as (pixels of the picture, pixels of the tensor).
+    """Return, for each body in `table`, (pixels of the picture that it covers, pixels of the smallest tensor for it).
 
+    Between measured tensors, PSNR is linear in the logarithm of the side.
     `table`: PSNR in dB, as `BySize.psnr_db_by_picture`. `tolerance`: most that a tensor loses against the best, dB.
     """
     curve: list[tuple[int, int]] = []
@@ -256,7 +257,7 @@ def curve_of(table: Mapping[int, Mapping[int, float]], tolerance: float) -> tupl
 
 
 def psnr_at(row: Mapping[int, float], pixels: float) -> float | None:
-    """Return the PSNR in dB of a tensor of `pixels`, interpolated in their logarithm; None for one beyond `row`."""
+    """Return the PSNR in dB of a tensor of `pixels`, interpolated in their logarithm; None if outside `row`."""
     sides = sorted(row)
     if not sides[0] ** 2 <= pixels <= sides[-1] ** 2:
         return None

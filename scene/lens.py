@@ -66,7 +66,7 @@ def cover(picture: Shape, output: Shape) -> PictureCut:
 class Lens:
     """A lens without distortion: x = `cx` + `fx` X / Z, y = `cy` + `fy` Y / Z, with Y down and Z ahead.
 
-    `width_px`, `height_px`: size of the picture. `fx`, `fy`, `cx`, `cy`: numbers of pixels of this picture.
+    `width_px`, `height_px`: size of the picture. `fx`, `fy`: focal lengths, and `cx`, `cy`: principal point, pixels.
     `known`: what is known of the lens.
     """
 
@@ -188,7 +188,7 @@ class Lens:
 def centred(width_px: float, height_px: float, focal_px: float, known: Known = Known.ALL) -> Lens:
     """Return a lens with square pixels, whose principal point is the middle of its picture.
 
-    `focal_px`: both focal lengths, pixels. The other parameters are those of `Lens`.
+    `focal_px`: both focal lengths, pixels. The other parameters are as in `Lens`.
     """
     return Lens(width_px, height_px, focal_px, focal_px, width_px / 2, height_px / 2, known)
 
@@ -196,7 +196,7 @@ def centred(width_px: float, height_px: float, focal_px: float, known: Known = K
 def of_opencv(width_px: float, height_px: float, fx: float, fy: float, cx: float, cy: float) -> Lens:
     """Return a lens from numbers of OpenCV or Kalibr, which count `cx` and `cy` from the centre of the first pixel.
 
-    The parameters are otherwise those of `Lens`.
+    The other parameters are as in `Lens`.
     """
     return Lens(width_px, height_px, fx, fy, cx + 0.5, cy + 0.5)
 
@@ -241,7 +241,7 @@ LEAST_BEND_PX = 0.5
 def measured_lens(where: str | Path, width_px: float, height_px: float, numbers: F64) -> Lens:
     """Return the lens of a file. `numbers` (4,): fx, fy, cx, cy in pixels of a picture of `width_px` x `height_px`.
 
-    Raises BadInputError about `where` when the numbers are not those of a lens.
+    Raises BadInputError about `where` unless the numbers are positive and `checked_lens` accepts them.
     """
     if not (np.isfinite(numbers).all() and (numbers > 0).all()):
         raise BadInputError(where, "a lens whose numbers are not all positive", "fx, fy, cx and cy in pixels")
@@ -250,7 +250,10 @@ def measured_lens(where: str | Path, width_px: float, height_px: float, numbers:
 
 
 class Bent(NamedTuple):
-    """A lens with distortion. `parameters`: values of k1 to k6, p1 and p2, by name; missing parameters are 0."""
+    """A lens with distortion. `parameters`: values of k1 to k6, p1 and p2, by name; missing parameters are 0.
+
+    `is_fisheye`: whether distortion follows OpenCV's fisheye model.
+    """
 
     lens: Lens
     parameters: Mapping[str, float]

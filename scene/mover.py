@@ -82,7 +82,7 @@ def outline(body: ShapedBody, joints: Collection[str] = JOINT_NAMES) -> BodyOutl
 
 
 def feet(body: ShapedBody) -> BodyOutline:
-    """Return all vertices that ankles and toes move most. All are kept so that feet stand exactly on the floor."""
+    """Return an outline of all vertices that ankles and toes move most, so that feet stand exactly on the floor."""
     return _of(body, np.flatnonzero(np.isin(body.body.weights.argmax(axis=1), [JOINT_INDEX[name] for name in FEET])))
 
 

@@ -17,7 +17,7 @@ budget, and the least dense tensor sets its density.
 **Mesh.** An avatar whose surface may be off by less than the error budget is drawn with fewer triangles. `hold_mesh`
 keeps a level while it is good enough, and goes to coarser levels step by step.
 
-**Changes.** A change of shape is visible, so its cost is that of the pixels of `PATIENCE` frames. Before the run,
+**Changes.** A change of shape is visible, so it costs as much as the pixels of `PATIENCE` frames. Before the run,
 `foreseen_changes` finds the changes that cost least. Each is made while both shapes are good, and preferably while
 nobody is visible or the scene moves fast. If a frame's shape is not good enough, the frame gets a good shape at once,
 whatever was foreseen. If nothing was foreseen, a smaller shape is taken after `PATIENCE` frames in which it would have
@@ -56,9 +56,9 @@ class FrameWork(IntEnum):
 
 
 def shown_by(arrays: Iterable[Floats]) -> bytes:
-    """Return, as bytes to compare, everything that the picture of the avatars depends on.
+    """Return `arrays` as bytes to compare.
 
-    `arrays`: these values; their number and shapes never change during a run.
+    `arrays`: everything on which the avatars' picture depends; number and shapes never change during a run.
     """
     return b"".join(array.tobytes() for array in arrays)
 
@@ -66,11 +66,12 @@ def shown_by(arrays: Iterable[Floats]) -> bytes:
 def work_of(
     shown: bytes, of_picture: bytes | None, of_nobody: bytes | None, is_anybody_seen: Callable[[], bool]
 ) -> FrameWork:
-    """Return the work for a frame that shows `shown`, as bytes of `shown_by`.
+    """Return the work for a frame.
 
-    `of_picture`: what the frame of the present picture showed; None before the first picture.
-    `of_nobody`: what the last frame without anybody showed; None before the first such frame.
-    `is_anybody_seen`: finds out whether an avatar is on the screen; called only if the bytes do not decide.
+    `shown`: bytes of `shown_by` for this frame.
+    `of_picture`: the bytes for the frame of the present picture; None before the first picture.
+    `of_nobody`: the bytes for the last frame without anybody; None before the first such frame.
+    `is_anybody_seen`: function that returns whether an avatar is on the screen; called only if bytes do not decide.
     """
     if shown == of_picture:
         return FrameWork.REUSE
@@ -220,8 +221,8 @@ def _fits(
 def _held(good: Sequence[Shape], before: HeldShape | None, foreseen: Shape | None) -> HeldShape:
     """Return the shape to use, one of `good`.
 
-    A foreseen shape is taken once, as soon as it is good. Otherwise the held shape stays while it is good. If it is
-    not, the smallest good shape is taken.
+    A foreseen shape is taken once, as soon as it is good. Otherwise the held shape stays while it is good; if it is
+    not, the smallest good shape is taken. If none was foreseen, a smaller good shape is taken after `PATIENCE` frames.
     """
     last = before.foreseen if before is not None else None
     is_kept = before is not None and before.shape in good
@@ -269,8 +270,8 @@ def foreseen_changes(
     `budget`: number of pixels that a tensor may have.
     `networks`: number of the network of each avatar of the scene; empty if one network paints all.
 
-    The result is the cheapest sequence of good shapes in pixels: the pixels of all frames, plus the cost of the
-    changes. If a shape is not good at a look, the next shape begins in the first frame after the look before.
+    The result is the sequence of good shapes that costs least: the pixels of all frames, plus the cost of the changes.
+    If a shape is not good in an examined frame, the next shape begins right after the examined frame before.
     """
     order = sorted(shapes, key=lambda shape: (area(shape), shape))
     costs, origins, needed = dict.fromkeys(order, 0.0), [], []
@@ -324,6 +325,7 @@ def _speed(before: LookAhead, now: LookAhead) -> float:
 def ideal_shape(rects: Sequence[Rect], output: Shape, budget: TensorBudget, networks: Sequence[int] = ()) -> Shape:
     """Return the shape within the budget that gives the avatars at `rects` the highest density; if equal, the smallest.
 
+    If no shape has room for all avatars, the largest shape is returned.
     `networks`: number of the network of each avatar at `rects`; empty if one network paints all.
     """
     pixels = pixels_of(rects, networks, output, budget)
@@ -402,7 +404,7 @@ def joined(first: ShapeSet, second: ShapeSet) -> ShapeSet:
 
 
 def larger_shapes(shapes: Sequence[Shape], most_pixels: int) -> list[Shape]:
-    """Return each new shape that just contains two of `shapes`, of at most `most_pixels`; the smallest first."""
+    """Return the smallest shapes that contain two of `shapes`, if new and of at most `most_pixels`; smallest first."""
     both = {(max(a[0], b[0]), max(a[1], b[1])) for a, b in combinations(shapes, 2)}
     return sorted((shape for shape in both - set(shapes) if area(shape) <= most_pixels), key=area)
 

@@ -1,7 +1,7 @@
 """Scene files (TOML): their schema, how they are loaded, and a message about the first error.
 
 The schema checks types and ranges; the loaders check whether a named file exists and what it contains. The values of a
-scene file never change, except that its paths are made absolute.
+scene file never change, except that its paths are made absolute. The file's name replaces a missing `name`.
 """
 
 from __future__ import annotations
@@ -443,7 +443,7 @@ def _field(loc: tuple[int | str, ...]) -> FieldInfo:
 
 
 def _table_of(loc: tuple[int | str, ...]) -> type[BaseModel]:
-    """Return the model of the table of the key at `loc`, pydantic's path of a key."""
+    """Return the model of the table that has the key at `loc`, the path by which pydantic names the key."""
     table: type[BaseModel] = Scene
     for key in loc[:-1]:
         if isinstance(key, str):

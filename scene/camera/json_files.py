@@ -51,8 +51,8 @@ NERF = "a NeRF transforms.json: `frames`, each with a 4x4 `transform_matrix`"
 DEFAULT_ANGLE_X = math.radians(50.0)
 DEFAULT_ASPECT = 4 / 3
 MAX_FRAMES = 100_000
-#: A matrix with columns of unit length is singular if its determinant is below this; that of a rotation is 1. A distant
-#: position makes it smaller: 1e-5 at 100 km.
+#: A matrix with columns of unit length is singular if its determinant is below this. A rotation has 1; a position far
+#: away makes the determinant smaller, 1e-5 at 100 km.
 LEAST_DETERMINANT = 1e-9
 LENS_KEYS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -206,7 +206,7 @@ def _by_angle(
 ) -> tuple[Lens, str]:
     """Return (lens of a file without focal lengths, source of its angles in words).
 
-    `width`, `height`: pixels; angles: radians; None if the file does not state it.
+    `width`, `height`: pixels. `angle_x`, `angle_y`: radians. Each is None if the file does not state it.
     """
     angles = {"camera_angle_x": angle_x, "camera_angle_y": angle_y}
     source = f"by {' and '.join(f'`{key}`' for key, value in angles.items() if value)}"

@@ -167,10 +167,9 @@ SENSOR_KEYS = {"data": 16, "resolution": 2, "intrinsics": 4, "distortion_coeffic
 def load_euroc(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
     """Read EuRoC MAV poses, `data.csv`: time in nanoseconds, position, quaternion `w, x, y, z`, then any other columns.
 
-    The poses are those of the device's body. `cam0/sensor.yaml` next to the file's folder leads to the camera; without
-    it, the body's axes are used. Camera axes are optical; the world's Z is up. `clock`: what the scene says about the
-    times.
-    Raises BadInputError with the line.
+    The poses belong to the device's body. `cam0/sensor.yaml` next to the file's folder states the camera's pose on the
+    body; without this file, the body's poses are taken for the camera's. Camera axes are optical; the world's Z is up.
+    `clock`: what the scene says about the times. Raises BadInputError with the line.
     Format: M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
     """
     poses = read_pose_table(path, clock, EUROC_NAMES, EUROC, may_have_more=True)
