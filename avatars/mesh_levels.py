@@ -15,13 +15,14 @@ where k is b or below b, it moves d - y_b. Therefore the distance is at most
 
 for any k. Between the places where edges of the two meshes cross in the texture, both points are linear functions of
 the texel. Therefore the distance is largest at one of two kinds of places: where edges cross, or at a vertex that lies
-in a triangle of the level but is not its corner (left out, or in a fold of the level). `training/mesh_levels.py`
-evaluates the terms at these places, one row for each place. Pose blend shapes move a vertex by at most r_v = sum_b r_vb
-|R_b - I|, which adds sum |e_v| r_v. Rows are joined in groups: a group has the largest value of each term.
+in a triangle of the level but is not its corner. The level leaves out such a vertex, or has a fold there.
+`training/mesh_levels.py` evaluates the terms at these places, one row for each place. Pose blend shapes move a vertex
+by at most r_v = sum_b r_vb |R_b - I|, which adds sum |e_v| r_v. Rows are joined in groups: a group has the largest
+value of each term.
 
-A bundle has its levels in `mesh-levels.npz`. Rule: this file identifies the body for which the levels were made, by a
-digest of the body's stored arrays and by samples of its computed arrays. For any other body the bounds would be wrong,
-and the file is refused. An avatar without this file has one level, its whole mesh.
+A bundle has its levels in `mesh-levels.npz`. Rule: this file identifies the body for which the levels were made. For
+that, it has a digest of the body's stored arrays and samples of its computed arrays. For any other body the bounds
+would be wrong, and the file is refused. An avatar without this file has one level, its whole mesh.
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ def accuracy_of(bundle: Bundle, drawn: DrawnAs) -> dict[str, Any]:
     """Return the figures of the avatar's image error that hold for a run that draws the avatar as `drawn`.
 
     Keys: `source`, which names the validation and its date; `runtime`, `size`; the keys of `AccuracyFigures`. If no
-    figure holds, the keys are those of `refused`: `source`, `changed`, `why`.
+    figure holds, the keys are `source`, `changed` and `why`, as in `refused`.
 
     Raises BadInputError for a file that cannot be read.
     """
@@ -211,7 +211,7 @@ class SizeLoss:
 
 
 def tolerance_db(avatars: int) -> float:
-    """Return the tolerance of `curve_of`, in dB, for so many `avatars` that share a network."""
+    """Return the tolerance for `curve_of`, in dB. `avatars`: number of avatars that share a network."""
     return TOLERANCE_DB if avatars == 1 else SHARED_TOLERANCE_DB
 
 

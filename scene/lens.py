@@ -23,7 +23,7 @@ import numpy as np
 from trilane.arrays import F64, Shape
 from trilane.errors import BadInputError
 
-#: Size of the picture of a lens of which only an angle is known.
+#: Assumed size of the picture if only an angle of the lens is known.
 ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX = 640.0, 480.0
 
 
@@ -171,8 +171,8 @@ class Lens:
     def projection(self, near_m: float, far_m: float) -> F64:
         """Return the OpenGL clip matrix (4, 4) of a camera with y up that looks along -Z.
 
-        `near_m`, `far_m`: distances of the clip planes. In NDC, x / w = 2 (cx + fx X / -Z) / width - 1 and y / w = 1 -
-        2 (cy - fy Y / -Z) / height.
+        `near_m`, `far_m`: distances of the clip planes, metres. The matrix gives, in NDC:
+        x / w = 2 (cx + fx X / -Z) / width - 1; y / w = 1 - 2 (cy - fy Y / -Z) / height.
         """
         depth = near_m - far_m
         return np.array(
@@ -202,13 +202,13 @@ def of_opencv(width_px: float, height_px: float, fx: float, fy: float, cx: float
 
 
 def of_fov_y(fov_y_deg: float) -> Lens:
-    """Return a lens of which only the field of view over the picture's height is known: `fov_y_deg` degrees."""
+    """Return a lens with only one known number: the field of view over the picture's height, `fov_y_deg` degrees."""
     focal = ASSUMED_HEIGHT_PX / 2 / math.tan(math.radians(fov_y_deg) / 2)
     return centred(ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX, focal, Known.HEIGHT)
 
 
 def of_fov_x(fov_x_deg: float) -> Lens:
-    """Return a lens of which only the field of view over the picture's width is known: `fov_x_deg` degrees."""
+    """Return a lens with only one known number: the field of view over the picture's width, `fov_x_deg` degrees."""
     focal = ASSUMED_WIDTH_PX / 2 / math.tan(math.radians(fov_x_deg) / 2)
     return centred(ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX, focal, Known.WIDTH)
 

@@ -127,9 +127,9 @@ def hold_mesh(errors_px: Sequence[float], budget_px: float, before: HeldMesh | N
     `budget_px`: error budget.
     `before`: level of the frame before, None for the first frame.
 
-    The first frame takes the coarsest level within the budget. A level beyond the budget is left at once, for the
-    coarsest finer level within the budget. Coarser levels are taken one by one, each after `PATIENCE` frames in which
-    its bound was well within the budget.
+    The first frame takes the coarsest level within the budget. If the level in use exceeds the budget, the coarsest of
+    the finer levels within the budget replaces it at once. Coarser levels are taken one by one, each after `PATIENCE`
+    frames in which its bound was well within the budget.
     """
     within = [level for level, error in enumerate(errors_px) if error <= budget_px]
     if before is None:
@@ -250,7 +250,7 @@ class LookAhead:
     def networks(self, of_all: Sequence[int]) -> list[int]:
         """Return the number of each visible avatar's network.
 
-        `of_all`: number of each avatar's network; empty if one network paints all, and so is the result.
+        `of_all`: number of each avatar's network. If one network paints all, it is empty, and the result is empty too.
         """
         return [of_all[number] for number in self.rects] if of_all else []
 
@@ -300,7 +300,7 @@ def _cheapest_way(
 ) -> tuple[float, Shape]:
     """Return the least cost, in pixels, of a sequence of shapes that ends with `shape`, and the shape before it.
 
-    Pixels of the frames after this look do not count yet. `costs`: the least cost up to the look before, by last shape.
+    Pixels from this examined frame on do not count yet. `costs`: least cost up to the examined frame before, by shape.
     `fits`: layout of each shape with room for the avatars. `price`: least cost of a change of shape, in pixels.
     """
 
@@ -404,7 +404,7 @@ def joined(first: ShapeSet, second: ShapeSet) -> ShapeSet:
 
 
 def larger_shapes(shapes: Sequence[Shape], most_pixels: int) -> list[Shape]:
-    """Return the smallest shapes that contain two of `shapes`, if new and of at most `most_pixels`; smallest first."""
+    """Return new shapes that each just contain two of `shapes`, of at most `most_pixels` pixels; smallest first."""
     both = {(max(a[0], b[0]), max(a[1], b[1])) for a, b in combinations(shapes, 2)}
     return sorted((shape for shape in both - set(shapes) if area(shape) <= most_pixels), key=area)
 

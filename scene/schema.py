@@ -403,7 +403,7 @@ BUILT_IN = (ROOM, *AVATARS)  # names of a background and of avatars
 
 
 def bad_input(where: str | Path, error: ValidationError) -> BadInputError:
-    """Return a BadInputError about the first defect in `error`. Its place is the file `where` with the key."""
+    """Return a BadInputError about the first defect in `error`. It names the file `where` and the key."""
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"])
     place = f"{where}: {key}" if key else str(where)

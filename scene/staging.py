@@ -199,7 +199,7 @@ ENOUGH = 0.5
 MOST_JUDGED = 120
 #: Weight of the person's share of the picture's height, against the share of frames: it only breaks ties.
 HEIGHT_WEIGHT = 0.01
-#: Axes of poses that are tried: those of cameras (optical and OpenGL), of robots and of aircraft.
+#: Axes of poses that are tried: for cameras (optical and OpenGL), for robots and for aircraft.
 LIKELY_AXES = ("right-down-forward", "right-up-back", "forward-left-up", "forward-right-down")
 #: Factors on the unit of length that are tried.
 FACTORS = (0.3, 0.1, 0.03, 3.0, 10.0)

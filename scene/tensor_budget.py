@@ -1,7 +1,7 @@
 """The number of pixels that a frame's tensor may have, and the largest density of the avatars in it.
 
 Rule: measured figures decide where there are any. Without them, an avatar has the pixels for which its network was
-trained, or as many as the picture shows if that is more, within fixed limits (docs/decisions/planner.md).
+trained, or as many as the picture shows if that is more. Fixed limits apply (docs/decisions/planner.md).
 """
 
 from __future__ import annotations

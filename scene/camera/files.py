@@ -317,7 +317,7 @@ def _signs(matrices: F64, up_axis: str, times: F64 | None) -> dict[str, tuple[st
     `times` (N,): times of the table; None if it has no times.
 
     A camera of KITTI looks along +Z, and its Y is down. A camera of ARKit looks along -Z, and its Y is up. A device is
-    upright if its X is nearer to the vertical than its Y.
+    upright if its X is nearly vertical, and more so than its Y.
 
     With and without times, these features count for both formats: the camera moves along its view, or it looks at one
     point. If the device is not upright, the direction of Y also counts. Here AUTO allows KITTI both axes, and ARKit

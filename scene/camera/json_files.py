@@ -120,7 +120,7 @@ def _nerf_lenses(path: Path, content: Mapping[str, Any], frames: Sequence[Any]) 
 def _distortion(
     path: Path, content: Mapping[str, Any], frames: Sequence[Any], lenses: Sequence[Lens]
 ) -> tuple[str, ...]:
-    """Return a note on the largest distortion of `lenses`, which is left out; () below LEAST_BEND_PX pixels."""
+    """Return a note on the largest distortion of `lenses`, which is not drawn; () below LEAST_BEND_PX pixels."""
     bent = []
     for lens, frame in zip(lenses, frames, strict=False):  # a single lens stands for all frames
         keys = {**content, **frame}

@@ -261,7 +261,7 @@ def find_upright(turns: F64, usual: str, is_levelled: bool, stated: str = AUTO) 
 
 
 def price_of(turns: F64, usual: str) -> float:
-    """Return the cost of the cheapest guess at up for cameras `turns` (N, 3, 3); infinite without any guess.
+    """Return the least cost of any up direction for cameras `turns` (N, 3, 3); infinite if none fits.
 
     The cost is 0 for cameras that are level if the axis `usual` is up.
     """
@@ -269,9 +269,9 @@ def price_of(turns: F64, usual: str) -> float:
 
 
 def price_of_horizons(turns: F64) -> float:
-    """Return the cost of the cheapest guess at up for cameras `turns` (N, 3, 3), by their horizons alone.
+    """Return the least cost of any up direction for cameras `turns` (N, 3, 3), by their horizons alone.
 
-    The guesses are all axes of the world and all quarter turns of the picture.
+    All axes of the world and all quarter turns of the picture are tried. The cost is infinite if none fits.
     """
     return min((guess.price for guess in _guesses(turns, "y", FREE, AUTO)), default=math.inf)
 

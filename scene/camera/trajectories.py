@@ -42,8 +42,8 @@ PHONE = centred(1920, 1080, 540 / math.tan(math.radians(18.0)), Known.LONG)
 def load_arkit(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
     """Read an ARKit log: `time r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz` per line, camera to world, metres, Y up.
 
-    The camera's axes are those of the sensor in landscape (x right, y up, looks along -Z). `clock`: what the scene says
-    about the times. Raises BadInputError with the line.
+    The camera's axes belong to the sensor in landscape (x right, y up, looks along -Z). The time may be missing.
+    `clock`: what the scene says about the times. Raises BadInputError with the line.
     """
     read = read_matrix_table(path, clock, ARKIT)
     count = len(read.turns)

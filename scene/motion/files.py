@@ -265,7 +265,7 @@ def load_motion(spec: AvatarSpec, base: Path, rest: F64 = T_POSE) -> Motion:
     """Load the motion that `spec.motion` names, as `spec` plays it.
 
     `base`: folder at which a relative path starts.
-    `rest` (55, 3): rest joints of the avatar that performs the motion, metres; by default those of a plain body.
+    `rest` (55, 3): rest joints of the avatar that performs the motion, metres; by default a plain body's.
     Raises BadInputError when there is no such motion, or when the file is unusable.
     """
     if spec.motion.startswith(BUILT_IN_PREFIX):

@@ -1,6 +1,6 @@
 """Tracks of named joints over time, and rotations computed from them: the input of retargeting, from any file.
 
-Names are those of the SMPL-X joints. Unit and axes are the file's own, and equal in all arrays. Positions alone tell in
+Joints have their SMPL-X names. Unit and axes are the file's own, and equal in all arrays. Positions alone tell in
 which frames the person stands, and whether a skeleton is built like the avatar's. The file's zero pose does not matter.
 
 **Trunk.** Hip line, trunk line and shoulder line define coordinate frames, in the same way for the recording and for
@@ -233,7 +233,7 @@ def mean_turn(turns: F64) -> F64:
 
 
 def level_with(turns: F64, base: F64, where: NDArray[np.bool_]) -> F64:
-    """Return `turns` (T, 3, 3) after one constant rotation that makes their mean equal to that of `base` (T, 3, 3).
+    """Return `turns` (T, 3, 3) after one constant rotation that makes their mean equal to the mean of `base` (T, 3, 3).
 
     `where` (T,): frames over which the means are taken.
     """
