@@ -97,9 +97,7 @@ def grouped(rest: F64, swing: F64, blend: F64) -> tuple[F32, F32, F32]:
 
     A row that cannot have the largest sum in any pose is left out. The rows are sorted by the joints of their two
     largest swings, and then by their largest sum. Groups of neighbours become one row with the largest value of each
-    term.
-
-    `rest`: (P,), `swing`, `blend`: (P,54): terms of P rows, as in `MeshLevel`.
+    term. `rest` (P,), `swing` and `blend` (P,54): terms of P rows, as in `MeshLevel`.
     """
     most = rest + 2.0 * swing.sum(axis=1) + 2.0 * np.sqrt(2.0) * blend.sum(axis=1)
     matters = most >= rest.max()

@@ -297,7 +297,6 @@ def reshaped(network: NetworkFile, height: int, width: int, batch: int = 1) -> N
 
     `height`, `width`: size of the input in pixels, multiples of BUCKET_STEP.
     `batch`: number of frames that are inferred together.
-
     Raises BadInputError if the graph cannot run at this shape.
     """
     if height % BUCKET_STEP or width % BUCKET_STEP or min(height, width, batch) < 1:

@@ -76,7 +76,6 @@ def split(network: NetworkFile, at: Sequence[str]) -> list[NetworkPart]:
     """Return the parts of `network` between the cuts `at`, in order.
 
     `at`: names of cuts, in the order of the network's nodes.
-
     Raises BadInputError for an unknown cut, and for cuts in another order.
     """
     known = {cut.at: cut for cut in cuts(network)} if at else {}

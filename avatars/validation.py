@@ -66,7 +66,6 @@ def accuracy_of(bundle: Bundle, drawn: DrawnAs) -> dict[str, Any]:
 
     Keys: `source`, which names the validation and its date; `runtime`, `size`; the keys of `AccuracyFigures`. If no
     figure holds, the keys are `source`, `changed` and `why`, as in `refused`.
-
     Raises BadInputError for a file that cannot be read.
     """
     validation = bundle.manifest.validation
@@ -102,12 +101,8 @@ def validation_facts(bundle: Bundle) -> dict[str, Any] | None:
 def refused(bundle: Bundle) -> dict[str, Any]:
     """Return the reason why no figure of the manifest may be shown; empty if they may be shown.
 
-    Keys:
-    `source`: `NO_FIGURES`.
-    `changed`: keys of `PARTS` that were changed since the validation.
-    `why`: the reason as a sentence.
-
-    Raises BadInputError for a file that cannot be read.
+    Keys: `source`, which is `NO_FIGURES`; `why`, the reason as a sentence; `changed`, the keys of `PARTS` that were
+    changed since the validation. Raises BadInputError for a file that cannot be read.
     """
     validation = bundle.manifest.validation
     if bundle.manifest.provenance.get("weights") == UNTRAINED:

@@ -185,7 +185,6 @@ def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies
     """Return the camera of `scene` at its place. A recorded camera films the avatars; a built-in camera goes along.
 
     A camera stays where it is if `scene.camera.place` is `none`.
-
     `path`: path of the camera.
     `scene`: its background, picture size and camera keys are used.
     `movers`: avatars of the scene. `bodies`: their bodies, in the same order.

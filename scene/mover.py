@@ -68,7 +68,6 @@ def outline(body: ShapedBody, joints: Collection[str] = JOINT_NAMES) -> BodyOutl
     """Return the outline of `body`: for each joint, the outermost vertex in each of DIRECTIONS.
 
     Only vertices that no other joint moves more count for a joint.
-
     `joints`: names of the joints whose vertices are taken.
     """
     weights, rest = body.body.weights, body.vertices.astype(np.float64)

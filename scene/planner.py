@@ -178,7 +178,6 @@ def plan_tensor(
 
 
 def _grouped(rects: Sequence[Rect], networks: Sequence[int]) -> list[list[Rect]]:
-    """Return the rectangles of the avatars of each network."""
     return [[rects[place] for place in places] for places in by_network(networks or [0] * len(rects))]
 
 

@@ -438,7 +438,6 @@ def _remedy(first: Mapping[str, Any]) -> str:
 
 
 def _field(loc: tuple[int | str, ...]) -> FieldInfo:
-    """Return the pydantic field of the key at `loc`."""
     return _table_of(loc).model_fields[str(loc[-1])]
 
 

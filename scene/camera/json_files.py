@@ -68,7 +68,6 @@ def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
     A frame may have its own lens; otherwise the lens of the file holds. A lens is an angle, or `fl_x`, `fl_y`, `cx`,
     `cy` in pixels of `w` x `h`. Distortion is left out and noted. nerfstudio makes such files from the exports of
     Polycam and Record3D.
-
     `rate_hz`: frames a second by the scene; None if the scene does not say. Raises BadInputError that names the key.
     Format: https://docs.nerf.studio/quickstart/data_conventions.html.
     """
@@ -242,7 +241,6 @@ def load_record3d(path: Path, rate_hz: float | None = None) -> RawCamera:
 
     The world is ARKit's: levelled, Y up, metres. The lens is `perFrameIntrinsicCoeffs` (fx, fy, cx, cy), or else `K`,
     column by column, in pixels of `w` x `h`. Times are `frameTimestamps`, or else follow from `fps`.
-
     `rate_hz`: frames a second by the scene; None if the scene does not say. Raises BadInputError that names the key.
     Format: keys of the exports of https://record3d.app, as nerfstudio's `process_data/record3d_utils.py` reads them.
     """

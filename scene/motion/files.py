@@ -288,7 +288,6 @@ def load_motion(spec: AvatarSpec, base: Path, rest: F64 = T_POSE) -> Motion:
 
 
 def _of_no_reader(path: Path) -> BadInputError:
-    """Return the error for a file whose suffix has no reader."""
     expected = f"a motion file: {', '.join(_READERS)}"
     try:
         require_file(path, expected)

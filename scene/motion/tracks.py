@@ -136,7 +136,6 @@ def planted_frames(tracks: Tracks, side: str, foot: F64, up: F64) -> NDArray[np.
     """Return a mask (T,) of the frames in which a foot most likely lies flat.
 
     Such a foot hardly moves, and its leg is below the hip.
-
     `side`: `left` or `right`. `foot` (T, 3): vector from the ankle to the toes. `up` (3,): up direction of the
     recording.
     """
