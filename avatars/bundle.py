@@ -75,9 +75,7 @@ class Bundle:
     def read_mesh_levels(self, shaped: ShapedBody) -> tuple[MeshLevel, ...]:
         """Return the coarser levels of the mesh, finest first; empty if the bundle has no file of levels.
 
-        `shaped`: body of this bundle, from `shaped_body`.
-
-        Raises BadInputError.
+        `shaped`: body of this bundle, from `shaped_body`. Raises BadInputError.
         """
         file = self.manifest.mesh_levels
         return () if file is None else read_mesh_levels(self.folder / file, shaped)
@@ -111,9 +109,7 @@ class Bundle:
 def read_texture(path: Path, channels: int) -> NDArray[np.float32]:
     """Return the neural texture (H, W, `channels`) float32 in the file `path`, with row 0 at v = 0.
 
-    `channels`: number of channels that the texture must have.
-
-    Raises BadInputError.
+    `channels`: number of channels that the texture must have. Raises BadInputError.
     """
     arrays = read_npz(path, TEXTURE_KEYS, "a neural texture")
     if "texture" not in arrays:
@@ -313,7 +309,7 @@ def split_levels(packed: NDArray[Any] | None, width: int) -> list[NDArray[Any]]:
 
 
 def check_levels(packed: NDArray[Any], texture: NDArray[Any], where: object) -> None:
-    """Raise BadInputError if `packed` cannot have the levels of `texture` (H,W,C): wrong shape, or another dtype.
+    """Raise BadInputError if `packed` cannot hold the levels of `texture` (H,W,C): wrong shape, or another dtype.
 
     `packed`: array from `pack_levels`.
     `where`: file that the error names.

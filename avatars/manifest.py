@@ -50,7 +50,7 @@ class _Model(BaseModel):
 
 
 class _Figures(_Model):
-    """Figures of which some may not be measured: these are None and not written."""
+    """Figures; a figure that was not measured is None and not written."""
 
     @model_serializer(mode="wrap")
     def _known(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
@@ -133,7 +133,7 @@ class AccuracyFigures(_Figures):
     `see_through`: share of the pixels inside the person whose alpha is less than 0.9.
     `iou`, `ssim`: means over the views, of the masks and of the pictures.
 
-    All further keys are those of `summary` in `training/image_error.py`. A key that was not measured is None and not
+    All further keys come from `summary` in `training/image_error.py`. A key that was not measured is None and not
     written. If `psnr_db_by_background` is None, an older Trilane measured the figures in front of a single grey.
     """
 
@@ -190,8 +190,9 @@ class BySize(_Figures):
     """Image error by size of the tensor, at the density of the picture: the planner's table.
 
     `date`: date in UTC. `runtime`: runtime that ran the network. `seed`, `per_band`, `held_out`: choice of the views.
-    `psnr_db_by_picture`: for bodies that cover side x side pixels of the picture, and tensors of side x side pixels:
-    mean PSNR in dB inside the bounding box of the true mask, by the two sides. All rows have the same tensors.
+    `psnr_db_by_picture`: mean PSNR in dB inside the bounding box of the true mask, by two sides, in pixels. The first
+    side is for bodies that cover side x side pixels of the picture, the second for tensors of side x side pixels. All
+    rows have the same tensors.
     `psnr_db`: what an older Trilane measured instead: PSNR by HEIGHTxWIDTH of the tensor, the network's own size first.
     """
 

@@ -15,13 +15,14 @@ where k is b or below b, it moves d - y_b. Therefore the distance is at most
 
 for any k. Between the places where edges of the two meshes cross in the texture, both points are linear functions of
 the texel. Therefore the distance is largest at one of two kinds of places: where edges cross, or at a vertex that lies
-in a triangle of the level but is not its corner (left out, or in a fold of the level). `training/mesh_levels.py`
-evaluates the terms at these places, one row for each place. Pose blend shapes move a vertex by at most r_v = sum_b r_vb
-|R_b - I|, which adds sum |e_v| r_v. Rows are joined in groups: a group has the largest value of each term.
+in a triangle of the level but is not its corner. The level leaves out such a vertex, or has a fold there.
+`training/mesh_levels.py` evaluates the terms at these places, one row for each place. Pose blend shapes move a vertex
+by at most r_v = sum_b r_vb |R_b - I|, which adds sum |e_v| r_v. Rows are joined in groups: a group has the largest
+value of each term.
 
-A bundle has its levels in `mesh-levels.npz`. Rule: this file identifies the body for which the levels were made, by a
-digest of the body's stored arrays and by samples of its computed arrays. For any other body the bounds would be wrong,
-and the file is refused. An avatar without this file has one level, its whole mesh.
+A bundle has its levels in `mesh-levels.npz`. Rule: this file identifies the body for which the levels were made. For
+that, it has a digest of the body's stored arrays and samples of its computed arrays. For any other body the bounds
+would be wrong, and the file is refused. An avatar without this file has one level, its whole mesh.
 """
 
 from __future__ import annotations
@@ -82,7 +83,7 @@ class MeshLevel:
 
     @cached_property
     def least_m(self) -> float:
-        """The largest distance at rest, in metres. In no pose is `metres` less."""
+        """The largest distance at rest, in metres; `metres` is never less, in any pose."""
         return float(self.rest.max())
 
     def reduced(self, shaped: ShapedBody) -> ShapedBody:
@@ -96,9 +97,7 @@ def grouped(rest: F64, swing: F64, blend: F64) -> tuple[F32, F32, F32]:
 
     A row that cannot have the largest sum in any pose is left out. The rows are sorted by the joints of their two
     largest swings, and then by their largest sum. Groups of neighbours become one row with the largest value of each
-    term.
-
-    `rest`: (P,), `swing`, `blend`: (P,54): terms of P rows, as in `MeshLevel`.
+    term. `rest` (P,), `swing` and `blend` (P,54): terms of P rows, as in `MeshLevel`.
     """
     most = rest + 2.0 * swing.sum(axis=1) + 2.0 * np.sqrt(2.0) * blend.sum(axis=1)
     matters = most >= rest.max()
@@ -179,7 +178,7 @@ def save_mesh_levels(file: Path | BinaryIO, shaped: ShapedBody, levels: Sequence
 
 
 def read_mesh_levels(path: Path, shaped: ShapedBody) -> tuple[MeshLevel, ...]:
-    """Return the levels of the mesh in the file `path`, finest first. `shaped`: body of which they must be.
+    """Return the levels of the mesh in the file `path`, finest first. `shaped`: body to which they must belong.
 
     Raises BadInputError if the file is missing or damaged, is for another body, or has impossible numbers.
     """

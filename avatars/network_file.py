@@ -103,7 +103,7 @@ def constants_of(model: onnx.ModelProto) -> Mapping[str, TensorProto]:
 
 
 def check_integer_layers(network: IntegerNetwork) -> None:
-    """Raise BadInputError if a layer has inputs that are not dequantised integers. Layers of `float_layers` may."""
+    """Raise BadInputError if a layer that `float_layers` does not list has inputs that are not dequantised integers."""
     makers = {out: node for node in network.model.graph.node for out in node.output}
     float_layers = []
     for node in network.model.graph.node:
@@ -297,7 +297,6 @@ def reshaped(network: NetworkFile, height: int, width: int, batch: int = 1) -> N
 
     `height`, `width`: size of the input in pixels, multiples of BUCKET_STEP.
     `batch`: number of frames that are inferred together.
-
     Raises BadInputError if the graph cannot run at this shape.
     """
     if height % BUCKET_STEP or width % BUCKET_STEP or min(height, width, batch) < 1:

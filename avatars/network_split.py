@@ -48,7 +48,7 @@ class Cut:
 
 @dataclass(frozen=True)
 class NetworkPart(IntegerNetwork):
-    """A part of the network that runs by itself. Each field has shapes of uint8 tensors by name.
+    """A part of the network that runs by itself. The fields below hold shapes of uint8 tensors by name.
 
     `inputs`, `outputs`: inputs and outputs of `model`, in the model's order.
     `crossing_in`: tensors that cross the cut before this part.
@@ -76,7 +76,6 @@ def split(network: NetworkFile, at: Sequence[str]) -> list[NetworkPart]:
     """Return the parts of `network` between the cuts `at`, in order.
 
     `at`: names of cuts, in the order of the network's nodes.
-
     Raises BadInputError for an unknown cut, and for cuts in another order.
     """
     known = {cut.at: cut for cut in cuts(network)} if at else {}

@@ -65,8 +65,7 @@ def accuracy_of(bundle: Bundle, drawn: DrawnAs) -> dict[str, Any]:
     """Return the figures of the avatar's image error that hold for a run that draws the avatar as `drawn`.
 
     Keys: `source`, which names the validation and its date; `runtime`, `size`; the keys of `AccuracyFigures`. If no
-    figure holds, the keys are those of `refused`: `source`, `changed`, `why`.
-
+    figure holds, the keys are `source`, `changed` and `why`, as in `refused`.
     Raises BadInputError for a file that cannot be read.
     """
     validation = bundle.manifest.validation
@@ -102,12 +101,8 @@ def validation_facts(bundle: Bundle) -> dict[str, Any] | None:
 def refused(bundle: Bundle) -> dict[str, Any]:
     """Return the reason why no figure of the manifest may be shown; empty if they may be shown.
 
-    Keys:
-    `source`: `NO_FIGURES`.
-    `changed`: keys of `PARTS` that were changed since the validation.
-    `why`: the reason as a sentence.
-
-    Raises BadInputError for a file that cannot be read.
+    Keys: `source`, which is `NO_FIGURES`; `why`, the reason as a sentence; `changed`, the keys of `PARTS` that were
+    changed since the validation. Raises BadInputError for a file that cannot be read.
     """
     validation = bundle.manifest.validation
     if bundle.manifest.provenance.get("weights") == UNTRAINED:
@@ -199,10 +194,10 @@ class SizeLoss:
     curve: tuple[tuple[int, int], ...] = ()
 
     def at(self, work: int) -> float | None:
-        """Return the loss in dB of a tensor with `work` thousandths of the largest tensor's pixels.
+        """Return the loss in dB of a tensor with `work` thousandths of the full size's pixels.
 
-        Return 0 for the full size, else the loss at the next smaller size that was measured; None if no smaller size
-        was measured.
+        The loss is 0 at the full size. For another size, it is the loss at the next smaller size that was measured;
+        None if no smaller size was measured. Without figures, the result is None.
         """
         if work >= WHOLE and self.by_work:
             return 0.0
@@ -211,7 +206,7 @@ class SizeLoss:
 
 
 def tolerance_db(avatars: int) -> float:
-    """Return the tolerance of `curve_of`, in dB, for so many `avatars` that share a network."""
+    """Return the tolerance for `curve_of`, in dB. `avatars`: number of avatars that share a network."""
     return TOLERANCE_DB if avatars == 1 else SHARED_TOLERANCE_DB
 
 
@@ -240,8 +235,9 @@ def size_loss(bundle: Bundle, avatars: int) -> SizeLoss:
 
 
 def curve_of(table: Mapping[int, Mapping[int, float]], tolerance: float) -> tuple[tuple[int, int], ...]:
-    """Return the smallest tensor that is large enough by `table`, as (pixels of the picture, pixels of the tensor).
+    """Return, for each body in `table`, (pixels of the picture that it covers, pixels of the smallest tensor for it).
 
+    Between measured tensors, PSNR is linear in the logarithm of the side.
     `table`: PSNR in dB, as `BySize.psnr_db_by_picture`. `tolerance`: most that a tensor loses against the best, dB.
     """
     curve: list[tuple[int, int]] = []
@@ -256,7 +252,7 @@ def curve_of(table: Mapping[int, Mapping[int, float]], tolerance: float) -> tupl
 
 
 def psnr_at(row: Mapping[int, float], pixels: float) -> float | None:
-    """Return the PSNR in dB of a tensor of `pixels`, interpolated in their logarithm; None for one beyond `row`."""
+    """Return the PSNR in dB of a tensor of `pixels`, interpolated in their logarithm; None if outside `row`."""
     sides = sorted(row)
     if not sides[0] ** 2 <= pixels <= sides[-1] ** 2:
         return None

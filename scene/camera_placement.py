@@ -94,9 +94,9 @@ class PlacedCamera:
 
     `path`: path of the camera, in its own world.
     `turn` (3, 3), `shift` (3,): transform from the path's world to the scene's world.
-    `mount` (3, 3): rotation from the camera's axes to those of the path.
+    `mount` (3, 3): rotation from the camera's axes to the path's axes.
     `notes`: what was decided, for people.
-    `ways`: ways of avatars, by whose mean the camera moves; empty for a camera that does not go along.
+    `ways`: ways of the avatars; the camera moves by their mean. Empty for a camera that does not go along.
     """
 
     path: CameraPath
@@ -115,7 +115,7 @@ class PlacedCamera:
         return view_from_pose(self.turn @ turn @ self.mount, at)
 
     def reach(self) -> tuple[F64, F64]:
-        """Return the (lowest, highest) coordinates (3,) of the camera in the scene, metres, over its whole movement."""
+        """Return (lower, upper) bounds (3,) on the camera's coordinates in the scene, metres, at all times."""
         places = self.path.places @ self.turn.T + self.shift
         low, high = places.min(axis=0), places.max(axis=0)
         if self.ways:
@@ -169,10 +169,11 @@ def _turn(arm: F64, azimuth_deg: float, elevation_deg: float) -> F64:
     return about(1, heading + np.radians(azimuth_deg)) @ about(0, -raised) @ about(1, -heading)
 
 
-#: Range of the camera's median line of sight, degrees above the horizon; a camera beyond it is tilted to its end.
+#: Range of the camera's median line of sight, degrees above the horizon. A camera outside is tilted to the nearer end,
+#: by at most LARGEST_TILT_DEG.
 SIGHT_DEG = (-24.0, 0.0)
 LARGEST_TILT_DEG = 40.0
-#: Factor on the farthest distance that a body can have from the camera: the far clip plane is there.
+#: The far clip plane is at this multiple of the farthest distance that a body can have from the camera.
 BEYOND = 1.1
 #: A built-in camera is judged at moments this far apart, seconds, or at this many in a longer cycle.
 JUDGED_EVERY_S, MOST_JUDGED = 0.25, 480
@@ -184,7 +185,6 @@ def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies
     """Return the camera of `scene` at its place. A recorded camera films the avatars; a built-in camera goes along.
 
     A camera stays where it is if `scene.camera.place` is `none`.
-
     `path`: path of the camera.
     `scene`: its background, picture size and camera keys are used.
     `movers`: avatars of the scene. `bodies`: their bodies, in the same order.
@@ -270,7 +270,7 @@ def _placed(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Seq
 
 
 def _far(places: F64, points: F64, spec: CameraSpec) -> tuple[float, tuple[str, ...]]:
-    """Return (distance of the far clip plane, metres, that cuts off none of `points`; a note if it is increased)."""
+    """Return (distance of the far clip plane, metres, beyond all `points` (F, P, 3); a note if it is increased)."""
     corners = points.reshape(-1, 3)
     low, high = np.minimum(places.min(axis=0), corners.min(axis=0)), np.maximum(places.max(axis=0), corners.max(axis=0))
     needed = min(BEYOND * float(np.linalg.norm(high - low)), MAX_DEPTH_RATIO * spec.near_m)

@@ -293,8 +293,8 @@ def apart(
 ) -> DenseLayout | None:
     """Return a layout with a separate tensor for the avatars of each network; None if a tensor has too little room.
 
-    `rects`, `networks`: mesh rectangle of each visible avatar, and number of its network.
-    `lay`: function that lays out the avatars of one network, always in a tensor of one shape.
+    `rects`: mesh rectangle of each visible avatar. `networks`: number of its network.
+    `lay`: function that lays out the avatars of one network, always in a tensor of the same shape.
     The density of the result is the least density of these tensors.
     """
     groups = by_network(networks)
@@ -317,7 +317,7 @@ def lay_out_apart(
     """Return a layout as `lay_out` does, but with a separate tensor for the avatars of each network.
 
     All tensors have the same shape: the bucket that gives the least dense tensor the highest density.
-    `networks`: number of each avatar's network. The other parameters and the errors are those of `lay_out`.
+    `networks`: number of each avatar's network. The other parameters and the errors are as in `lay_out`.
     """
     if len(set(networks)) == 1:
         return lay_out(rects, output, buckets)
@@ -347,7 +347,7 @@ def tight_shape(rects: Sequence[Rect], output: Shape, density: float = 1.0) -> S
     """Return the shape of least area with room for the avatars at `density`; sides are multiples of `BUCKET_STEP`.
 
     For several avatars, a shape whose longer side exceeds `MOST_ASPECT` times the shorter is taken only if every
-    arrangement has such a shape. The other parameters are those of `lay_out_at`.
+    arrangement has such a shape. The other parameters are as in `lay_out_at`.
     """
     whole = [_pixels(on_grid(rect, output), output) for rect in rects]
     sizes = [(math.ceil(height * density), math.ceil(width * density)) for height, width in whole]

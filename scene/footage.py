@@ -30,8 +30,8 @@ from trilane.scene.lens import Known, Lens, cover
 from trilane.scene.recordings import natural
 from trilane.scene.rotations import quat_from_matrix
 
-#: Numbers in names are times if the share LEAST_IN_STEP of neighbours is one step apart. Also, the film must have fewer
-#: than MOST_MISSING frames per picture.
+#: Numbers in names count a film's frames if at least the share LEAST_IN_STEP of neighbours is one step apart. Also, the
+#: film must have fewer than MOST_MISSING frames for each picture.
 LEAST_IN_STEP, MOST_MISSING = 0.5, 4
 NAMED_GAPS = 3
 #: A step between times is a gap if it is longer than this many usual steps.
@@ -116,7 +116,7 @@ def _numbers(names: Sequence[str]) -> list[int]:
 
 
 def _step(numbers: Sequence[int]) -> int:
-    """Return the step of `numbers` from one frame to the next; 0 if the numbers are not those of a film."""
+    """Return the step of `numbers` from one frame to the next; 0 if they do not number the frames of a film."""
     steps = Counter(later - earlier for earlier, later in pairwise(numbers))
     if not steps:
         return 0
@@ -187,6 +187,7 @@ class Footage:
 def filmed(path: CameraPath, footage: Footage | None, output: Shape) -> tuple[CameraPath, tuple[str, ...]]:
     """Return (`path` as the camera that filmed `footage`, notes on the background).
 
+    A built-in camera stays as it is.
     `footage`: None for a drawn background. `output`: (height, width) of the shown picture.
     """
     if footage is None:
@@ -226,14 +227,14 @@ def _over_all(
 
 
 def _turned(path: CameraPath, stored: tuple[Stored, ...]) -> tuple[CameraPath, tuple[str, ...]]:
-    """Return (`path` with the shape of each picture and the turns that make it fit the camera, notes)."""
+    """Return (`path` with the shape of each picture and the turns that make each picture fit the camera, notes)."""
     lenses = path.optics.lenses
     turns = tuple(
         _turn(lenses[k % len(lenses)], path.quarter, one, is_own=path.is_held) for k, one in enumerate(stored)
     )
     shapes = tuple(one.shown(turned) for one, turned in zip(stored, turns, strict=True))
     differ = sum((one.turned - turned) % 4 != 0 for one, turned in zip(stored, turns, strict=True))
-    as_files_say = not differ and not path.is_held  # what its file prescribes may also mirror, and differs by photo
+    as_files_say = not differ and not path.is_held  # () also keeps mirroring, and turns of a folder's other pictures
     optics = replace(path.optics, filmed=_once(shapes), turned=() if as_files_say else _once(turns))
     said = f" ({differ} of {len(stored)})" if len(stored) > 1 else ""
     note = (f"turned with the camera's picture, and not as the file says{said}",) if differ else ()
@@ -245,8 +246,8 @@ def _turn(lens: Lens, quarter: int, stored: Stored, is_own: bool) -> int:
 
     `quarter`: quarter turns of the lens. `is_own`: whether the camera's file measured the lens on this photo. Such a
     photo was measured either as stored or as its file displays it; the shape of the lens decides. Any other photo has
-    the turn that its file states, with one exception: stored pixels have the shape of a measured lens, but lie across
-    it when displayed.
+    the turn that its file states, with one exception. If stored pixels have the shape of a measured lens, but lie
+    across it when displayed, they have the lens's turn.
     """
     measured = lens.turned(-quarter)
     if is_own and lens.known is Known.ALL:

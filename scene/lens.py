@@ -23,7 +23,7 @@ import numpy as np
 from trilane.arrays import F64, Shape
 from trilane.errors import BadInputError
 
-#: Size of the picture of a lens of which only an angle is known.
+#: Assumed size of the picture if only an angle of the lens is known.
 ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX = 640.0, 480.0
 
 
@@ -66,7 +66,7 @@ def cover(picture: Shape, output: Shape) -> PictureCut:
 class Lens:
     """A lens without distortion: x = `cx` + `fx` X / Z, y = `cy` + `fy` Y / Z, with Y down and Z ahead.
 
-    `width_px`, `height_px`: size of the picture. `fx`, `fy`, `cx`, `cy`: numbers of pixels of this picture.
+    `width_px`, `height_px`: size of the picture. `fx`, `fy`: focal lengths, and `cx`, `cy`: principal point, pixels.
     `known`: what is known of the lens.
     """
 
@@ -171,8 +171,8 @@ class Lens:
     def projection(self, near_m: float, far_m: float) -> F64:
         """Return the OpenGL clip matrix (4, 4) of a camera with y up that looks along -Z.
 
-        `near_m`, `far_m`: distances of the clip planes. In NDC, x / w = 2 (cx + fx X / -Z) / width - 1 and y / w = 1 -
-        2 (cy - fy Y / -Z) / height.
+        `near_m`, `far_m`: distances of the clip planes, metres. The matrix gives, in NDC:
+        x / w = 2 (cx + fx X / -Z) / width - 1; y / w = 1 - 2 (cy - fy Y / -Z) / height.
         """
         depth = near_m - far_m
         return np.array(
@@ -188,7 +188,7 @@ class Lens:
 def centred(width_px: float, height_px: float, focal_px: float, known: Known = Known.ALL) -> Lens:
     """Return a lens with square pixels, whose principal point is the middle of its picture.
 
-    `focal_px`: both focal lengths, pixels. The other parameters are those of `Lens`.
+    `focal_px`: both focal lengths, pixels. The other parameters are as in `Lens`.
     """
     return Lens(width_px, height_px, focal_px, focal_px, width_px / 2, height_px / 2, known)
 
@@ -196,19 +196,19 @@ def centred(width_px: float, height_px: float, focal_px: float, known: Known = K
 def of_opencv(width_px: float, height_px: float, fx: float, fy: float, cx: float, cy: float) -> Lens:
     """Return a lens from numbers of OpenCV or Kalibr, which count `cx` and `cy` from the centre of the first pixel.
 
-    The parameters are otherwise those of `Lens`.
+    The other parameters are as in `Lens`.
     """
     return Lens(width_px, height_px, fx, fy, cx + 0.5, cy + 0.5)
 
 
 def of_fov_y(fov_y_deg: float) -> Lens:
-    """Return a lens of which only the field of view over the picture's height is known: `fov_y_deg` degrees."""
+    """Return a lens with only one known number: the field of view over the picture's height, `fov_y_deg` degrees."""
     focal = ASSUMED_HEIGHT_PX / 2 / math.tan(math.radians(fov_y_deg) / 2)
     return centred(ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX, focal, Known.HEIGHT)
 
 
 def of_fov_x(fov_x_deg: float) -> Lens:
-    """Return a lens of which only the field of view over the picture's width is known: `fov_x_deg` degrees."""
+    """Return a lens with only one known number: the field of view over the picture's width, `fov_x_deg` degrees."""
     focal = ASSUMED_WIDTH_PX / 2 / math.tan(math.radians(fov_x_deg) / 2)
     return centred(ASSUMED_WIDTH_PX, ASSUMED_HEIGHT_PX, focal, Known.WIDTH)
 
@@ -241,7 +241,7 @@ LEAST_BEND_PX = 0.5
 def measured_lens(where: str | Path, width_px: float, height_px: float, numbers: F64) -> Lens:
     """Return the lens of a file. `numbers` (4,): fx, fy, cx, cy in pixels of a picture of `width_px` x `height_px`.
 
-    Raises BadInputError about `where` when the numbers are not those of a lens.
+    Raises BadInputError about `where` unless the numbers are positive and `checked_lens` accepts them.
     """
     if not (np.isfinite(numbers).all() and (numbers > 0).all()):
         raise BadInputError(where, "a lens whose numbers are not all positive", "fx, fy, cx and cy in pixels")
@@ -250,7 +250,10 @@ def measured_lens(where: str | Path, width_px: float, height_px: float, numbers:
 
 
 class Bent(NamedTuple):
-    """A lens with distortion. `parameters`: values of k1 to k6, p1 and p2, by name; missing parameters are 0."""
+    """A lens with distortion. `parameters`: values of k1 to k6, p1 and p2, by name; missing parameters are 0.
+
+    `is_fisheye`: whether distortion follows OpenCV's fisheye model.
+    """
 
     lens: Lens
     parameters: Mapping[str, float]

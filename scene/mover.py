@@ -68,7 +68,6 @@ def outline(body: ShapedBody, joints: Collection[str] = JOINT_NAMES) -> BodyOutl
     """Return the outline of `body`: for each joint, the outermost vertex in each of DIRECTIONS.
 
     Only vertices that no other joint moves more count for a joint.
-
     `joints`: names of the joints whose vertices are taken.
     """
     weights, rest = body.body.weights, body.vertices.astype(np.float64)
@@ -82,7 +81,7 @@ def outline(body: ShapedBody, joints: Collection[str] = JOINT_NAMES) -> BodyOutl
 
 
 def feet(body: ShapedBody) -> BodyOutline:
-    """Return all vertices that ankles and toes move most. All are kept so that feet stand exactly on the floor."""
+    """Return an outline of all vertices that ankles and toes move most, so that feet stand exactly on the floor."""
     return _of(body, np.flatnonzero(np.isin(body.body.weights.argmax(axis=1), [JOINT_INDEX[name] for name in FEET])))
 
 

@@ -17,7 +17,7 @@ budget, and the least dense tensor sets its density.
 **Mesh.** An avatar whose surface may be off by less than the error budget is drawn with fewer triangles. `hold_mesh`
 keeps a level while it is good enough, and goes to coarser levels step by step.
 
-**Changes.** A change of shape is visible, so its cost is that of the pixels of `PATIENCE` frames. Before the run,
+**Changes.** A change of shape is visible, so it costs as much as the pixels of `PATIENCE` frames. Before the run,
 `foreseen_changes` finds the changes that cost least. Each is made while both shapes are good, and preferably while
 nobody is visible or the scene moves fast. If a frame's shape is not good enough, the frame gets a good shape at once,
 whatever was foreseen. If nothing was foreseen, a smaller shape is taken after `PATIENCE` frames in which it would have
@@ -56,9 +56,9 @@ class FrameWork(IntEnum):
 
 
 def shown_by(arrays: Iterable[Floats]) -> bytes:
-    """Return, as bytes to compare, everything that the picture of the avatars depends on.
+    """Return `arrays` as bytes to compare.
 
-    `arrays`: these values; their number and shapes never change during a run.
+    `arrays`: everything on which the avatars' picture depends; number and shapes never change during a run.
     """
     return b"".join(array.tobytes() for array in arrays)
 
@@ -66,11 +66,12 @@ def shown_by(arrays: Iterable[Floats]) -> bytes:
 def work_of(
     shown: bytes, of_picture: bytes | None, of_nobody: bytes | None, is_anybody_seen: Callable[[], bool]
 ) -> FrameWork:
-    """Return the work for a frame that shows `shown`, as bytes of `shown_by`.
+    """Return the work for a frame.
 
-    `of_picture`: what the frame of the present picture showed; None before the first picture.
-    `of_nobody`: what the last frame without anybody showed; None before the first such frame.
-    `is_anybody_seen`: finds out whether an avatar is on the screen; called only if the bytes do not decide.
+    `shown`: bytes of `shown_by` for this frame.
+    `of_picture`: the bytes for the frame of the present picture; None before the first picture.
+    `of_nobody`: the bytes for the last frame without anybody; None before the first such frame.
+    `is_anybody_seen`: function that returns whether an avatar is on the screen; called only if bytes do not decide.
     """
     if shown == of_picture:
         return FrameWork.REUSE
@@ -126,9 +127,9 @@ def hold_mesh(errors_px: Sequence[float], budget_px: float, before: HeldMesh | N
     `budget_px`: error budget.
     `before`: level of the frame before, None for the first frame.
 
-    The first frame takes the coarsest level within the budget. A level beyond the budget is left at once, for the
-    coarsest finer level within the budget. Coarser levels are taken one by one, each after `PATIENCE` frames in which
-    its bound was well within the budget.
+    The first frame takes the coarsest level within the budget. If the level in use exceeds the budget, the coarsest of
+    the finer levels within the budget replaces it at once. Coarser levels are taken one by one, each after `PATIENCE`
+    frames in which its bound was well within the budget.
     """
     within = [level for level, error in enumerate(errors_px) if error <= budget_px]
     if before is None:
@@ -177,7 +178,6 @@ def plan_tensor(
 
 
 def _grouped(rects: Sequence[Rect], networks: Sequence[int]) -> list[list[Rect]]:
-    """Return the rectangles of the avatars of each network."""
     return [[rects[place] for place in places] for places in by_network(networks or [0] * len(rects))]
 
 
@@ -220,8 +220,8 @@ def _fits(
 def _held(good: Sequence[Shape], before: HeldShape | None, foreseen: Shape | None) -> HeldShape:
     """Return the shape to use, one of `good`.
 
-    A foreseen shape is taken once, as soon as it is good. Otherwise the held shape stays while it is good. If it is
-    not, the smallest good shape is taken.
+    A foreseen shape is taken once, as soon as it is good. Otherwise the held shape stays while it is good; if it is
+    not, the smallest good shape is taken. If none was foreseen, a smaller good shape is taken after `PATIENCE` frames.
     """
     last = before.foreseen if before is not None else None
     is_kept = before is not None and before.shape in good
@@ -249,7 +249,7 @@ class LookAhead:
     def networks(self, of_all: Sequence[int]) -> list[int]:
         """Return the number of each visible avatar's network.
 
-        `of_all`: number of each avatar's network; empty if one network paints all, and so is the result.
+        `of_all`: number of each avatar's network. If one network paints all, it is empty, and the result is empty too.
         """
         return [of_all[number] for number in self.rects] if of_all else []
 
@@ -269,8 +269,8 @@ def foreseen_changes(
     `budget`: number of pixels that a tensor may have.
     `networks`: number of the network of each avatar of the scene; empty if one network paints all.
 
-    The result is the cheapest sequence of good shapes in pixels: the pixels of all frames, plus the cost of the
-    changes. If a shape is not good at a look, the next shape begins in the first frame after the look before.
+    The result is the sequence of good shapes that costs least: the pixels of all frames, plus the cost of the changes.
+    If a shape is not good in an examined frame, the next shape begins right after the examined frame before.
     """
     order = sorted(shapes, key=lambda shape: (area(shape), shape))
     costs, origins, needed = dict.fromkeys(order, 0.0), [], []
@@ -299,7 +299,7 @@ def _cheapest_way(
 ) -> tuple[float, Shape]:
     """Return the least cost, in pixels, of a sequence of shapes that ends with `shape`, and the shape before it.
 
-    Pixels of the frames after this look do not count yet. `costs`: the least cost up to the look before, by last shape.
+    Pixels from this examined frame on do not count yet. `costs`: least cost up to the examined frame before, by shape.
     `fits`: layout of each shape with room for the avatars. `price`: least cost of a change of shape, in pixels.
     """
 
@@ -324,6 +324,7 @@ def _speed(before: LookAhead, now: LookAhead) -> float:
 def ideal_shape(rects: Sequence[Rect], output: Shape, budget: TensorBudget, networks: Sequence[int] = ()) -> Shape:
     """Return the shape within the budget that gives the avatars at `rects` the highest density; if equal, the smallest.
 
+    If no shape has room for all avatars, the largest shape is returned.
     `networks`: number of the network of each avatar at `rects`; empty if one network paints all.
     """
     pixels = pixels_of(rects, networks, output, budget)
@@ -402,7 +403,7 @@ def joined(first: ShapeSet, second: ShapeSet) -> ShapeSet:
 
 
 def larger_shapes(shapes: Sequence[Shape], most_pixels: int) -> list[Shape]:
-    """Return each new shape that just contains two of `shapes`, of at most `most_pixels`; the smallest first."""
+    """Return new shapes that each just contain two of `shapes`, of at most `most_pixels` pixels; smallest first."""
     both = {(max(a[0], b[0]), max(a[1], b[1])) for a, b in combinations(shapes, 2)}
     return sorted((shape for shape in both - set(shapes) if area(shape) <= most_pixels), key=area)
 

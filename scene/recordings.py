@@ -1,5 +1,4 @@
-"""Facts that a reader finds in the file of a motion or a camera, the choice of its usable samples, and an order of
-names.
+"""What readers of motions and cameras share: facts about a file, the choice of usable samples, an order of names.
 
 A sample is left out when its reader finds it unreadable, or when its time is not after the time of the last usable
 sample. Sampling interpolates across such holes, and a note says how many samples are left out. A file with more bad

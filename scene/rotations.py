@@ -34,8 +34,7 @@ def rotvec_from_quat(quat: ArrayLike) -> F64:
 
 
 def _products_to_matrix() -> F64:
-    """Return the matrix (16, 9) that maps the flattened outer product q q^T to the flattened rotation matrix,
-    row-major.
+    """Return the matrix (16, 9) from the outer product q q^T to the rotation matrix, both flattened by rows.
 
     q is the unit quaternion (w, x, y, z).
     """

@@ -1,7 +1,7 @@
 """Scene files (TOML): their schema, how they are loaded, and a message about the first error.
 
 The schema checks types and ranges; the loaders check whether a named file exists and what it contains. The values of a
-scene file never change, except that its paths are made absolute.
+scene file never change, except that its paths are made absolute. The file's name replaces a missing `name`.
 """
 
 from __future__ import annotations
@@ -403,7 +403,7 @@ BUILT_IN = (ROOM, *AVATARS)  # names of a background and of avatars
 
 
 def bad_input(where: str | Path, error: ValidationError) -> BadInputError:
-    """Return a BadInputError about the first defect in `error`. Its place is the file `where` with the key."""
+    """Return a BadInputError about the first defect in `error`. It names the file `where` and the key."""
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"])
     place = f"{where}: {key}" if key else str(where)
@@ -438,12 +438,11 @@ def _remedy(first: Mapping[str, Any]) -> str:
 
 
 def _field(loc: tuple[int | str, ...]) -> FieldInfo:
-    """Return the pydantic field of the key at `loc`."""
     return _table_of(loc).model_fields[str(loc[-1])]
 
 
 def _table_of(loc: tuple[int | str, ...]) -> type[BaseModel]:
-    """Return the model of the table of the key at `loc`, pydantic's path of a key."""
+    """Return the model of the table that has the key at `loc`, the path by which pydantic names the key."""
     table: type[BaseModel] = Scene
     for key in loc[:-1]:
         if isinstance(key, str):

@@ -78,7 +78,7 @@ APART_M = 0.2
 
 
 def _shared_places(scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> Iterator[str]:
-    """Yield a sentence for each avatar that stands where an avatar before it stands, at the first frame."""
+    """Yield a sentence for each avatar that stands, in the first frame, where an earlier avatar stands."""
     pelvises = [body.joints[0] + mover.sample(0.0)[1] for mover, body in zip(movers, bodies, strict=True)]
     places = [(mover.world @ [*pelvis, 1.0])[[0, 2]] for mover, pelvis in zip(movers, pelvises, strict=True)]
     names = [str(avatar.name) for avatar in scene.avatars]
@@ -199,7 +199,7 @@ ENOUGH = 0.5
 MOST_JUDGED = 120
 #: Weight of the person's share of the picture's height, against the share of frames: it only breaks ties.
 HEIGHT_WEIGHT = 0.01
-#: Axes of poses that are tried: those of cameras (optical and OpenGL), of robots and of aircraft.
+#: Axes of poses that are tried: for cameras (optical and OpenGL), for robots and for aircraft.
 LIKELY_AXES = ("right-down-forward", "right-up-back", "forward-left-up", "forward-right-down")
 #: Factors on the unit of length that are tried.
 FACTORS = (0.3, 0.1, 0.03, 3.0, 10.0)
@@ -217,8 +217,8 @@ def require_person(
     """Raise BadInputError if the recorded camera of `staged` does not show the person; the remedy names a key.
 
     Half of the examined frames must show the whole bodies if the camera was placed, or a part of a body otherwise.
-    `staged` is the result of `stage_scene` for the other parameters. `say`: function that gets the notes and a message
-    before other values are tried, which takes up to a minute.
+    `staged`: result of `stage_scene` for the other parameters. `say`: function that is called with each note and then
+    with a message, before other values are tried, which takes up to a minute.
     """
     if not staged.camera.path.recorded:
         return
@@ -267,7 +267,7 @@ def _remedy(scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], base: Pa
 
 
 def _variants(spec: CameraSpec, path: CameraPath, base: Path) -> Iterator[tuple[str, Any]]:
-    """Yield each (key, value) of the camera to try in place of the present value; stated axes and up stay."""
+    """Yield each (key of the camera, value) to try. Stated axes and up stay; only placing is tried for `place` none."""
     if spec.place == "none":
         yield "place", "auto"
         return

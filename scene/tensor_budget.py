@@ -1,7 +1,7 @@
 """The number of pixels that a frame's tensor may have, and the largest density of the avatars in it.
 
 Rule: measured figures decide where there are any. Without them, an avatar has the pixels for which its network was
-trained, or as many as the picture shows if that is more, within fixed limits (docs/decisions/planner.md).
+trained, or as many as the picture shows if that is more. Fixed limits apply (docs/decisions/planner.md).
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ class TensorBudget:
     def density(self, rects: Sequence[Rect], output: Shape) -> float:
         """Return the largest density of the avatars at `rects`, however large the tensor is.
 
-        This is the density of the measured curve. Bodies below the curve's range have at most the density at its
-        start, or `MOST_DENSITY` if that is more.
+        This is the density of the measured curve, or `MOST_DENSITY` without a curve. Bodies below the curve's range
+        have at most the density at its start, or `MOST_DENSITY` if that is more.
         """
         if not self.curves:
             return MOST_DENSITY
@@ -86,7 +86,7 @@ class TensorBudget:
         return min(math.sqrt(sum(map(self._measured, seen)) / sum(seen)), max(MOST_DENSITY, math.sqrt(start)))
 
     def _measured(self, picture: int) -> float:
-        """Return the pixels for a body that covers `picture` pixels: those of the curve with the most."""
+        """Return the pixels for a body that covers `picture` pixels, by the curve that gives the most."""
         return max(pixels_at(curve, picture, self.own * MOST_GROWTH) for curve in self.curves)
 
     def _allowed(self, pixels: float) -> int:
@@ -96,9 +96,9 @@ class TensorBudget:
 def pixels_at(curve: Curve, picture: int, limit: float) -> float:
     """Return the tensor pixels of `curve` for a body that covers `picture` pixels, interpolated in their logarithms.
 
-    A smaller body than any of the curve has as many as the smallest one, a larger one the density of the largest one.
-
-    `limit`: most pixels of a larger body than any of the curve, if the curve's last one does not have more.
+    A body smaller than all of the curve's bodies has as many pixels as the smallest. A body larger than all of them has
+    the density of the largest.
+    `limit`: most pixels of such a larger body, unless the curve itself ends with more.
     """
     at = bisect_left(curve, picture, key=lambda knot: knot[0])
     if at == 0:

@@ -4,16 +4,16 @@
 in the picture and between the clip planes. Nobody is seen when all points of each body are beyond one plane of the view
 volume.
 
-**Best place.** A place is the position that the scene's origin gets in the world of the recording. At each place, the
-scene is turned about the vertical so that a heading of 0 faces the first eye. The best place shows whole bodies at the
-most moments. Among places with about as many, the place wins where bodies are larger and nearer to the picture's
-middle. Candidates are points on rays through the camera's pictures. Their distances range from the one at which the
-bodies fill the picture to many times the length of the path. The search therefore works at any scale. The best
-candidates then climb: each tries random steps, which are shares of its distance from the camera.
+**Best place.** A place is the position that the scene's origin gets in the world of the recording. An eye is a
+position of the camera. At each place, the scene is turned about the vertical so that a heading of 0 faces the first
+eye. The best place shows whole bodies at the most moments. Among places with about as many, the best place shows the
+bodies larger and nearer to the picture's middle. Candidates are points on rays through the camera's pictures. At the
+nearest, bodies fill the picture; the farthest are many path lengths away. The search therefore works at any scale. The
+best candidates then climb: each tries random steps, which are shares of its distance from the camera.
 
 In the search, a body is in the picture when no point of it is beyond any of the picture's four sides. A side is a
-plane, so only the body's outermost point across that plane counts. The reach of this point depends only on the bodies'
-heading. Reaches are computed once for each heading; after that, a place costs one product with each plane.
+plane, so only the body's outermost point across that plane counts. How far that point reaches depends only on the
+scene's heading. Reaches are computed once for each heading; after that, a place costs one product with each plane.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from trilane.scene.schema import BUILT_IN_PREFIX, Scene
 
 #: A person whose median share of the picture's height is below this is hard to find.
 SMALL = 0.08
-#: Extent of a walk over the floor, metres, from which a person looks small because the camera shows the whole walk.
+#: Extent of a walk over the floor, metres. A camera that shows the whole of such a walk shows the person small.
 FAR_WALK_M = 10.0
 #: Most frames that are examined; in a longer run, frames are evenly spread over the run.
 MOST_FRAMES = 300
@@ -120,7 +120,7 @@ def _shown(clip: F64) -> tuple[float, float, float]:
 def seen_notes(camera: Camera, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> tuple[str, ...]:
     """Return notes: how often the bodies are whole in the picture, how often nobody is seen, and how large they are.
 
-    If a placed recorded camera shows people very small, a second note says which key may be wrong.
+    If a placed recorded camera shows people very small, a second note gives likely reasons and the keys to set.
     """
     count = min(scene.frames, MOST_FRAMES)
     frames = np.arange(count) * scene.frames // count
@@ -136,9 +136,9 @@ def seen_notes(camera: Camera, scene: Scene, movers: Sequence[Mover], bodies: Se
 
 
 def _hint(scene: Scene, heights: F64, movers: Sequence[Mover], times_s: F64) -> tuple[str, ...]:
-    """Return a note when people are very small: either the walk is long, or the camera file has another unit.
+    """Return a note when a placed recorded camera shows people very small, with the likely reasons; otherwise ().
 
-    `heights` (F,): people's shares of the picture's height. The result is empty for a camera that was not placed.
+    `heights` (F,): people's shares of the picture's height.
     """
     is_placed = scene.camera.place == "auto" and not scene.camera.source.startswith(BUILT_IN_PREFIX)
     if not is_placed or not len(heights) or np.median(heights) >= SMALL:
@@ -180,8 +180,8 @@ LOWEST_EYE_M = 0.3
 MARGIN = 0.98
 #: Least depth, metres, at which a body is seen; a near clip plane farther away takes its place.
 NEAREST_M = 0.3
-#: Weight of how well bodies are shown, against whole bodies at all moments, which score 1. A body scores its share of
-#: the picture's height, at most ENOUGH_SIZE; a body at the border loses the share MIDDLE_WEIGHT of this score. The
+#: Weight of how well bodies are shown; whole bodies at all moments score 1. A whole body adds its share of the
+#: picture's height, at most ENOUGH_SIZE, times this weight; at the border it loses the share MIDDLE_WEIGHT of that. The
 #: largest possible gain is less than a fortieth of the moments.
 SIZE_WEIGHT, ENOUGH_SIZE, MIDDLE_WEIGHT = 0.03, 0.75, 0.5
 #: Weight, in moments, of bodies that are nearly whole in the picture. It leads a climb towards places with more whole
@@ -193,8 +193,8 @@ HEADINGS = 512
 DIRECTIONS = 120
 #: Number of places that are scored together; few enough that the arrays stay in the processor's cache.
 PLACES_AT_ONCE = 128
-#: Rows of a moment: the picture's four sides, the depth of the nearest point, then the depth, x and y of the bodies'
-#: middle. NEAR and MIDDLE are the indices of the nearest depth and of the middle's depth.
+#: Number of rows of a moment (see `PlaceJudge`): the picture's four sides, the nearest point's depth, and the depth, x
+#: and y of the bodies' middle. NEAR and MIDDLE are the indices of the nearest depth and of the middle's depth.
 ROWS, NEAR, MIDDLE = 8, 4, 5
 
 
@@ -245,12 +245,11 @@ def filming(path: CameraPath, mount: F64, times_s: F64, output: Shape, points: F
     """Return the recorded camera and the bodies at F moments, in the form in which places are scored.
 
     `path`: recorded camera path.
-    `mount` (3, 3): rotation from the camera's axes to those of the path.
+    `mount` (3, 3): rotation from the camera's axes to the path's axes.
     `times_s` (F,): the moments, in seconds of the path.
     `output`: (height, width) of the picture.
     `points` (F, P, 3): outermost points of the bodies at the moments, in the scene.
-    `near_m`: distance of the near clip plane, metres. A body is seen from this depth or NEAREST_M on, whichever is
-    larger.
+    `near_m`: distance of the near clip plane, metres. A body is seen from the larger of this depth and NEAREST_M on.
     """
     poses = [path.pose(float(t_s)) for t_s in times_s]
     clips = np.stack([path.projection(float(t_s), output) for t_s in times_s])
@@ -264,8 +263,8 @@ class PlaceMerits:
     """How S places show the bodies; all arrays (S,).
 
     `whole`: share of the moments with whole bodies.
-    `well`: size of whole bodies, less for those near the border, averaged over all moments: 0 to ENOUGH_SIZE.
-    `nearly`: how nearly the other bodies are in the picture, averaged over all moments: 0 to 1.
+    `well`: size of whole bodies, reduced near the border, averaged over all moments: 0 to ENOUGH_SIZE.
+    `nearly`: how nearly the bodies are whole at the other moments, averaged over all moments: 0 to 1.
     """
 
     whole: F64
@@ -318,9 +317,9 @@ class PlaceJudge:
 
 
 def _rows(film: Filming) -> F64:
-    """Return the rows (ROWS, F, 3).
+    """Return the rows (ROWS, F, 3) of all moments.
 
-    Rows of sides point inwards. A row's value divided by the depth is in half sides of the picture.
+    Rows of sides point inwards. Divided by the depth, the values of sides, x and y count in halves of the picture.
     """
     right, up, ahead = film.turns[:, :, 0], film.turns[:, :, 1], -film.turns[:, :, 2]
     x, y = (film.lenses[:, k, :1] * axis + film.lenses[:, k, 1:] * ahead for k, axis in enumerate((right, up)))
@@ -332,7 +331,7 @@ def _reaches(film: Filming, rows: F64) -> tuple[F32, F32]:
     """Return the reaches (HEADINGS, ROWS, F) and the heights (HEADINGS, F) of the bodies.
 
     A reach is what the bodies add to a row's value. For rows of sides and of the nearest depth, their outermost point
-    counts; for other rows, their middle. Heights are those at a depth of 1, in half pictures.
+    counts; for other rows, their middle. Heights are shares of the picture's height at a depth of 1.
     """
     headings = about(1, np.arange(HEADINGS) * (2 * np.pi / HEADINGS))
     reaches = np.empty((HEADINGS, ROWS, rows.shape[1]), np.float32)

@@ -1,7 +1,7 @@
 """COLMAP sparse models: a folder with `cameras` and `images`, as `.txt` or as `.bin`.
 
 Poses are world to camera with optical axes (x right, y down, looks along +Z). Views are in the order of their photos'
-names. The map has no unit, no levelled axis and no times. Distortion is left out and noted. Format:
+names. The map has no unit, no vertical axis and no times. Distortion is left out and noted. Format:
 https://colmap.github.io/format.html, https://colmap.github.io/cameras.html. The numbers of camera models are those in
 COLMAP's `sensor/models.h`.
 """
@@ -202,7 +202,7 @@ class _Reader:
         """Read the number of entries from the file, and return an iterator over their indices.
 
         `least`: least size of an entry, bytes. `what`: entries in words. Raises BadInputError when the file is too
-        short.
+        short, or for more than MAX_ENTRIES entries.
         """
         count = self.take(COUNT, f"the count of {what}")[0]
         if count > MAX_ENTRIES:

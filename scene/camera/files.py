@@ -109,7 +109,7 @@ BELOW_M = 0.7, 2.5
 #: Range of times of a device's clock, in seconds since it was switched on: more than times since the start of a
 #: recording, less than times since 1970.
 OF_A_DEVICE_S = 60.0, 1e9
-#: Another order of numbers is possible if its price is higher by less than this.
+#: Another order of numbers is possible if its price (`price_of`, `price_of_horizons`) is higher by less than this.
 MUCH_DEARER = 0.1
 #: Another order looks clearly more astray if `_astray` is higher by this: for one of the 24 orders of a quaternion, and
 #: for an order of a matrix. Matrices whose entries differ by at most SAME, as by a rotation of 5 degrees, are the same.
@@ -317,7 +317,7 @@ def _signs(matrices: F64, up_axis: str, times: F64 | None) -> dict[str, tuple[st
     `times` (N,): times of the table; None if it has no times.
 
     A camera of KITTI looks along +Z, and its Y is down. A camera of ARKit looks along -Z, and its Y is up. A device is
-    upright if its X is nearer to the vertical than its Y.
+    upright if its X is nearly vertical, and more so than its Y.
 
     With and without times, these features count for both formats: the camera moves along its view, or it looks at one
     point. If the device is not upright, the direction of Y also counts. Here AUTO allows KITTI both axes, and ARKit
@@ -327,7 +327,7 @@ def _signs(matrices: F64, up_axis: str, times: F64 | None) -> dict[str, tuple[st
     tends up and the camera is below 0 by a depth in BELOW_M. For ARKit, the times are of a device's clock, or Y tends
     up. Here AUTO means Y.
 
-    One feature counts only without times: an upright device speaks for ARKit. It fits both directions of Z.
+    One feature counts only without times: an upright device speaks for ARKit, whatever the direction of Z.
     """
     turns, places = matrices[:, :, :3], matrices[:, :, 3]
     ups = ("z", "y") if up_axis == AUTO else (up_axis,)
@@ -370,7 +370,7 @@ def _signs(matrices: F64, up_axis: str, times: F64 | None) -> dict[str, tuple[st
 
 
 def _along(turns: F64, places: F64) -> float:
-    """Return the mean cosine, weighted by length, between the steps of `places` (N, 3) and Z of the cameras `turns`."""
+    """Return the mean cosine, weighted by length, of steps of `places` (N, 3) with Z of `turns`; 0 without movement."""
     steps = np.diff(places, axis=0)
     length = float(np.linalg.norm(steps, axis=1).sum())
     return float((steps * turns[:-1, :, 2]).sum()) / length if length > 0 and len(turns) >= LEAST_ROWS else 0.0

@@ -51,8 +51,8 @@ NERF = "a NeRF transforms.json: `frames`, each with a 4x4 `transform_matrix`"
 DEFAULT_ANGLE_X = math.radians(50.0)
 DEFAULT_ASPECT = 4 / 3
 MAX_FRAMES = 100_000
-#: A matrix with columns of unit length is singular if its determinant is below this; that of a rotation is 1. A distant
-#: position makes it smaller: 1e-5 at 100 km.
+#: A matrix with columns of unit length is singular if its determinant is below this. A rotation has 1; a position far
+#: away makes the determinant smaller, 1e-5 at 100 km.
 LEAST_DETERMINANT = 1e-9
 LENS_KEYS = ("w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y")
 DISTORTION_KEYS = ("k1", "k2", "k3", "k4", "p1", "p2")
@@ -68,7 +68,6 @@ def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
     A frame may have its own lens; otherwise the lens of the file holds. A lens is an angle, or `fl_x`, `fl_y`, `cx`,
     `cy` in pixels of `w` x `h`. Distortion is left out and noted. nerfstudio makes such files from the exports of
     Polycam and Record3D.
-
     `rate_hz`: frames a second by the scene; None if the scene does not say. Raises BadInputError that names the key.
     Format: https://docs.nerf.studio/quickstart/data_conventions.html.
     """
@@ -120,7 +119,7 @@ def _nerf_lenses(path: Path, content: Mapping[str, Any], frames: Sequence[Any]) 
 def _distortion(
     path: Path, content: Mapping[str, Any], frames: Sequence[Any], lenses: Sequence[Lens]
 ) -> tuple[str, ...]:
-    """Return a note on the largest distortion of `lenses`, which is left out; () below LEAST_BEND_PX pixels."""
+    """Return a note on the largest distortion of `lenses`, which is not drawn; () below LEAST_BEND_PX pixels."""
     bent = []
     for lens, frame in zip(lenses, frames, strict=False):  # a single lens stands for all frames
         keys = {**content, **frame}
@@ -206,7 +205,7 @@ def _by_angle(
 ) -> tuple[Lens, str]:
     """Return (lens of a file without focal lengths, source of its angles in words).
 
-    `width`, `height`: pixels; angles: radians; None if the file does not state it.
+    `width`, `height`: pixels. `angle_x`, `angle_y`: radians. Each is None if the file does not state it.
     """
     angles = {"camera_angle_x": angle_x, "camera_angle_y": angle_y}
     source = f"by {' and '.join(f'`{key}`' for key, value in angles.items() if value)}"
@@ -242,7 +241,6 @@ def load_record3d(path: Path, rate_hz: float | None = None) -> RawCamera:
 
     The world is ARKit's: levelled, Y up, metres. The lens is `perFrameIntrinsicCoeffs` (fx, fy, cx, cy), or else `K`,
     column by column, in pixels of `w` x `h`. Times are `frameTimestamps`, or else follow from `fps`.
-
     `rate_hz`: frames a second by the scene; None if the scene does not say. Raises BadInputError that names the key.
     Format: keys of the exports of https://record3d.app, as nerfstudio's `process_data/record3d_utils.py` reads them.
     """

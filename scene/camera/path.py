@@ -288,7 +288,7 @@ BUILTIN: dict[str, Orbit | Descent | Stand] = {
 def load_builtin(name: str, spec: CameraSpec) -> CameraPath | None:
     """Return the built-in camera `name`; None if there is no such camera.
 
-    `spec`: camera of the scene, of which field of view and clip planes are used.
+    `spec`: camera of the scene; only its field of view and its clip planes are used.
     """
     camera = BUILTIN.get(name)
     if camera is None:

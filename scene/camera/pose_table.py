@@ -1,9 +1,9 @@
 """Text tables of camera poses: one pose per line, numbers separated by blanks or commas, `#` for comments.
 
-All lines must have the same number of columns; the error names the first other line. An empty field between two commas
-is NaN; empty fields at the end of a line are ignored. Column names, in a comment or in the first line, override the
-order of the format. Columns that seldom hold a quaternion of length 1 are refused, as another order of columns would
-give a camera that looks in arbitrary directions.
+All lines must have the same number of columns; the error names the first line that differs. An empty field between two
+commas is NaN; empty fields at the end of a line are ignored. Column names, in a comment or in the first line, override
+the order of the format. A table whose quaternions mostly have another length than 1 is refused: its columns are in
+another order, which would give a camera that looks in arbitrary directions.
 """
 
 from __future__ import annotations
@@ -36,11 +36,12 @@ LEAST_STEP_S, FAST_STEP_S = 0.9e-3, 3e-3
 #: Times since 1970, or times with fractions, keep their unit for steps up to SURE_STEP_S, such as those between key
 #: frames. For steps up to LONGEST_STEP_S, another unit is as likely.
 SURE_STEP_S, LONGEST_STEP_S = 3.0, 60.0
-#: Times from 2001 to 2100, in seconds since 1970, are those of a clock; other times are those of a device.
+#: Times from 2001 to 2100, in seconds since 1970, count as times of a clock. Other times may start at any number.
 EARLIEST_S, LATEST_S = 1e9, 4.1e9
 #: Number of lines of numbers from which a table's layout is found.
 LOOKED_AT = 20
-#: Whole numbers below MOST_FRAMES are frame numbers if at least the share LEAST_GROWING of their steps is 1 or more.
+#: Whole numbers below MOST_FRAMES are frame numbers if their median step is 1. Also, at least the share LEAST_GROWING
+#: of the steps must be 1 or more.
 MOST_FRAMES, LEAST_GROWING = 1e7, 0.75
 #: Unit of a first column that holds frame numbers.
 FRAMES = "frames"
@@ -205,7 +206,7 @@ class ColumnName(NamedTuple):
 
 
 def columns_in(line: str) -> tuple[ColumnName, ...]:
-    """Return the column names in `line`, maybe a comment; () if it has fewer than four different known names."""
+    """Return the column names in `line`, which may be a comment; () for fewer than four different known names."""
     text = UNIT.sub(lambda unit: re.sub(r"[\s,]+", "_", unit[0]), _parted(line.strip().lstrip("#")))
     text = re.sub(r"(?<!\s)\s+(?=[\[(])", "", text)  # a unit in brackets belongs to the name before it
     columns = tuple(map(_named, text.split(",") if "," in text else text.split()))
@@ -234,7 +235,10 @@ def _plain(name: str) -> str:
 def _unit_of(
     path: Path, columns: tuple[ColumnName, ...], holding: tuple[str, ...], units: Mapping[str, float], key: str
 ) -> str:
-    """Return the unit, a key of `units`, that the columns with a content in `holding` state; "" if none."""
+    """Return the unit, a key of `units`, that the names of columns with a content in `holding` state; "" if none.
+
+    `key`: key of the scene that states the unit, for messages. Raises BadInputError for unknown or different units.
+    """
     of = [column for column in columns if column.holds in holding]
     found = [SPELLINGS.get(column.unit.lower(), column.unit) for column in of]
     for column, unit in zip(of, found, strict=True):

@@ -3,10 +3,10 @@
 The movement from pose to pose never changes. Three constants are applied. A rotation of the world makes +Y up. A
 rotation of the picture by a multiple of 90 degrees does what a phone does with its display. A scale converts to metres.
 
-**Unit.** The scene states the unit, or the format defines a metre as its unit. If neither holds, or if the camera would
-be faster than anything that carries a camera, the scale is guessed: a person fills the pictures where the cameras look.
-Files of NeRF have no unit, but many are in metres. Their scale is guessed only if the views circle a point at which no
-person fits.
+**Unit.** The scene states the unit, or the format defines it as a metre. Otherwise the scale may be guessed: a person
+fills the pictures where the cameras look. A format without a unit is always guessed. A format that usually has metres
+is guessed if the camera would be faster than anything that carries a camera. Files of NeRF have no unit, but many are
+in metres. They are guessed if the camera is too fast, or if the views circle a point at which no person fits.
 
 **Up.** People hold a camera level. Each axis of the world is tried with each quarter turn of the picture. A guess costs
 more if the horizon is far from level, if the camera looks steeply down or up, or if this elevation changes. A guess
@@ -61,7 +61,7 @@ class LengthUnit(Enum):
 
 
 def near_origin(places: F64) -> tuple[F64, tuple[str, ...]]:
-    """Return (`places` (N, 3) without the offset of a map, such as that of UTM coordinates; a note on the offset)."""
+    """Return (`places` (N, 3) without the large offset that maps such as UTM have; a note on the offset, or ())."""
     finite = np.isfinite(places).all(axis=1)
     middle = np.median(places[finite], axis=0) if finite.any() else np.zeros(3)
     if np.abs(middle).max() <= MAP_M:
@@ -141,7 +141,7 @@ def looked_at_from(turns: F64, places: F64) -> float | None:
 
 
 def meeting_point(turns: F64, places: F64) -> F64 | None:
-    """Return the point (3,) nearest to all lines of sight, before or behind the cameras; None for parallel lines.
+    """Return the point (3,) nearest to all lines of sight, ahead of the cameras or behind; None for parallel lines.
 
     `turns` (N, 3, 3), `places` (N, 3): camera to world, OpenGL axes.
 
@@ -194,10 +194,10 @@ class _Prices:
 
 
 #: Costs in a format whose world is arbitrary (ANY_WORLD), and in a format whose world is aligned with gravity by
-#: definition (LEVELLED). In ANY_WORLD, a turn of the device is believed only after every axis. Its cost is that of
-#: another axis plus the most by which the picture's own up can be off an axis (45 degrees). A view straight down along
-#: the usual axis is believed only if other axes have horizons that are 0.15 rad off. In LEVELLED, such a view is
-#: believed before every other axis.
+#: definition (LEVELLED). In ANY_WORLD, a turn of the device is believed only after every axis. It costs more than
+#: another axis together with a picture whose own up is off that axis by 45 degrees, the most possible. A view straight
+#: down along the usual axis is believed only if other axes have horizons that are 0.15 rad off. In LEVELLED, such a
+#: view is believed before every other axis.
 ANY_WORLD = _Prices(axis=0.2, turn=0.4, between=0.25, nadir=0.5, nadir_deg=5.0)
 LEVELLED = _Prices(axis=0.4, turn=0.1, between=None, nadir=0.3, nadir_deg=18.0)
 #: Costs that compare horizons alone.
@@ -261,14 +261,17 @@ def find_upright(turns: F64, usual: str, is_levelled: bool, stated: str = AUTO) 
 
 
 def price_of(turns: F64, usual: str) -> float:
-    """Return the cost of the cheapest guess at up for cameras `turns` (N, 3, 3); 0 if they are level about `usual`."""
+    """Return the least cost of any up direction for cameras `turns` (N, 3, 3); infinite if none fits.
+
+    The cost is 0 for cameras that are level if the axis `usual` is up.
+    """
     return min((guess.price for guess in _guesses(turns, usual, ANY_WORLD, AUTO)), default=math.inf)
 
 
 def price_of_horizons(turns: F64) -> float:
-    """Return the cost of the cheapest guess at up for cameras `turns` (N, 3, 3), by their horizons alone.
+    """Return the least cost of any up direction for cameras `turns` (N, 3, 3), by their horizons alone.
 
-    The guesses are all axes of the world and all quarter turns of the picture.
+    All axes of the world and all quarter turns of the picture are tried. The cost is infinite if none fits.
     """
     return min((guess.price for guess in _guesses(turns, "y", FREE, AUTO)), default=math.inf)
 
@@ -438,7 +441,7 @@ def path_from_recording(raw: RawCamera, where: str, spec: CameraSpec) -> CameraP
     `raw`: content of the file, with OpenGL axes.
     `where`: path of the file, for messages.
     `spec`: camera of the scene.
-    Raises BadInputError when more than half of the poses are unusable.
+    Raises BadInputError when more than half of the poses are unusable, or when two stated units differ.
     """
     places_m, spec, length_notes = _in_metres(raw, where, spec)
     near, offset_notes = near_origin(places_m)

@@ -42,8 +42,8 @@ PHONE = centred(1920, 1080, 540 / math.tan(math.radians(18.0)), Known.LONG)
 def load_arkit(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
     """Read an ARKit log: `time r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz` per line, camera to world, metres, Y up.
 
-    The camera's axes are those of the sensor in landscape (x right, y up, looks along -Z). `clock`: what the scene says
-    about the times. Raises BadInputError with the line.
+    The camera's axes belong to the sensor in landscape (x right, y up, looks along -Z). The time may be missing.
+    `clock`: what the scene says about the times. Raises BadInputError with the line.
     """
     read = read_matrix_table(path, clock, ARKIT)
     count = len(read.turns)
@@ -167,10 +167,9 @@ SENSOR_KEYS = {"data": 16, "resolution": 2, "intrinsics": 4, "distortion_coeffic
 def load_euroc(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
     """Read EuRoC MAV poses, `data.csv`: time in nanoseconds, position, quaternion `w, x, y, z`, then any other columns.
 
-    The poses are those of the device's body. `cam0/sensor.yaml` next to the file's folder leads to the camera; without
-    it, the body's axes are used. Camera axes are optical; the world's Z is up. `clock`: what the scene says about the
-    times.
-    Raises BadInputError with the line.
+    The poses belong to the device's body. `cam0/sensor.yaml` next to the file's folder states the camera's pose on the
+    body; without this file, the body's poses are taken for the camera's. Camera axes are optical; the world's Z is up.
+    `clock`: what the scene says about the times. Raises BadInputError with the line.
     Format: M. Burri et al., "The EuRoC micro aerial vehicle datasets", IJRR 2016.
     """
     poses = read_pose_table(path, clock, EUROC_NAMES, EUROC, may_have_more=True)

@@ -155,7 +155,7 @@ class Walker:
     def _print(self, swing: Swing, after: Swing) -> tuple[float, float, float]:
         """Return the footprint between swing `swing` and the next swing `after`, as (x, z, heading).
 
-        x and z are those of the point below the ankle, metres; the heading is in radians.
+        x and z are the place of the point below the ankle, metres; the heading is in radians.
         """
         stance = (after.start_s - swing.end_s) % self.period_s
         middle = np.array([(swing.end_s + stance / 2) % self.period_s])

@@ -3,7 +3,7 @@
 The syntax is read first, and every error in it names the line. After that, joints are matched by name. A BVH file
 states no unit. If the scene does not state it either, the unit is the one that makes the legs nearest to USUAL_LEG_M.
 If no unit makes human legs, the file is scaled to that length. A T pose at the beginning is left out if the recording
-jumps away from it. If the recording moves on from the T pose, it is kept.
+jumps away from it. Otherwise it is kept.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ placed like a whole motion: its first frame faces +Z, and the middle of the grou
 
 Files of NumPy hold poses, dicts of arrays, or only positions of joints. Positions, as in HumanML3D, are (T, 22, 3) in
 the order of SMPL's joints. Poses may have the same shape, so the content decides. An array holds positions if its
-bones, apart from the legs, are as long as a person's, alike on both sides, and rigid. Also, the hips must be on either
+bones, relative to the legs, are as long as a person's, alike on both sides, and rigid. Also, the hips must be on either
 side of the pelvis, and the trunk must not be folded. `retarget.py` computes rotations from positions. Positions do not
 determine twists. Therefore a limb twists as its bend and the toes suggest, and the head turns as the neck does.
 
@@ -48,7 +48,7 @@ _ENDS = np.arange(1, len(NAMES))
 _STARTS = np.array(JOINT_PARENTS[1 : len(NAMES)])
 #: Indices of thighs and shins among the bones.
 _LEGS = [index for index, end in enumerate(_ENDS) if NAMES[end].endswith(("knee", "ankle"))]
-#: Indices of the bones of the left side, and of those of the right side in the same order.
+#: Indices of the bones of the left side and, in the same order, of the right side.
 _LEFT, _RIGHT = (
     [index for index, end in enumerate(_ENDS) if NAMES[end].startswith(side)] for side in ("left", "right")
 )
@@ -265,7 +265,7 @@ def load_motion(spec: AvatarSpec, base: Path, rest: F64 = T_POSE) -> Motion:
     """Load the motion that `spec.motion` names, as `spec` plays it.
 
     `base`: folder at which a relative path starts.
-    `rest` (55, 3): rest joints of the avatar that performs the motion, metres; by default those of a plain body.
+    `rest` (55, 3): rest joints of the avatar that performs the motion, metres; by default a plain body's.
     Raises BadInputError when there is no such motion, or when the file is unusable.
     """
     if spec.motion.startswith(BUILT_IN_PREFIX):
@@ -288,7 +288,6 @@ def load_motion(spec: AvatarSpec, base: Path, rest: F64 = T_POSE) -> Motion:
 
 
 def _of_no_reader(path: Path) -> BadInputError:
-    """Return the error for a file whose suffix is not that of a motion."""
     expected = f"a motion file: {', '.join(_READERS)}"
     try:
         require_file(path, expected)

@@ -2,7 +2,7 @@
 
 The scene's `joint_map` decides first; a table of names decides for all other joints. No joint of the file stands for
 two joints of the body. Each family of skeletons has one table. Names are compared without prefix, case and separators.
-The family is chosen whose table contains the most of a file's names, the first one among equals.
+Of the families that match all required joints, the one with the most matches is chosen; among equals, the first.
 
 Sources of the names, besides files of those programs: Unity's `HumanBodyBones`
 (https://docs.unity3d.com/ScriptReference/HumanBodyBones.html); VRM's humanoid bones, 0.x and 1.0
@@ -149,7 +149,7 @@ DIALECTS: dict[str, dict[str, str]] = {
 REQUIRED = ("pelvis", "left_hip", "right_hip", "left_knee", "right_knee", "left_ankle", "right_ankle")
 #: Names of the pelvis in most families. They are used in addition to any table, as they cannot mean another joint.
 PELVIS = ("hips", "pelvis", "hip")
-#: Key of the scene that maps joints which no table has.
+#: Key of the scene that maps joints by hand.
 STATED = "joint_map"
 
 

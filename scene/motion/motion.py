@@ -7,7 +7,7 @@ the middle of the covered ground is the origin.
 **Up** is the axis that the scene states. Otherwise up is the axis along which the body's own up points on average. If
 there is no such axis, up is the usual axis of the format. A body that always lies or stands on its hands must not turn
 the world over. In files that have a floor, the floor is at 0. Therefore, if the lowest joint stays near 0 along an
-axis, the body is on the floor along that axis. If this does not decide, a note says which other axis may be up.
+axis, this axis is up. If this does not decide, a note says which other axis may be up.
 
 **Stance** says when the feet stand. Each of ankles and toes has its own height while its foot stands. A person stands
 while at least one of these joints is at that height.
@@ -52,7 +52,6 @@ _PLACES_MM = {
 
 
 def _joints() -> F64:
-    """Return the rest joints (55, 3) of a plain body, metres."""
     rows = [
         np.multiply(_PLACES_MM[name.replace("right_", "left_")], (-1 if name.startswith("right_") else 1, 1, 1))
         for name in JOINT_NAMES
@@ -195,19 +194,19 @@ def joint_places(poses: F64, places: F64, leg_m: float | None) -> F64:
 def lowest(poses: F64, places: F64, leg_m: float | None, up: F64) -> F64:
     """Return the height (n,), metres, of the lowest joint in n <= MOST_LOOKED_AT frames.
 
-    `up` (3,): direction of heights. The other parameters are those of `joint_places`.
+    `up` (3,): direction of heights. The other parameters are as in `joint_places`.
     """
     some = np.linspace(0, len(poses) - 1, min(len(poses), MOST_LOOKED_AT)).round().astype(int)
     return np.asarray((joint_places(poses[some], places[some], leg_m) @ up).min(axis=1))
 
 
 def lies(heights: F64) -> bool:
-    """Return whether the `heights` (n,), metres, of the lowest joint are those of a lying person or a handstand."""
+    """Return whether a person lies, or stands on the hands. `heights` (n,): heights of the lowest joint, metres."""
     return _are_within(heights, LIES_M, LIES_SPREAD_M)
 
 
 def stands(heights: F64) -> bool:
-    """Return whether the `heights` (n,), metres, of the lowest joint are those of a person who stands or walks."""
+    """Return whether a person stands or walks. `heights` (n,): heights of the lowest joint, metres."""
     return _are_within(heights, STANDS_M, STANDS_SPREAD_M)
 
 
@@ -218,7 +217,7 @@ def _are_within(heights: F64, within: tuple[float, float], spread: float) -> boo
 
 #: The height at which a joint stands is this percentile of its heights.
 STANDING_PERCENTILE = 5.0
-#: A joint stands up to the height FOOT_STANDS_M above that, and does not stand from FOOT_FLIES_M on; metres.
+#: A joint stands if it is at most FOOT_STANDS_M above that height, and flies from FOOT_FLIES_M above it on; metres.
 FOOT_STANDS_M, FOOT_FLIES_M = 0.03, 0.06
 
 

@@ -257,8 +257,7 @@ def _build(reader: _Reader, _value: Any) -> None:
 def _array(reader: _Reader, shape: Any, kind: Any, fortran: Any, raw: Any) -> NDArray[Any] | list[Any]:
     """Return the array that NumPy stored as `shape`, dtype `kind`, order `fortran` and bytes `raw`.
 
-    For an array of objects, `raw` is the list of items, and so is the result.
-
+    For an array of objects, `raw` is the list of items, and the result is this list.
     Raises ValueError unless `raw` has exactly the bytes that `shape` and `kind` require.
     """
     sides = wanted(shape, tuple, "a shape")

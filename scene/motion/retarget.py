@@ -56,8 +56,7 @@ OF_TOES, OF_LEAST_TWIST = 0.5, 0.02
 #: A planted foot is laid flat if its slope differs from the avatar's by this or more, radians; otherwise it is laid
 #: along its recorded bone.
 SAME_SLOPE = np.radians(8.0)
-#: Distance of the heel behind the ankle, as a share of the bone from the ankle to the toes: that of the built-in
-#: walker.
+#: Distance of the heel behind the ankle, as a share of the bone from the ankle to the toes; as in the built-in walker.
 HEEL_BEHIND = 0.057 / np.hypot(0.062, 0.146)
 #: Largest difference in slope, radians, between a program's feet and the avatar's; beyond it, the heels are raised
 #: throughout.
@@ -105,9 +104,10 @@ class Retarget:
 
 
 def retarget(tracks: Tracks, joints: F64) -> tuple[F64, F64, tuple[str, ...]]:
-    """Return (poses (T, 55, 3), axis-angle; positions (T, 3) of the avatar's pelvis, metres; notes for people).
+    """Return (poses (T, 55, 3), axis-angle; positions (T, 3) of the pelvis; notes for people).
 
-    `tracks`: the recording, in any unit. It must have hips, knees and ankles, with the hips apart.
+    The positions have the unit of the recording, and fit an avatar whose legs are as long as the recorded ones.
+    `tracks`: the recording, in any unit. It must have pelvis, hips, knees and ankles, with the hips apart.
     `joints` (55, 3): rest joints of the avatar, metres.
     """
     rest = at_rest(joints)
@@ -187,11 +187,13 @@ class _RecordedFoot:
     length: float
 
     def above(self, floor: float, steeper: float, flat_by: float, up: F64) -> F64:
-        """Return the vector (T, 3) from ankle to toes, raised or lowered to keep toes and heel above the floor.
+        """Return the vector (T, 3) from ankle to toes, turned where toes or heel would be below the floor.
 
-        A foot that lies flat has the slope `ours` + `flat_by`. This slope limits how far toes may point down. If the
-        ankle is higher by r, the limit's sine is larger by r / `length`, which puts the toes on the floor. A limit in
-        the other direction does the same for the heel, which turns about the ankle.
+        `floor`: height of the ankle of a planted foot, metres. `steeper`, `flat_by`: result of `_steeper`; if `steeper`
+        is 0, nothing is turned. A foot that lies flat has the slope `ours` + `flat_by`. If `steeper` is above 0, this
+        slope limits how far toes may point down. If the ankle is higher by r, the limit's sine is larger by r /
+        `length`, which puts the toes on the floor. If `steeper` is below 0, a limit in the other direction does the
+        same for the heel, which turns about the ankle.
         """
         if not steeper:
             return self.way
@@ -342,7 +344,7 @@ def _local(turns: dict[str, F64], frames: int) -> F64:
 
 
 def _scale(work: Retarget) -> float:
-    """Return the ratio of the recorded leg's length, in the recording's unit, to that of the avatar's leg in metres."""
+    """Return the length of the recorded leg, in the recording's unit, over the length of the avatar's leg in metres."""
     return leg_length(work.tracks) / leg_length(work.rest)
 
 

@@ -5,7 +5,7 @@ other keys are ignored. If a file has several persons, only the person with the 
 
 An array alone has no frame rate. If neighbouring frames are similar, 30 frames a second are assumed. If they differ by
 more than POSE_SET_STEP_RAD, they are separate poses, one a second. ROMP saves a dict for each frame, with a row for
-each person in it. The number in a frame's name is its time. Coordinates are those of the camera, with Y down.
+each person in it. The number in a frame's name is its time. Coordinates are relative to the camera, with Y down.
 
 Sources: AMASS (https://amass.is.tue.mpg.de); `smplx` (https://github.com/vchoutas/smplx, arguments of `forward`);
 AIST++ (https://github.com/google/aistplusplus_api: 60 frames a second, Y up, `smpl_trans` in units in which the body is

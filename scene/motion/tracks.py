@@ -1,6 +1,6 @@
 """Tracks of named joints over time, and rotations computed from them: the input of retargeting, from any file.
 
-Names are those of the SMPL-X joints. Unit and axes are the file's own, and equal in all arrays. Positions alone tell in
+Joints have their SMPL-X names. Unit and axes are the file's own, and equal in all arrays. Positions alone tell in
 which frames the person stands, and whether a skeleton is built like the avatar's. The file's zero pose does not matter.
 
 **Trunk.** Hip line, trunk line and shoulder line define coordinate frames, in the same way for the recording and for
@@ -136,7 +136,6 @@ def planted_frames(tracks: Tracks, side: str, foot: F64, up: F64) -> NDArray[np.
     """Return a mask (T,) of the frames in which a foot most likely lies flat.
 
     Such a foot hardly moves, and its leg is below the hip.
-
     `side`: `left` or `right`. `foot` (T, 3): vector from the ankle to the toes. `up` (3,): up direction of the
     recording.
     """
@@ -159,7 +158,10 @@ def leg_length(tracks: Tracks) -> float:
 
 
 def built_alike(tracks: Tracks, rest: Tracks) -> bool:
-    """Return whether `tracks` and `rest` have equal distances between joints, relative to the length of their legs."""
+    """Return whether `tracks` and `rest` have equal distances between joints, relative to the length of their legs.
+
+    The result is False if `tracks` lacks the joints of the trunk.
+    """
     scale = leg_length(tracks) / leg_length(rest)
     pairs = [pair for pair in RIGID if tracks.has(*pair)]
     for pair in pairs:
@@ -192,10 +194,10 @@ def beside(vectors: F64, axis: F64) -> F64:
 def frames_along(exact: F64, other: F64, first: str) -> F64:
     """Return coordinate frames (T, 3, 3) with the directions left, up and forward as columns.
 
-    `first`: `left` or `up`, the direction that `exact` is.
-    `exact` (T, 3): this direction, kept exactly.
-    `other` (T, 3): the second of left and up, approximately. If `exact` and `other` are parallel, any perpendicular
-    direction replaces `other`.
+    `first`: which direction `exact` is, `left` or `up`.
+    `exact` (T, 3): that direction, kept exactly.
+    `other` (T, 3): the other of left and up, kept approximately. If it is parallel to `exact`, any perpendicular
+    direction replaces it.
     """
     a = unit(exact)
     b = beside(unit(other), a)
@@ -230,7 +232,7 @@ def mean_turn(turns: F64) -> F64:
 
 
 def level_with(turns: F64, base: F64, where: NDArray[np.bool_]) -> F64:
-    """Return `turns` (T, 3, 3) after one constant rotation that makes their mean equal to that of `base` (T, 3, 3).
+    """Return `turns` (T, 3, 3) after one constant rotation that makes their mean equal to the mean of `base` (T, 3, 3).
 
     `where` (T,): frames over which the means are taken.
     """
@@ -249,8 +251,8 @@ def limb_turns(bone: F64, recorded: F64, carrier: F64, evidence: Sequence[Eviden
     """Return global rotations (T, 3, 3) that take the avatar's rest `bone` (3,) to the recorded directions (T, 3).
 
     `carrier` (T, 3, 3): rotations whose change over time the twist follows.
-    `evidence`: evidence for the constant part of the twist. Without evidence, the rest bone is laid by the least angle
-    on the mean recorded direction in the carrier's axes.
+    `evidence`: evidence for the constant part of the twist. Without evidence, the rest bone has no twist: it is turned
+    by the least angle to the mean recorded direction in the carrier's axes.
     """
     target = unit(recorded)
     within = unit(turned(transposed(carrier), target).mean(axis=0))
@@ -291,8 +293,8 @@ def swung(parent: F64, bone: F64, recorded: F64) -> F64:
 SPINE = ("spine1", "spine2", "spine3")
 #: Joints that may be the upper end of the trunk line: the first of these that the recording has.
 TOPS = ("neck", "shoulder", "head", "spine3")
-#: Least distance between the collar joints, as a share of that between the shoulders; closer ones count as in the
-#: spine.
+#: Least distance between the collar joints, as a share of the distance between the shoulders. Closer collar joints do
+#: not show the chest's direction.
 LEAST_COLLARS = 0.1
 #: Share of the rotation from hip line to shoulder line that each part of the trunk has made.
 TWIST = {"pelvis": 0.0, "spine1": 1 / 3, "spine2": 2 / 3, "spine3": 1.0}
@@ -381,7 +383,10 @@ class Trunk:
 
 
 def trunk_of(tracks: Tracks, line: TrunkLine, shares: F64, by_collars: bool) -> Trunk:
-    """Return the coordinate frames of pelvis and spine; the spine's joints are at `shares` (3,) of the trunk line."""
+    """Return the coordinate frames of pelvis and spine; the spine's joints are at `shares` (3,) of the trunk line.
+
+    `by_collars`: whether collar joints, if there are any, show the chest's direction instead of the shoulders.
+    """
     low, *inner, top = points_at(line.points(tracks), np.array([0.0, *shares, 1.0]))
     hips = unit(tracks.across("hip"))
     chest = _across_chest(tracks, hips, by_collars)
@@ -489,7 +494,7 @@ def with_shoulders_on(across: F64, turns: dict[str, F64], rest: Tracks) -> dict[
 def turns_of_neck(tracks: Tracks, rest: Tracks, chest: F64) -> F64:
     """Return global rotations (T, 3, 3) of the neck, which points to the recorded head, with the left of the chest.
 
-    `chest` (T, 3, 3): global rotations of the chest.
+    `chest` (T, 3, 3): global rotations of the chest, which are the result if neck or head was not recorded.
     """
     if not tracks.has("neck", "head"):
         return chest
