@@ -195,7 +195,7 @@ ENDINGS = {
 }
 NO_VERDICT = "no verdict: fewer than two frames were presented"
 IN_LINES = ("p50", "p95", "p99")
-MIB = 1 << 20
+MIB, MB = 1 << 20, 1_000_000
 
 
 def screen(look: RunLook, width: int) -> Group:
@@ -357,7 +357,7 @@ def _time(times: Mapping[str, float], key: str) -> str:
 
 
 def _stages(figures: MomentFigures) -> Table:
-    table = _table("stage", "unit", "waiting", "ms", "MiB a job", "least")
+    table = _table("stage", "unit", "waiting", "ms", "MB a job", "least")
     for name, stage in figures.stages.items():
         moved, least = _moved(stage.bytes)
         _add_row(table, name, stage.unit, str(stage.waiting), f"{stage.service_ms:.1f}", moved, least)
@@ -365,14 +365,14 @@ def _stages(figures: MomentFigures) -> Table:
 
 
 def _moved(kinds: Mapping[str, Moved]) -> tuple[str, str]:
-    """Return two texts: the MiB that a job moves, in all and by kind, and the least bytes of a job in MiB.
+    """Return two texts: the MB that a job moves, in all and by kind, and the least bytes of a job in MB.
 
     An unknown number is a dash. `kinds`: moved bytes of a stage, by kind; the least bytes have the key LEAST.
     """
     from trilane.apps.watch.live_figures import LEAST
 
-    shown = {kind: moved.per_job / MIB for kind, moved in kinds.items() if kind != LEAST and moved.total}
-    least = f"{kinds[LEAST].per_job / MIB:.2f}" if LEAST in kinds else DASH
+    shown = {kind: moved.per_job / MB for kind, moved in kinds.items() if kind != LEAST and moved.total}
+    least = f"{kinds[LEAST].per_job / MB:.2f}" if LEAST in kinds else DASH
     if not shown:
         return DASH, least
     return f"{sum(shown.values()):.2f} ({', '.join(f'{kind} {value:.2f}' for kind, value in shown.items())})", least
