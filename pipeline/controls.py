@@ -61,7 +61,7 @@ class _Requests(Generic[Request]):
 
 
 class RunControls(_Requests[Event | str]):
-    """Passes requests to one run; once the run is over, requests do nothing."""
+    """Passes requests to one run: hold, stop, kill a unit. Once the run is over, requests do nothing."""
 
     def hold(self, frames: int) -> None:
         """Release `frames` more frames now, and no others until the next call; `ALL` ends the hold."""

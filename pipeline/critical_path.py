@@ -29,7 +29,7 @@ from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.stats import LEAST_FRAMES, batch_interval
 
-DELAY: Final = 256  # once so many further jobs have ended, all jobs that ran at the same time as a job have ended
+DELAY: Final = 256  # after so many further jobs, every job that ran at the same time as a job has ended
 
 
 class Taken(NamedTuple):
@@ -87,7 +87,7 @@ class Sharing:
         return self._sums
 
     def taken(self, unit: str, begin_ns: int, end_ns: int, lacked_ns: int) -> dict[str, int]:
-        """Return, by stage, the time in ns in which its jobs had the core that `unit` lacked.
+        """Return, for each stage, the time in ns in which the stage's jobs had the core that `unit` lacked.
 
         The unit's time without a core is divided among the stages. Each stage's part is proportional to the time that
         its jobs ran between `begin_ns` and `end_ns`, and is not longer than this time.
@@ -263,9 +263,9 @@ class Paths:
             yield from _divided(now, from_ns, HELD if is_latched else self._overhead(now, from_ns))
 
     def _overhead(self, now: ExplainedJob, from_ns: int) -> str:
-        """Return the kind of time from `from_ns` to the begin of `now` that has no cause of `OF_GAPS`.
+        """Return the kind of the time before `now` that no cause of `OF_GAPS` explains: STALLED, STOPPED or OVERHEAD.
 
-        The kind is STALLED, STOPPED or OVERHEAD.
+        `from_ns`: begin of the time, which ends when `now` begins.
         """
         begin_ns = now.job.begin_ns
         for stall in reversed(self._stalls):
@@ -276,7 +276,7 @@ class Paths:
         return STOPPED if from_ns < now.stopped_ns <= begin_ns else OVERHEAD
 
     def _unreleased(self, job: JobRecord, from_ns: int, end_ns: int) -> Iterator[Piece]:
-        """Yield the pieces of the time before the frame whose first job is `job` was released, the latest piece first.
+        """Yield the pieces of the time before a frame's release, the latest piece first. `job`: first job of the frame.
 
         Time in which a unit was down is a piece of kind DOWN, because it explains why no earlier frame was presented.
         """
@@ -309,7 +309,7 @@ class Paths:
         return found, False
 
     def _shown_by(self, by_ns: int) -> ExplainedJob | None:
-        """Return the job that presented the last frame that was presented by `by_ns`; None if it is not kept."""
+        """Return the last job that presented a frame at `by_ns` or earlier; None if this job is not kept."""
         shown = (self._jobs[key] for key in reversed(self._presented) if key in self._jobs)
         return next((each for each in shown if each.job.end_ns <= by_ns), None)
 
@@ -320,7 +320,7 @@ class Paths:
 
 
 def _divided(now: ExplainedJob, from_ns: int, rest: str) -> Iterator[Piece]:
-    """Yield the gap before a job, which begins at `from_ns`, as one piece for each cause, the latest piece first.
+    """Yield one piece for each cause of the gap from `from_ns` to the begin of a job, the latest piece first.
 
     The true order of the causes is not known. The time without a cause is of kind `rest`, and becomes the latest piece.
     """
@@ -397,7 +397,7 @@ class Budget:
         self._since: deque[int] = deque()
         self._from_ns: int | None = None
         self._newest: ExplainedJob | None = None
-        self._blocks: list[Counter[Part]] = []  # one for each run of the same number of frames, in order
+        self._blocks: list[Counter[Part]] = []  # in order, each over the same number of frames
         self._merged = 1  # number of blocks that were merged into one
         self._open: list[Counter[Part]] = []
         self.ns_of: Counter[Part] = Counter()
@@ -435,7 +435,7 @@ class Budget:
         return {"unit": units, "stage": stages}
 
     def largest(self, name_of: Mapping[Part, str]) -> dict[str, Any] | None:
-        """Return the keys of `share` for the name with the largest share of the path, and the key `rivals`.
+        """Return the result of `share` for the name with the largest share of the path, and the key `rivals`.
 
         Rivals are the names whose share may be as large: the 95 % interval of the difference contains 0. `rivals` is
         None if there are too few frames for an interval. Without a path, return None. Called after `close`.
@@ -455,7 +455,7 @@ class Budget:
     def share(self, name_of: Mapping[Part, str], name: str) -> dict[str, Any]:
         """Return `name`, its `share` of the path (0 to 1), and the bounds `share_low` and `share_high` of the share.
 
-        The bounds are those of the 95 % interval; both are None if there are too few frames.
+        The bounds form the 95 % interval; both are None if there are too few frames.
 
         `name_of`: name of each part of the path, from `names`.
         """
@@ -470,7 +470,7 @@ class Budget:
         return {name: ns / total for name, ns in _by_name(self.ns_of, name_of).most_common()}
 
     def _half_width(self, name_of: Mapping[Part, str], name: str, other: str = "") -> float | None:
-        """Return half the 95 % interval of the share of `name`, less the share of `other` if one is given.
+        """Return half the 95 % interval of the share of `name`, or of this share minus the share of `other`.
 
         Return None if there are too few blocks.
         """

@@ -152,7 +152,7 @@ class PipelineStage(Described):
 
 
 class PipelineEdge(Described):
-    """The slots that a stage writes. In a chain the next stage reads them; in a graph, all readers of the stage.
+    """The slots that a stage writes. In a chain, the next stage reads them; in a graph, every reader of the stage does.
 
     `payload_bytes`: size of every packet's payload.
     `header`: dtype of every packet's header, made by `trilane.transport.packets.header_dtype`.
@@ -173,7 +173,7 @@ class Pipeline(Described):
     unit.
     `latency_to`: stage at whose end a frame's latency ends; empty for the last stage.
     `bypass`: names of two stages. If the first stage returns a `Skip` for a frame, the frame goes on to the second
-    stage, past the stages between. The edges behind the first and before the second have the same header.
+    stage, past the stages between. The edge behind the first and the edge before the second have the same header.
     `from_release`: whether the latency begins with a frame's release, as for a camera with a rate.
     `warms_up`: whether the stages of a chain do a frame before the run; must be False if a stage counts its calls.
     `module_folders`: folders where a unit's process first looks for the modules of factories.
@@ -337,7 +337,7 @@ def tables_of(
 def _reads(pipeline: Pipeline, place: int) -> str | dict[str, Any] | None:
     """Return the value of the key `in` of the stage at index `place`; None for a stage without inputs.
 
-    In a chain the value is the name of the stage before; in a graph it is a table with a key for each stage read.
+    In a chain the value is the name of the stage before. In a graph it is a table with a key for each input.
     """
     stage = pipeline.stages[place]
     if stage.inputs is None:
@@ -365,7 +365,7 @@ def unsaid(pipeline: Pipeline) -> Iterator[str]:
 def file_text(tables: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
     """Return the text of a pipeline file, TOML with one line for each key of a table.
 
-    A stage is one key of the table [stages]. Keys are written without quotes, which names of stages and units allow.
+    A stage is one key of the table [stages]. Keys have no quotes, so names of stages and units must be ASCII.
 
     `tables`: tables of the file, such as from `tables_of`. `comments`: lines before the tables.
     """

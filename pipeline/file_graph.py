@@ -97,9 +97,9 @@ def settings_of(file: PipelineFile, frames: int = 0, seed: int = 0, **others: An
 def edge_rules(file: PipelineFile) -> dict[str, str]:
     """Return the edge rule of each stream, by the name of the stage that writes it.
 
-    If the file states no rule, a stream has two slots. Where branches meet, a stream may need more slots, so that they
-    do not make the period longer with the file's times. If the file does not state all times, the slots are those for
-    equally long stages, each on a unit of its own. These slots are enough for any times, because no cycle has more
+    If the file states no rule, a stream has two slots. Where branches meet, two slots may make the period longer. Such
+    a stream gets just enough slots for the file's times. If the file does not state all times, the stages count as
+    equally long, each on a unit of its own. The slots for this case are enough for any times, because no cycle has more
     stages than slots. A run and all predictions of a file have the same slots.
     """
     given = {name: file.run.edge for name in file.readers} if file.run.edge else {}

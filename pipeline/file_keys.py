@@ -1,8 +1,8 @@
 """The keys of a pipeline file, each as one field: its type, its range and its meaning.
 
 Rule: this module checks one value at a time; `pipeline_file.py` checks values that must fit together. The tables of
-docs/pipeline-file.md come from the descriptions here. A pipeline file may come from a stranger. Therefore no file that
-it names is opened, and no module that it names is imported.
+docs/pipeline-file.md come from the descriptions here. A pipeline file may come from a stranger. Therefore this module
+opens no file that it names, and imports no module that it names.
 """
 
 from __future__ import annotations
@@ -95,7 +95,7 @@ Ms = Annotated[float, Field(ge=0, le=LONGEST_MS, allow_inf_nan=False)]
 
 
 class Arrivals(Keys):
-    """When frames arrive. `poisson`: mean rate of arrivals that are independent of each other, frames a second."""
+    """When frames arrive. `poisson`: mean rate of arrivals that are independent of each other, in frames a second."""
 
     poisson: Rate = Field(description="Mean rate in frames a second; arrivals are independent of each other.")
 
@@ -246,7 +246,7 @@ def read_input(port: str, value: object) -> PortInput:
 
 
 def _inside(text: str) -> str:
-    """Return the path `text`. Raise UnexpectedValue if it leads out of the file's folder, as a stranger's file may."""
+    """Return the path `text`. Raise UnexpectedValue if it leads out of the folder of the pipeline file."""
     normal = posixpath.normpath(text)
     if not text or "\0" in text or "\\" in text or normal in (".", "..") or normal.startswith(("/", "../")):
         remedy = "copy the file there, or put a link to it there"
@@ -255,7 +255,7 @@ def _inside(text: str) -> str:
 
 
 def _mp4(text: str) -> str:
-    """Return `text` if it ends with .mp4: otherwise a run could replace code or a network in the folder."""
+    """Return `text`, which must end with .mp4. With another name, a run could replace code or a network."""
     if not text.endswith(".mp4"):
         raise UnexpectedValue(repr(text), "a video to write, such as out.mp4", "let the name end with .mp4")
     return text
@@ -267,7 +267,7 @@ InsidePath = Annotated[str, Field(max_length=1000), AfterValidator(_inside)]
 class StageTime(Keys):
     """The time of one job of a stage, in ms: one of `mean`, `exponential`, `samples` and `source`.
 
-    `sd` belongs to `mean`, and `name` to `source`. `pipeline_file.py` replaces `source` by the times of that file.
+    `sd` belongs to `mean`, and `name` to `source`. `pipeline_file.py` replaces `source` by the times in the file.
     """
 
     mean: Ms | None = Field(default=None, description="Mean time, ms.")
@@ -340,7 +340,7 @@ def _pattern(text: str | None) -> str | None:
 
 
 class BypassKeys(Keys):
-    """The table `bypass` of a stage: frames without work for the next stages skip them, and go on to stage `to`."""
+    """The table `bypass` of a stage: a frame for which the next stages have no work skips them, up to stage `to`."""
 
     to: str = Field(
         pattern=NAME, description="Stage to which such a frame goes, two places or more behind in the row of stages."

@@ -1,14 +1,14 @@
-"""The process that units are forked from. Rule: it has one thread; it ends with its parent, and its units outlive it.
+"""The process that units are forked from. Rule: it has one thread and ends with its parent; its units may outlive it.
 
 `python -P -m trilane.pipeline.fork_server --socket FD --parent PID --preload MODULE,...` imports once the modules that
 every unit needs, then forks a unit for each request. Therefore a unit starts in milliseconds, without imports of its
 own.
 
-A request is one packet on a SOCK_SEQPACKET socket: JSON with descriptors. The descriptors are the unit's spec (a memory
-file with JSON for the unit's loop), its stderr, its lifeline, and the descriptors that the spec names. The answer is
-the unit's process id with its pidfd and a pipe. When the unit has ended, the server writes the exit code to this pipe,
-negative for a signal. A request with the key `call` names a function to call in place of a unit to start. The
-function's result goes to a pipe that comes with the request; the server gives no other answer.
+A request is one packet on a SOCK_SEQPACKET socket: JSON with descriptors. The descriptors are the unit's spec, stderr
+and lifeline, and the descriptors that the spec names. The spec is a memory file with JSON for the unit's loop. The
+answer is the unit's process id with its pidfd and a pipe. When the unit has ended, the server writes the exit code to
+this pipe, negative for a signal. A request with the key `call` names a function to call in place of a unit to start.
+The function's result goes to a pipe that comes with the request; the server gives no other answer.
 
 A lifeline is a pipe whose other end only the parent has: the kernel kills the unit when that end is closed.
 """
@@ -81,9 +81,9 @@ def serve(requests: socket.socket) -> None:
 
 
 def _reap(codes: dict[int, int], options: int) -> None:
-    """Reap the units that have ended, and write their exit codes to their pipes.
+    """Reap units that have ended, and write their exit codes to their pipes.
 
-    `options`: WNOHANG reaps units that have ended, 0 waits for all.
+    `options`: WNOHANG: reap the units that have ended by now; 0: wait for the ends of all units.
     """
     with contextlib.suppress(ChildProcessError):
         while (ended := os.waitpid(-1, options))[0]:

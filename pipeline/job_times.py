@@ -24,7 +24,7 @@ three numbers. It also proves that the busy times of units that share cores neve
 
 Rule for counts: instructions and cache misses are the processor's counts (perf_event_open), or are reported as absent.
 Only user mode counts. A counter covers the thread that opens it, and all threads that this thread or its children begin
-later; the kernel adds up their counts (`inherit`). A processor with fewer counters than events counts each event for a
+later. The kernel adds up their counts (`inherit`). A processor with fewer counters than events counts each event for a
 part of the time. Counts for a part of the time are scaled to the whole time.
 
 Each event is opened and read by itself, because `inherit` does not work with a group (`man 2 perf_event_open`). Some
@@ -157,7 +157,7 @@ class Lost(NamedTuple):
 def most_preempted_ns(wall_ns: int, cpu_ns: int, cores: int) -> int:
     """Return the longest time in ns for which a unit can have waited for its cores.
 
-    It is `wall_ns` less the CPU time for each core, if the CPU time is divided evenly among the cores.
+    It is `wall_ns` less `cpu_ns` / `cores`, which is the CPU time of each core if all have the same. It is at least 0.
 
     `wall_ns`: length of the piece of time.
     `cpu_ns`: CPU time of the unit's threads in it, summed over the threads.
@@ -169,9 +169,9 @@ def most_preempted_ns(wall_ns: int, cpu_ns: int, cores: int) -> int:
 def preempted_ns(wall_ns: int, cpu_ns: int, delay_ns: int, cores: int) -> int:
     """Return the time in ns for which a unit waited for its cores.
 
-    The sum of the times in which a thread was ready is cpu + delay. Therefore m = (cpu + delay) / wall threads were
-    ready at a time, but at least one. The unit waited for delay / m, but not longer than `most_preempted_ns`. With one
-    core the result is min(delay, wall - cpu).
+    The time in which threads were ready is cpu + delay, summed over the threads. Therefore, on average,
+    m = max((cpu + delay) / wall, 1) threads were ready. The unit waited for delay / m, but not longer than
+    `most_preempted_ns`. With one core the result is min(delay, wall - cpu).
 
     `wall_ns`: length of the piece of time.
     `cpu_ns`, `delay_ns`: CPU time and run delay of the unit's threads in it, summed over the threads.
@@ -204,7 +204,7 @@ JOBS_PER_LOOK: Final = 64  # jobs between two searches for new threads, if no jo
 
 
 class JobClock:
-    """Measures the jobs of a unit.
+    """Measures the jobs of a unit. The calls for a job are `begin`, `end`, `done` and `answered`, in this order.
 
     `meter`: meter of the unit's process.
     `cores`, `stages`: number of cores and of stages of the unit.

@@ -47,9 +47,9 @@ EXPECTED = "the journal of a run"
 class Begun(NamedTuple):
     """The first record.
 
-    `facts`: JSON values known before the first frame, with the keys of report.json where they are known: `clock`
-    ("host" or "virtual"), `began_at` (UTC, ISO 8601), `config`, `machine`, `made`, `accuracy`, `units`. Also
-    `target_period_ns`, as for `trilane.scheduler.stats.due_ns`; journals of an older Trilane lack it.
+    `facts`: JSON values that are known before the first frame, by their keys in report.json. They may be `clock`
+    ("host" or "virtual"), `began_at` (UTC, ISO 8601), `config`, `machine`, `made`, `accuracy` and `units`. Another key
+    is `target_period_ns`, as for `trilane.scheduler.stats.due_ns`; journals of an older Trilane lack it.
     """
 
     schema: int
@@ -342,7 +342,7 @@ def config_of(begun: Begun) -> Mapping[str, Any]:
 
 
 def _has_form_of_a_run(config: Any) -> TypeGuard[Mapping[str, Any]]:
-    """Return whether the tables of a configuration, and the values in them that readers compute with, have a type."""
+    """Return whether the tables of a configuration, and some values that readers compute with, have the right types."""
     names = ("units", "scene", "pace_ns", "pipeline")
     if not isinstance(config, Mapping) or not all(isinstance(config.get(name, {}), Mapping) for name in names):
         return False
@@ -358,7 +358,7 @@ def _has_form_of_a_run(config: Any) -> TypeGuard[Mapping[str, Any]]:
 def target_period_ns(begun: Begun) -> int:
     """Return `target_period_ns` of a journal's first record. Raises BadInputError as `config_of` does.
 
-    If the journal lacks it, the value comes from the rate of the run's scene.
+    If the journal lacks it, the result is 0 for frames with a deadline, else the period of the scene's rate.
     """
     written, settings = begun.facts.get("target_period_ns"), begun.settings
     if type(written) is int and 0 <= written < NEVER:
@@ -388,7 +388,7 @@ _Checks = tuple[tuple[Callable[[Any], Any], ...], ...]
 
 
 def _checks(run: RunValues) -> _Checks:
-    """Return functions that check, and return, the fields of each type of record, in the order of RECORDS."""
+    """Return, for each type in RECORDS, a function for each field. It checks and returns the field's value."""
     of: dict[type[Any], tuple[Callable[[Any], Any], ...]] = {
         Begun: (),
         Stepped: (run.step_ns, run.events, run.actions),

@@ -1,7 +1,7 @@
 """Checks the values of a journal's records.
 
 Rule: each function takes a value that was read from an untrusted file. It returns the checked value, or raises
-UnexpectedValue in plain words. What the checks remember of earlier records does not grow with the run.
+UnexpectedValue in plain words. The memory that the checks need does not grow with the run.
 """
 
 from __future__ import annotations

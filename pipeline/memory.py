@@ -200,7 +200,7 @@ class ByteCounter:
     least: int = 0
 
     def start(self, passed_on: int = 0) -> None:
-        """Begin a frame. `passed_on`: bytes of the header that is copied from input slot to output slot; 0: none is."""
+        """Begin a frame. `passed_on`: bytes of the header that is copied from input to output slot; 0: no header is."""
         self.read = self.written = passed_on
         self.uploaded = self.read_back = self.least = 0
 

@@ -3,8 +3,8 @@
     file = read_pipeline(Path("street.toml"))
     file.stages["detector"].unit, stage_inputs(file.stages["overlay"])
 
-Rule: a defect becomes one BadInputError that names the file and the key. The file may come from a stranger: sizes are
-checked before memory is allocated, no path leads out of its folder, and no module that it names is imported.
+Rule: a defect becomes one BadInputError that names the file and the key. The file may come from a stranger. Sizes are
+checked before memory is allocated, no path leads out of the file's folder, and no module of the file is imported.
 """
 
 from __future__ import annotations
@@ -124,9 +124,9 @@ class PipelineFile:
 
     @property
     def out_of_row(self) -> str:
-        """The first stage that is not as in a chain; "" in a chain.
+        """The name of the first stage that breaks the chain; "" if all stages form a chain.
 
-        It leaves out frames, or does not read exactly the stage before it.
+        This stage leaves out frames, or does not read exactly the stage before it.
         """
         before: tuple[PortInput, ...] = ()
         for name, stage in self.stages.items():
@@ -360,7 +360,7 @@ def _inputs(value: object, where: str) -> tuple[PortInput, ...]:
 
 
 def _check_ports(stage: StageKeys, where: str) -> None:
-    """Check that a stage reads only through ports of its kind, and through all that the kind needs."""
+    """Check that a stage reads through no port that its kind lacks, and through all ports that its kind needs."""
     known = stage.in_ports
     if known is None:
         return
@@ -383,7 +383,7 @@ def _check_ports(stage: StageKeys, where: str) -> None:
 
 
 def _in_order(stages: Mapping[str, StageKeys], path: Path) -> dict[str, StageKeys]:
-    """Return the stages in their own order, changed only so that each stage follows the stages that it reads.
+    """Return the stages in the order of the file, changed only so that each stage follows the stages that it reads.
 
     Raises BadInputError for an unknown stage or port, and for stages that wait for each other in a circle.
     """
@@ -593,6 +593,6 @@ def _with_value(tables: Mapping[str, Any], parts: Sequence[str], value: object) 
 def stage_inputs(stage: StageKeys) -> tuple[PortInput, ...]:
     """Return one input, without names of ports, for each stage that `stage` reads.
 
-    All ports of a stage belong to one stream.
+    All ports that a stage writes belong to one stream.
     """
     return tuple({each.stage: replace(each, port="", from_port="") for each in stage.inputs}.values())

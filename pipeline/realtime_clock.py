@@ -2,7 +2,7 @@
 
 Rule: the clock waits and carries out the core's actions; it decides nothing. `wait` turns messages of the units,
 signals and the governor's duties into events; `perform` turns actions into messages. The shares of the units include
-the time for which a viewer held the run, and a message states this time (`HeldTime`).
+the time for which a viewer held the run; a message states how long this was (`HeldTime`).
 
 Rule: CPU time counts only within the run. If figures contradict each other, or were not measured, a message says so. A
 unit's CPU time covers all threads of its process, including threads that a runtime lets spin between jobs. Units that
@@ -117,7 +117,7 @@ class CpuTimes:
 def use_of_cores(
     cores: Mapping[str, Sequence[int]], cpu_s: Mapping[str, float], busy: Mapping[str, float], duration_s: float
 ) -> list[CoreUse]:
-    """Return the use of each set of cores that is the set of a unit, and of all cores together.
+    """Return the use of each unit's set of cores, and of all cores together, the smallest set first.
 
     `cores`: numbers of the cores of each unit.
     `cpu_s`: CPU time of each unit in seconds.
@@ -182,11 +182,11 @@ class ClockGovernor(Protocol):
 
 
 class RealtimeClock:
-    """The `trilane.scheduler.core.Clock` of one run of `core` on the unit processes `processes`.
+    """The host clock of one run: a `trilane.scheduler.core.Clock` for `core`, with the units in `processes`.
 
-    `on_progress`: function that is called with (number of presented frames, number of frames of the run); None: none.
+    `on_progress`: function that is called with (number of presented frames, number of frames of the run), or None.
     `sketch`: function that makes a sketch, as for `trilane.scheduler.stats.Samples`.
-    `requests`, `controls`: requests for frames, and to the run; None: none.
+    `requests`, `controls`: frame requests, and other requests to the run; None: none.
     `metrics`: sums of each stage's metrics over the jobs that `ended` has returned, by stage and metric.
     `reported`: number of these jobs that reported each metric, by stage and metric.
     `cpu`: CPU time of units and stages in these jobs.
@@ -370,7 +370,7 @@ class RealtimeClock:
         return [Pinged(unit) for unit in units]
 
     def _tell_stopped(self, now_ns: int) -> None:
-        """Note units that a signal has stopped. When a stopped unit runs again, log how long it was stopped."""
+        """Note units that a signal has stopped. If a stopped unit runs again, log how long it was stopped."""
         stopped = self._processes.stopped
         for unit in stopped - self._stopped_ns.keys():
             self._stopped_ns[unit] = now_ns

@@ -7,8 +7,8 @@ equal answers.
 The bound is found by replays in virtual time (`WhatIf`). Each replay makes one stage slower, and shows what this costs.
 The stage that costs most bounds the run.
 
-A share of the critical path says how the time was spent. The share does not say how a run reacts to a longer job: the
-kernel moves a longer job to another core more often, and takes that core from a unit that was on no path. Therefore
+A share of the critical path says how the time was spent. It does not say how a run reacts to a longer job. The kernel
+moves a longer job to another core more often, and takes that core from a unit that was on no path. Therefore
 some of the run's frames are replayed (`trilane.scheduler.virtual`), with the CPU times of their own jobs, the run's
 placement and the run's scheduler. For each stage these frames are replayed once more, with all jobs of the stage longer
 by SLOWER.
@@ -61,7 +61,7 @@ class Cost(NamedTuple):
     of_blocks: tuple[float, ...]
 
     def half_width(self, other: Cost | None = None) -> float | None:
-        """Return half the 95 % interval of `share`, less the share of `other` if given; None for too few blocks."""
+        """Return half the 95 % interval of `share`, or of `share - other.share`; None for too few blocks."""
         others = other.of_blocks if other is not None else (0.0,) * len(self.of_blocks)
         return batch_interval([a - b for a, b in zip(self.of_blocks, others, strict=True)])
 
@@ -223,7 +223,8 @@ class RunEfficiencies:
     def add(self, job: JobRecord, *, presents: bool) -> None:
         """Take a job; call this in the order of the jobs' ends.
 
-        A job counts from when a frame is presented at its end or later.
+        A job counts as soon as a frame is presented at the job's end or later.
+
         `presents`: whether this job presents a frame.
         """
         self._unsettled.append(job)
@@ -239,7 +240,7 @@ class RunEfficiencies:
         """Return `efficiency`, `core_efficiency` and `machine_efficiency` of a report; called after all jobs.
 
         `efficiency` is the work of the slowest unit, as a share of the time. `core_efficiency` is the CPU time of the
-        units that run only on the fullest set of cores, as a share of the time that this set had.
+        units that run only on the fullest set of cores, as a share of that set's time.
         `machine_efficiency` is the CPU time of all units, as a share of the time that all cores had. All are None for
         fewer than two presented frames.
         """

@@ -4,8 +4,8 @@ The rehearsal measures the work of each unit for a frame. Rule: frames go throug
 frame at a time.
 
 Every frame goes through all stages before the next frame begins, and the slots of an edge are used in turn. This
-matters because the time of a stage depends on the stage's last frame, on the content of its slot, and on how long the
-stage has rested. Only time in which the unit had its cores counts, because other programs may use the machine.
+matters: the time of a stage depends on its last frame, the content of its slot, and how long the stage has rested.
+Only time in which the unit had its cores counts, because other programs may use the machine.
 
 The trial measures the frame times of a few placements. Rule: placements run in turns, a few frames each, and all do the
 same frames.
@@ -100,9 +100,8 @@ def on_rungs(chain: Chain, frames: Sequence[int], rungs: int, follow: Sequence[s
     Rung 0 is all the work; each further rung is a smaller share of it.
 
     Each time is the median over `frames`. All frames are done on one rung before the next rung, so that no stage does
-    the same frame twice in a row. With several frames, the first frame of each rung warms up and does not count. If a
-    further rung does not make a stage faster, the stage is left out. An example is a scene with nobody on the screen in
-    these frames.
+    the same frame twice in a row. With several frames, the first frame of each rung warms up and does not count. A
+    stage that is not faster on each further rung is left out, for example if nobody is on the screen in these frames.
 
     `frames`: numbers of the frames that are done.
     `rungs`: number of rungs.
@@ -220,7 +219,7 @@ Cores = Mapping[str, tuple[int, ...]]
 
 
 class Group(NamedTuple):
-    """Placements with the same numbers of threads, which the same processes can have in turn.
+    """Placements with the same numbers of threads. The same processes can be moved from one to another.
 
     `pipeline`: pipeline of these processes; the cores in its settings do not matter.
     `places`: for each placement, the cores of each unit.

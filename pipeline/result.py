@@ -71,7 +71,7 @@ class RunResult:
     `startup_ms`: start-up time of each unit in ms.
     `jobs`, `recording`: jobs and steps of a run without a journal. With a journal both are empty, because the journal
     has the jobs and steps.
-    `metrics`: mean of each metric of each stage, over the jobs that reported it.
+    `metrics`: mean of each metric of each stage, over the jobs that reported it; counts of bytes are left out.
     `rungs`: number of presented frames on each rung, for a run with a ladder of work.
     `rung_switches`: how often a frame had another rung than the frame before.
     `messages`: messages about problems during the run, such as a unit that died and was restarted.
@@ -143,7 +143,7 @@ class RunLog:
         self.failure = self.failure or Failure(text, exit_code)
 
     def fail_with(self, message: Failed) -> None:
-        """If it is the first failure of the run, note a stage's error as failure and as message."""
+        """Note a stage's error as failure and as message; do nothing if the run has failed before."""
         if self.failure is None:
             self.fail(message.message, message.exit_code)
             self.say(message.message)
@@ -160,7 +160,7 @@ def after_stderr(tail: str) -> str:
 
 FLUSH_NS = 250_000_000
 SAMPLE_NS = 5_000_000_000
-STEPS_AT_ONCE = 64  # some twelve frames
+STEPS_AT_ONCE = 64  # of about twelve frames
 PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
@@ -210,9 +210,9 @@ class _KeptRun:
         self._source: JobSource | None = None
 
     def begin(self, source: JobSource, pids: Callable[[], Mapping[str, int]]) -> None:  # noqa: ARG002 - a journal has them
-        """Note that the scheduler's loop begins. The jobs that `source` gives are read after the run.
+        """Note that the scheduler's loop begins. The jobs of `source` are read after the run.
 
-        They would slow units on the scheduler's core. `pids`: function that returns the present process ids.
+        To read them during the run would slow units on the scheduler's core. `pids`: not used.
         """
         self._source = source
 
@@ -364,7 +364,7 @@ def recorded(
 
     `file`: journal of the run; None: the record is in memory.
     `caps`: governor that sets the units' duties, or None.
-    `target_period_ns`: as for `trilane.scheduler.stats.due_ns`; the journal names it.
+    `target_period_ns`: as for `trilane.scheduler.stats.due_ns`, for the journal.
 
     Raises BadInputError if the file cannot be made.
     """

@@ -3,8 +3,8 @@
 A run with a journal keeps at most MOST_EXACT times of each kind. Percentiles of more times come from the library
 ddsketch, within RELATIVE_ERROR of the exact values. Source: Masson, Rim, Lee, "DDSketch: A Fast and Fully-Mergeable
 Quantile Sketch with Relative-Error Guarantees", PVLDB 12 (2019). The sketch counts values in bins. Each bin is wider
-than the bin before by the same factor, so each value is known within this factor. _BINS bins reach from a nanosecond to
-centuries.
+than the bin before by the same factor, so each value is known within this factor. The _BINS bins reach from a
+nanosecond to 19 years.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def run_pipeline(
     ladder counts only if frames are released at a rate. A frame that would be late gets less work
     (`trilane.scheduler.policy`), and the first stage gets the rung (`SteppedStage`).
     `follow`: names of the stages that take less time for less work.
-    `settings`: settings of the scheduler, which replace `frames` and the options above except `fps`.
+    `settings`: settings of the scheduler, which replace all parameters above but `pipeline`, `fps` and `assets`.
     `requests`: queue of frame requests, at most `frames` in sum; this function closes it.
     `controls`: requests to the run; this function closes them. With `controls` or `requests`, only released frames
     count as requested in the report.
@@ -134,8 +134,8 @@ def run_pipeline(
     `on_progress(presented, requested)`: function that is called, in this thread, with numbers of frames.
     `on_message(text)`: function that is called, in this thread, with each message about a problem.
 
-    SIGINT, SIGTERM, SIGHUP or SIGQUIT ends the run cleanly, and its result is `interrupted`. A second signal ends the
-    units at once. Before the first frame, a signal raises KeyboardInterrupt.
+    In the main thread, SIGINT and the other signals of `trilane.signals.that_end` end the run cleanly; its result is
+    `interrupted`. A second signal ends the units at once. Before the first frame, a signal raises KeyboardInterrupt.
 
     Raises BadInputError for bad settings, and if a unit's process calls this function. Raises TrilaneError, with the
     exit code of the unit's error, if a unit cannot start; a later failure is in `RunResult.failure`.

@@ -40,8 +40,9 @@ class FrameCounts(Record):
 
     `requested`: number of frames that the run was asked for.
     `presented`: number of frames that reached the end of the last stage.
-    `lost`: number of frames that were begun and not presented, because a unit died or a stage failed.
-    `lost_by_cause`: numbers of lost frames by `cause:unit`; for the cause `failed` by `failed:stage`.
+    `lost`: number of frames in flight whose unit died, hung or was given up, whose stage failed, or whose run was
+    aborted.
+    `lost_by_cause`: numbers of lost frames by `cause:unit`, `failed:stage` or `aborted`.
     `dropped`: numbers of dropped frames, by `edge:cause`.
     `not_begun`: number of frames that no stage took before the run ended; null in older reports.
     `skipped`: number of presented frames that took the pipeline's bypass; absent without a bypass.
@@ -98,8 +99,8 @@ class FrameTimes(TimeSummary):
 
     `ema20_min`, `ema20_max`: smallest and largest exponential average over 20 frames; null without a frame time.
     `jitter`: mean absolute difference of successive frame times; null for fewer than two.
-    `mean_low`, `mean_high`: bounds of the 95 % interval of the mean, from the scatter of this run's frames (batch
-    means); null if there are too few frames.
+    `mean_low`, `mean_high`: bounds of the 95 % interval of the mean, from batch means of this run's frames; null if
+    there are too few frames.
     """
 
     ema20_min: float | None
@@ -159,7 +160,7 @@ class StageTimes(Record):
 
     `unit`: name of the unit that ran the stage.
     `jobs`: number of the stage's jobs that have ended.
-    `service_ms`: times from a job's begin to its end, including time in which another process had the core.
+    `service_ms`: times from a job's begin to its end, including time in which another thread had the core.
     `wait_ms`: times from when a job's input was there to the job's begin.
     `cpu_ms`: CPU times of the jobs over all threads of the unit; on the host clock.
     `bytes`: bytes that the stage moved for a presented frame; absent if it does not count them.
@@ -237,7 +238,7 @@ class CoreShare(Record):
 
 
 class UnitCap(Record):
-    """The cap of one unit: the corner, and so the share of the time, that the governor allowed it.
+    """The cap of one unit: the corner that the governor allowed it, and the duty that follows from the corner.
 
     `corner`: corner at the run's end.
     `duty`: duty at the run's end, 0 to 1.
@@ -351,7 +352,7 @@ class PathShares(Record):
 
 
 class FramesBehind(Record):
-    """Numbers of frames by which newest frames were older than the frames of the jobs that took them: `mean`, `max`."""
+    """By how many frames a taken frame was older than the frame of the job that took it: `mean` and `max`."""
 
     mean: float
     max: int
@@ -392,7 +393,7 @@ class Bound(PathShares):
 
     `unit`: unit that bounded the run; its name is the report's `bottleneck`.
     `stage`: stage that bounded the run; null if no stage did.
-    `path`: largest parts of the path; absent if their names are those of `unit` and `stage`.
+    `path`: largest parts of the path; absent if they have the names of `unit` and `stage`.
     `stages`: share of each stage in the path, the largest first; absent in older reports.
     `slowed`: cost of slowing each stage; absent if the run was not replayed.
     """
@@ -415,8 +416,8 @@ class PolicyMetrics(Record):
     `stages`: times of each stage, in the order of the pipeline.
     `bytes`: bytes that all stages moved for a presented frame; absent if no stage counts them.
     `units`: shares of each unit.
-    `efficiency`: work of the slowest unit's jobs, as a share of the time between the first and the last presented
-    frame; null for fewer than two.
+    `efficiency`: work of the slowest unit's jobs, as a share of the time from first to last presented frame; null for
+    fewer than two.
     `core_efficiency`: CPU time of the jobs on the fullest set of cores, as a share of the time that this set had.
     `machine_efficiency`: CPU time of all jobs, as a share of the time that all cores of the run had.
     `bottleneck`: name of the bound of the frame time: a unit, or another owner of time, such as `other programs`,
@@ -447,7 +448,7 @@ class PolicyMetrics(Record):
     @field_validator("fps")
     @classmethod
     def _know_no_rate_of_one_frame(cls, fps: float | None, known: ValidationInfo) -> float | None:
-        """Replace the rate 0, as ledgers and older reports have it, by null if fewer than two frames were presented."""
+        """Return None if fewer than two frames were presented; ledgers and older reports have the rate 0 then."""
         frames = known.data.get("frames")
         return fps if frames is None or frames.presented > 1 else None
 
@@ -456,10 +457,10 @@ class RunMetrics(PolicyMetrics):
     """All figures of a run.
 
     `clock`: `host`, measured on this machine, or `virtual`, computed from a hardware profile.
-    `duration_s`: time in seconds from the first job to the end of the run.
+    `duration_s`: time in seconds from when all units are ready to the end of the run.
     `percentiles`: text that says whether percentiles are exact or from a sketch, with its error; on the host clock.
     `xrbench`: XRBench's scores.
-    `edge`: edge rule of the scheduler.
+    `edge`: edge rule; if edges have different rules, all rules, joined by commas.
     `idle_cores`: text that says whether cores without work stayed awake, or why not; on the host clock.
     `other_programs`: share of other programs in the time of the run's cores; null if a unit died.
     `processor`: clock and throttling of the run's cores; null in virtual time and in older reports.

@@ -70,8 +70,8 @@ class JoiningStage(Protocol):
         The header of the output slot already has the frame's number and the sampling time of the oldest input. Inputs
         that take the newest frame do not count for this time. The header has no other fields of the inputs.
 
-        `slots_in`: slot of each input; None for an input that takes the newest frame, while it has no frame, or
-        only one that is too old.
+        `slots_in`: slot of each input. None for an input that takes the newest frame, if it has no frame or only one
+        that is too old.
         """
 
     def close(self) -> None:
@@ -82,17 +82,17 @@ class SteppedStage(Stage, Protocol):
     """The first stage of a pipeline with a ladder, whose frames may get less work (`works` of `run_pipeline`)."""
 
     def step_to(self, rung: int) -> None:
-        """Give frames the work of `rung` from now on. The first rung is 0; called before `run` after each change."""
+        """Give frames the work of `rung` from now on; called before `run` if the rung changes. The first rung is 0."""
 
 
 class SkippingStage(Stage, Protocol):
     """The stage at which a pipeline's bypass begins. Its `run` may return a `Skip`."""
 
     def forget(self) -> None:
-        """Forget the results that earlier frames brought to the bypass's end; the next frame must not rely on them.
+        """Forget what earlier frames brought to the end of the bypass; the next frame must not rely on these results.
 
-        Called before `run` for the first frame. Called again after the unit at the bypass's end was restarted, and
-        after a frame that did not skip was lost or dropped before the bypass's end.
+        Called before `run` for the first frame. Called again after the unit at the bypass's end was restarted. Called
+        too after a frame that did not skip was lost or dropped before the bypass's end.
         """
 
 
@@ -155,14 +155,14 @@ Ports = Mapping[str, str]
 
 
 def payload_bytes(ports: Mapping[str, PortType]) -> int:
-    """Return the size in bytes of a slot with these ports, by name."""
+    """Return the size in bytes of a payload with these ports, each filled up to whole cache lines."""
     return sum(-(-port.payload_bytes // LINE) * LINE for port in ports.values())
 
 
 def views(payload: U8, ports: Mapping[str, PortType]) -> dict[str, NDArray[Any]]:
-    """Return a view of a slot for each port, by the port's name. Raises ValueError if the slot is too small.
+    """Return the array of each port, a view of its bytes, by name. Raises ValueError if the payload is too small.
 
-    `payload`: bytes of the slot.
+    `payload`: (bytes,) uint8, payload of a slot.
     """
     found: dict[str, NDArray[Any]] = {}
     start = 0
@@ -180,7 +180,7 @@ class PortRead(Model):
 
     `name`: name of the reading port.
     `stream`: index, among the stage's inputs, of the stream that is read.
-    `port`: name of the port of this stream that is read.
+    `port`: name of the port that is read in this stream.
     """
 
     name: str
@@ -251,7 +251,7 @@ class PortedStage:
 
     @property
     def sampled_ns(self) -> int:
-        """The time in ns, on CLOCK_MONOTONIC, at which the frame in work was sampled; 0 for a stage without inputs."""
+        """The earliest sampling time of the inputs that `run` got, in ns of CLOCK_MONOTONIC; 0 if it got none."""
         taken = [of[slot] for of, slot in zip(self._headers, self._slots, strict=True) if slot is not None]
         return min((int(header["t_sampled_ns"]) for header in taken), default=0)
 
@@ -269,7 +269,7 @@ class PortedStage:
     def _views(self, place: int, packet: Packet, ports: Mapping[str, PortType]) -> Mapping[str, NDArray[Any] | None]:
         """Return the read-only arrays of a slot, by port. `place`: number of the slot.
 
-        The stage at which a bypass begins may lack a port; in its slots the port has None in place of an array.
+        A slot that comes by a bypass may lack a port, or have it with another type. Such a port has no array but None.
         """
         passed = self.settings.bypass
         if passed is None or place < passed.behind:
@@ -289,7 +289,7 @@ class PortedStage:
         """Prepare for the first frame; called once, after the arrays of all slots are made."""
 
     def work(self, frame: int, arrays: Sequence[NDArray[Any] | None], outputs: Arrays) -> Mapping[str, float]:
-        """Do a frame, and return metrics by name; a `Skip` sends the frame to the bypass that begins at the stage.
+        """Do a frame, and return metrics by name; a `Skip` sends the frame over the bypass that begins at the stage.
 
         `arrays`: read-only array of each of `reads`. It is None for an input with `latest` that has no frame, or only
         one that is too old. It is also None if the frame took a bypass that lacks the port.

@@ -33,7 +33,7 @@ LEAST_FILES = 96
 
 
 def refuse_in_a_unit() -> None:
-    """Raise BadInputError if a unit's process calls this, because its module would start units without end."""
+    """Raise BadInputError in a unit's process: a module that starts a run on import would start units without end."""
     spec = sys.modules["__main__"].__spec__
     if spec is not None and spec.name == fork_server.__name__:
         found = "run_pipeline was called while a unit imported its stages"
@@ -159,8 +159,8 @@ def on_cores(cores: tuple[int, ...]) -> Iterator[None]:
 def prompt_answers() -> Iterator[None]:
     """Make the scheduler, in this thread, answer at once inside the `with` block.
 
-    It does not wait for the time slice of a unit on its core, or for a thread that draws a progress bar. Garbage
-    collection is off, because a run makes no reference cycles.
+    The scheduler then does not wait for the time slice of a unit on its core, or for a thread that draws a progress
+    bar. Garbage collection is off, because a run makes no reference cycles.
     """
     switch_s, collects = sys.getswitchinterval(), gc.isenabled()
     sys.setswitchinterval(SWITCH_S)

@@ -60,7 +60,7 @@ class Presented(NamedTuple):
 
     @property
     def before_ns(self) -> int | None:
-        """The time at which the frame before it was presented; None where `interval_ns` is."""
+        """The time at which the frame before it was presented; None if `interval_ns` is None."""
         return None if self.interval_ns is None else self.end_ns - self.interval_ns
 
 
@@ -152,7 +152,7 @@ class Timeline:
     `units`: recent past of each unit, by name.
     `start_ns`: time at which the last unit became ready, so that the run started; None before.
     `is_over`: whether the run is over.
-    `span`: time from the start of the run to the step that finished the run; None before this step, and for a run that
+    `span`: time from the start of the run to the step that finished the run. None before this step, and for a run that
     never started.
     `presented`: number of presented frames.
     `skipped`: number of presented frames that took the bypass.
@@ -213,7 +213,7 @@ class Timeline:
     def waiting(self, stage: str) -> list[int]:
         """Return the numbers of the frames that wait before `stage`, the oldest first.
 
-        Before the first stage, they are the released frames.
+        Before the first stage, these are released frames.
         """
         return self._track.waiting(stage)
 

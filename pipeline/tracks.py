@@ -125,7 +125,7 @@ class ChainTrack:
         return GoneFrame(frame, self._leave(frame, now_ns))
 
     def lost_for(self, _cause: str, _now_ns: int) -> GoneFrame | None:
-        """Return the next frame that was lost for a key of the report; None, as `lose` returns lost frames."""
+        """Return None: `lose` has returned the lost frames of a chain already."""
         return None
 
     def dropped_for(self, cause: str, now_ns: int) -> GoneFrame:
@@ -242,7 +242,7 @@ class GraphTrack:
         """Do nothing, because the second scheduler has taken the event."""
 
     def lose(self, _frame: int, _now_ns: int) -> GoneFrame | None:
-        """Return None: `lost_for` returns lost frames."""
+        """Return None: `lost_for` returns the lost frames of a graph."""
         return None
 
     def lost_for(self, cause: str, now_ns: int) -> GoneFrame:

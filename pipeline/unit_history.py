@@ -61,7 +61,7 @@ class Handed(NamedTuple):
 class IdleSlice(NamedTuple):
     """A time in which no job ran on the unit, for one cause.
 
-    `cause`: one of IDLE_CAUSES, JOIN or UNEXPLAINED.
+    `cause`: OVERHEAD, UNEXPLAINED, or one of the names in `trilane.scheduler.ledger.NAMES`, such as JOIN.
     `preempted_ns`: part of this time in which the unit had no core.
     `late`: for JOIN, the stages whose output was missing when the slice began, joined by commas; else "".
     """
@@ -102,7 +102,7 @@ class UnitHistory:
     # its process
 
     def rise(self, now_ns: int) -> int | None:
-        """Note that the process is up. Return the time in ns since which it was down; None for its first start.
+        """Note that the process is up. Return the time in ns at which it went down; None for its first start.
 
         While a kill of the process is under way, note nothing and return None.
         """
@@ -198,7 +198,7 @@ class UnitHistory:
         return {cause: ns for cause, ns in found.items() if ns}
 
     def _add_not_handed(self, found: dict[str, int], begin_ns: int, end_ns: int, heard_ns: int) -> None:
-        """Add to `found` the causes of a time in which the unit had neither the job nor another one."""
+        """Add to `found` the ns of each cause, for a time in which the unit had neither this job nor another."""
         if end_ns <= begin_ns:
             return
         explained_ns = 0
@@ -210,7 +210,7 @@ class UnitHistory:
         found[OVERHEAD] += end_ns - begin_ns - explained_ns
 
     def _causes(self, begin_ns: int, end_ns: int) -> Iterator[tuple[str, int, int]]:
-        """Yield (cause, begin in ns, end in ns) of a time, the latest first, from the first kept change on."""
+        """Yield (cause, begin in ns, end in ns) of the parts of a time since the first kept change, latest first."""
         for since_ns, cause in reversed(self._changes):
             if since_ns < end_ns:
                 yield cause, max(since_ns, begin_ns), end_ns
@@ -248,9 +248,9 @@ class UnitHistory:
 class IdleCutter:
     """Divides the idle time of `units` into slices, in the order of their ends, during a run or after it.
 
-    For each step the caller calls `settle` and then `step`. The next calls are `account` for each account that the step
-    changed, and `job` for each job whose end the scheduler heard of in the step. The last call is `end`. `settle` and
-    `end` return the slices that are complete.
+    For each step the caller calls `settle` and then `step`. After that it calls `account` for each account that the
+    step changed, and `job` for each job whose end the scheduler heard of. The last call is `end`. `settle` and `end`
+    return the slices that are complete.
     """
 
     def __init__(self, units: Iterable[UnitHistory]) -> None:
@@ -285,7 +285,7 @@ class IdleCutter:
             self._hold(unit.note_idle(since_ns, OVERHEAD))
 
     def job(self, unit: UnitHistory, job: JobRecord) -> None:
-        """Note a job of which the scheduler heard in the last step; a unit's jobs come in the order of their ends."""
+        """Note a job whose end the scheduler heard of in the last step; a unit's jobs come in order of their ends."""
         self._hold(unit.cut(job))
 
     def end(self) -> list[IdleSlice]:

@@ -196,7 +196,7 @@ class Join:
     """The inputs of a `JoiningStage`, which takes one slot of each input for a job.
 
     `inputs`: slots of each input.
-    `is_source`: whether all inputs take the newest frame, so that the source gives the stage's frames.
+    `is_source`: whether all inputs take the newest frame, so that the run's source releases the stage's frames.
     """
 
     def __init__(self, inputs: Sequence[list[Packet]], latest: Sequence[bool]) -> None:
@@ -227,7 +227,7 @@ def hold_until(end_ns: int) -> None:
 
 
 def _header_copier(inputs: list[Packet], outputs: list[Packet]) -> Callable[[int, int], None]:
-    """Return a function of (input slot, output slot) that copies the header; of different kinds only FRAME_FIELDS."""
+    """Return a function of (input slot, output slot) that copies the header, or only FRAME_FIELDS if dtypes differ."""
     if inputs and outputs and inputs[0].header.dtype != outputs[0].header.dtype:
         return lambda slot_in, slot_out: _copy_fields(inputs[slot_in].header, outputs[slot_out].header)
     sources, targets = [_bytes_of(packet) for packet in inputs], [_bytes_of(packet) for packet in outputs]

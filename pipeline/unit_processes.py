@@ -3,8 +3,8 @@
 Rule: every process that is started here is ended here, and its end is always noticed. This file has the time limits for
 starts and ends.
 
-A unit's messages come over its link (job pipe and heartbeat socket), its stderr over a pipe, and the end of its process
-over a pidfd. One poller waits for all of these.
+A unit's messages come over its link (job pipe and heartbeat socket), and its stderr over a pipe. A pidfd shows the end
+of its process. One poller waits for all of these.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class _Process:
             signal.pidfd_send_signal(self.pidfd, signal.SIGKILL)
 
     def wait(self) -> None:
-        """Wait until the process has ended. Then kill the processes that it started (its process group)."""
+        """Wait until the process has ended, then kill the processes that it started (its process group)."""
         poller = select.poll()  # select(2) takes no descriptor above 1023
         poller.register(self.pidfd, select.POLLIN)
         poller.poll()
@@ -89,9 +89,9 @@ class _Process:
             os.killpg(self.pid, signal.SIGKILL)
 
     def killed_by(self) -> int:
-        """Return the number of the signal from elsewhere that ended the process; 0 if this is not known.
+        """Return the number of the signal from outside this run that ended the process.
 
-        It is 0 if `kill` or no signal ended the process, or if the fork server is gone.
+        Return 0 if `kill` or no signal ended the process, or if the fork server is gone and the signal is not known.
         """
         poller = select.poll()
         poller.register(self.code_fd, select.POLLIN)
@@ -112,7 +112,7 @@ class UnitProcesses:
     `assets_fd`: descriptor of the assets.
     `starter`: fork server.
     `stderr_tails`: stderr tail of each unit's last process that has ended.
-    `signals`: number of the signal from elsewhere that ended this process, by unit; 0: none.
+    `signals`: number of the signal from outside this run that ended the same process, by unit; 0: none is known.
     `places`: index of each stage among the stages of its unit, by the stage's name; messages use this index.
     """
 
@@ -214,7 +214,7 @@ class UnitProcesses:
     def why_ended(self, unit: str) -> str:
         """Return the end of a sentence about a unit's death, with all that is known about the cause.
 
-        It names the signal, the last line of stderr, and a lack of memory.
+        This may be the signal, the last line of stderr, and a lack of memory.
         """
         number = self.signals.get(unit, 0)
         killed = f"it was killed by signal {number}" if number else ""
@@ -246,7 +246,7 @@ class UnitProcesses:
             self.listen(50)
 
     def _job_messages(self, process: _Process) -> list[UnitMessage]:
-        """Return the next message of the job pipe, if any, as a list. While more wait, the pipe stays readable."""
+        """Return a list with the next message of the job pipe, if any. The pipe stays readable while more wait."""
         try:
             message = process.link.job_pipe.receive()
         except MessageError as error:
@@ -372,7 +372,7 @@ def listen_before_run(processes: UnitProcesses, interrupts: Interrupts) -> list[
 
 
 def close_units(processes: UnitProcesses, log: RunLog, interrupts: Interrupts) -> None:
-    """Tell all units to close, and wait for the ends of their processes. Their stages complete their files before.
+    """Tell all units to close, and wait until their stages have completed their files and their processes have ended.
 
     A unit that fails, dies or takes too long is noted in `log` as a failure of the run. A process that does not end is
     left to `UnitProcesses.close`, which kills it.

@@ -1,7 +1,7 @@
 """The unit starter, the parent process's end of the fork server. Rule: after its end, no process is left behind.
 
-Units outlive the fork server. A server that has ended, or that a signal has stopped, is replaced. The caller calls
-`renew` from time to time, so that a new server has imported its modules before the next unit must start.
+If the fork server dies, its units live on. A server that has ended, or that a signal has stopped, is replaced. The
+caller calls `renew` from time to time, so that a new server has imported its modules before the next unit must start.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ class UnitStarter:
     def renew(self, wait_s: float = 0.0) -> str:
         """If the fork server has ended or was stopped, replace it and return the reason; else return "".
 
-        `wait_s`: longest time in seconds to wait for its end.
+        `wait_s`: longest time in seconds to wait for the server's end.
 
         Raises OSError if no process can be made.
         """
@@ -155,7 +155,7 @@ class UnitStarter:
     def trouble(self, wait_s: float = 0.0) -> str:
         """Return the reason why the fork server no longer answers; "" if it may still answer.
 
-        `wait_s`: longest time in seconds to wait for its end.
+        `wait_s`: longest time in seconds to wait for the server's end.
         """
         try:
             code = self._server.wait(wait_s)
@@ -245,7 +245,7 @@ class UnitStarter:
         return reads
 
     def close(self) -> None:
-        """End the fork server; if it has started units, it first waits for those that still live."""
+        """End the fork server. If it has started units, it first waits for their ends, but no longer than CLOSE_S."""
         self._end()
         os.close(self._stderr)
 

@@ -4,9 +4,8 @@
     found.sample("line 16: RPC (execute) time", "RPC (execute) time", "run", 7784, "us")
     found.measurements, found.refused
 
-Rule: a reader of a format hands each number to `Measurements`, which converts it to ms and refuses a number that no
-tool can have measured. A refusal names the row and a reason; other rows stay. Nothing is guessed and nothing is
-repaired.
+Rule: a reader of a format hands each number to `Measurements`, which converts it to ms. A number that no tool can have
+measured is refused. A refusal names the row and a reason; other rows stay. Nothing is guessed and nothing is repaired.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ from trilane.pipeline.file_keys import LONGEST_MS
 
 #: run: one job of a whole network. layer: a part of such a job. wall: a time measured from outside, with all waits.
 Kind = Literal["run", "layer", "wall"]
-#: How many of each unit of time a millisecond has. A division by this number rounds once, so 99091 us are 99.091 ms.
+#: Number of each unit of time in a millisecond. A division by this number rounds once, so 99091 us are 99.091 ms.
 PER_MS: Final = {"s": 1e-3, "ms": 1.0, "us": 1e3, "ns": 1e6}
 CYCLES: Final = "cycles"
 MOST_SAMPLES: Final = 1_000_000  # in one file
@@ -179,7 +178,7 @@ class Measurements:
         """Add a time to the samples of the measurement `name`. Return the time in ms; None if it is refused.
 
         `row`, `kind`, `value`, `unit`: as for `ms`.
-        `what`, `facts`: further fields of the measurement; those of its first sample count.
+        `what`, `facts`: further fields of the measurement; only its first sample sets them.
 
         Raises BadInputError for too many times or names.
         """
@@ -212,7 +211,7 @@ class Measurements:
 
     @cached_property
     def measurements(self) -> tuple[Measurement, ...]:
-        """All measurements in the order of the file, but those with samples come first; read after the whole file."""
+        """All measurements in the order of the file, but sampled ones come first. Use this after the last row only."""
         samples = self._samples.items()
         sampled = [_of_samples(name, kind, values, self._facts[name, kind]) for (name, kind), values in samples]
         return (*sampled, *_told_apart(self._made))
@@ -279,7 +278,7 @@ def falling(values: Sequence[float], slack: float = 0.0) -> list[int]:
     """Return the indices of a longest subsequence of `values` that never rises by more than `slack`.
 
     Of several longest subsequences, the function returns the one with the largest sum, because a wrong time is more
-    often too short than too long. Therefore a value outside may fit most other values: [10, 9, 8, 8.5] gives [0, 1, 3].
+    often too short than too long. Therefore a value that fits others may be left out: [10, 9, 8, 8.5] gives [0, 1, 3].
 
     `slack`: largest rise from one value of the subsequence to the next, as a share of the first of the two.
     """

@@ -144,7 +144,7 @@ class BenchmarkLog:
         self._figures = (place, pairs)
 
     def _flush(self, place: str, summary: str = "") -> None:
-        """Add the last line of figures, after a check against `summary`, which repeats the mean; empty without one."""
+        """Add the last line of figures. `summary`: text that repeats the mean, for a check; empty: there is no text."""
         figures, self._figures, self._is_warm = self._figures, None, False
         stated = re.search(r"Inference \(avg\): ([^\s,]+)", summary)
         average = number_in(stated[1]) if stated else None
@@ -342,8 +342,8 @@ CUT: Final = re.compile(r"^(.*)_at_(-?\d+)$")
 def read_cut_means(document: Mapping[str, Any]) -> Measurements:
     """Return the measurements in a table of mean times of networks that are cut after layer N (`NAME_at_N`).
 
-    The part of a network behind a later cut cannot take longer than the part behind an earlier cut. A time that
-    contradicts this is refused.
+    The part of a network behind a later cut (`total_time`) cannot take longer than the part behind an earlier cut. A
+    time that contradicts this is refused.
     """
     found = Measurements("table of times by cut", "the mean for each place at which a network is cut")
     rests: dict[str, list[tuple[int, float]]] = defaultdict(list)

@@ -119,13 +119,13 @@ class _Sequence:
     """The state of one writer of packets (a sequence in Perfetto's words).
 
     `names`: names of events by their numbers.
-    `clocks`: for each clock of the writer, its last time in ns, ns of a tick, and whether times are differences.
+    `clocks`: for each clock of the writer, its last time in ns, the ns of a tick, and 1 if times are differences.
     `default_clock`, `default_track`: clock and track of packets that state none.
     """
 
     def __init__(self) -> None:
         self.names: dict[int, str] = {}
-        self.clocks: dict[int, list[int]] = {}  # clock: its last time, ns of a tick, whether times are differences
+        self.clocks: dict[int, list[int]] = {}
         self.default_clock = 0
         self.default_track = 0
         self.is_known = False  # whether no packet of the writer is missing

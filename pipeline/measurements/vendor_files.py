@@ -158,7 +158,7 @@ def _fits_name(unit: str, identifier: str, level: str) -> bool:
 
 
 class _Run:
-    """Collects the times of one execution after the other, each in any order.
+    """Collects the times of executions, one after the other. The times of an execution may come in any order.
 
     A name that comes again begins the next execution. The time of the whole execution, if it comes after its parts,
     ends the execution. A row of `qnn-net-run` names the graph of an execution.
@@ -530,10 +530,10 @@ def _add_result(
 
 
 def _fits(rate: float, mean_ms: float, p90_ms: float | None) -> bool:
-    """Return whether a rate in queries a second is about the reciprocal of the 90th percentile.
+    """Return whether a rate in queries a second fits the times of the queries.
 
-    Without a percentile, return whether the rate differs less from the reciprocal of the mean than a wrong unit would
-    make it.
+    The rate must be about the reciprocal of the 90th percentile, which must be within a factor UNIT_SLACK of the mean.
+    Without a percentile, the rate must be within a factor UNIT_SLACK of the reciprocal of the mean.
     """
     if p90_ms is not None:
         return (

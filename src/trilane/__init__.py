@@ -13,7 +13,7 @@ __all__ = ["Prediction", "Run", "RunFailedError", "load_run", "predict", "run"]
 
 
 def __getattr__(name: str) -> Any:
-    """Return a name of the interface, or `__version__`. Neither is made at import, because that takes long."""
+    """Return the object `name` of the interface, or the version. Both load on first use, because that takes long."""
     if name in __all__:
         from importlib import import_module
 

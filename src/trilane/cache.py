@@ -1,4 +1,4 @@
-"""A cache of results that are expensive to compute. Rule: the cache saves time and never decides anything.
+"""A cache of results that are expensive to compute. Rule: the cache saves time and never changes a result.
 
 The cache lies under XDG_CACHE_HOME. The name of an entry is a digest of everything that the entry was made from. An
 entry that cannot be read is made again. If the folder cannot be written, nothing is kept.
@@ -21,13 +21,13 @@ from trilane.errors import BadInputError
 from trilane.writing import write_atomically
 
 ARRAYS = "arrays"
-MAX_ENTRIES = 64  # entries of arrays, some MB each; the oldest go first
+MAX_ENTRIES = 64  # entries of arrays, some MB each; the oldest are removed first
 
 Arrays = Mapping[str, NDArray[Any]]
 
 
 def cache_dir(name: str) -> Path | None:
-    """Return the folder of the cache `name`, which is made if it is missing; None if it cannot be written."""
+    """Return the folder of the cache `name`, and make it if it is missing; None if it cannot be written."""
     try:
         folder = machine.here.cache_home() / "trilane" / name
         folder.mkdir(parents=True, exist_ok=True)

@@ -2,7 +2,7 @@
 
 Code raises these errors for anything that a user can cause; the command line turns each into one sentence and an exit
 code. The parts of the sentence are fields of the error, so that no code parses a text. A remedy may be the word that a
-person most likely meant, or a command that installs a missing package. This command can be typed as it is, and fits the
+person most likely meant, or a command that installs a missing package. The command can be typed as it is, and fits the
 way in which this Trilane was installed. It never fetches Trilane from a package index, because no index has Trilane.
 """
 
@@ -54,7 +54,7 @@ def clone() -> Path | None:
 def pip() -> str:
     """Return the command that runs this Python's pip.
 
-    The command has a relative path if this Python is that of the clone's .venv, and the working directory is the clone.
+    The command has a relative path if this Python belongs to the clone's .venv, and the working directory is the clone.
     """
     root = clone()
     if root is None or Path(sys.prefix).resolve() != root / ".venv":
@@ -88,7 +88,7 @@ def _stands_in(root: Path) -> bool:
 
 
 def _requirements(extra: str) -> Iterator[str]:
-    """Yield the requirements of the installed distribution for `extra`, without markers; "": those of every run."""
+    """Yield what the installed distribution requires for `extra`, or for every run if it is ""; without markers."""
     try:
         lines = importlib.metadata.requires("trilane") or []
     except importlib.metadata.PackageNotFoundError:
@@ -100,7 +100,7 @@ def _requirements(extra: str) -> Iterator[str]:
             yield requirement.strip()
 
 
-#: Error numbers of a place that takes no more data, and the remedy for them.
+#: Error numbers that mean that a place takes no more data, and the remedy for them.
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS})
 FREE_SPACE = "free space there or choose another --out"
 #: Most characters of `found` that a message shows.
@@ -134,7 +134,7 @@ def _file_limit() -> int:
 
 
 class TrilaneError(Exception):
-    """Base class of failures with a message for people. Exit code 1, if no subclass has another.
+    """Base class of failures with a message for people. The exit code is 1, unless a subclass has another.
 
     `details`: further lines to print after the message.
     """
@@ -216,7 +216,7 @@ class MissingPartError(TrilaneError):
 def require(checks: Iterable[Callable[[], object]]) -> None:
     """Call all `checks`, and raise one MissingPartError for all missing parts, with one command that installs them.
 
-    `checks`: functions, each of which raises a MissingPartError with an `extra` if its part is missing.
+    `checks`: functions that raise a MissingPartError with an `extra` if their part is missing.
     """
     missing: list[MissingPartError] = []
     for check in checks:

@@ -1,9 +1,9 @@
 """Reads untrusted input files: sizes are read from headers before memory is taken, and nothing is unpickled.
 
-Any defect of a file becomes one BadInputError that names the file. A file's first bytes tell its format, not its
-suffix. Signatures come from the format's own specification, or from libmagic's list. Most formats that Trilane does not
-read have a remedy, such as a way to convert the file. In every function, `expected` is the sentence part that says what
-the file should be.
+Any defect of a file becomes one BadInputError that names the file. A file's first bytes tell its format; its suffix
+does not. Signatures come from the format's own specification, or from libmagic's list. Most formats that Trilane does
+not read have a remedy, such as a way to convert the file. In every function, `expected` is the sentence part that says
+what the file should be.
 """
 
 from __future__ import annotations
@@ -240,11 +240,11 @@ def npz_names(path: Path, expected: str) -> list[str]:
 
 
 def npz_pickles(path: Path, keys: Collection[str], most: int, expected: str) -> dict[str, bytes]:
-    """Return the bytes of the arrays of Python objects in an `.npz` file, by name. Raises BadInputError.
+    """Return the bytes of each array of Python objects in an `.npz` file, by the array's name. Raises BadInputError.
 
     The bytes are the `.npy` header and the pickle, which stays pickled.
 
-    `keys`: names of the arrays to check; arrays of numbers are left out.
+    `keys`: names of arrays in the file; arrays of numbers are left out.
     `most`: most bytes that all returned arrays may have together.
     """
     require_file(path, expected)

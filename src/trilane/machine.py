@@ -4,16 +4,16 @@ Only this module asks the machine, so a test can put another machine in place of
 every other file (`banned-api` in pyproject.toml). There are two exceptions: `trilane.stages.gpu.opengl` asks OpenGL,
 and code that measures reads clocks, because a clock is read in every job.
 
-This module also decides whether a failure comes from a **lack of memory**. Rule: a shortage is reported only if a limit
-is below the memory that a run takes, or if the kernel has ended a process for lack of memory. The memory of a run is
-measured (docs/limits.md); a larger scene, avatar or background takes more.
+This module also decides whether a failure comes from a **lack of memory**. Rule: evidence is a limit below the
+memory of a run, or a process that the kernel has ended for this reason. The memory of a run was measured
+(docs/limits.md); a larger scene, avatar or background takes more.
 
-This module also asks the kernel to **wake soon** a thread for which a message has come; a refusal changes only the
+This module also asks the kernel to **wake a thread soon** after a message for it has come; a refusal changes only the
 speed. Linux makes a woken thread wait until the time slice of the running thread ends, about 3 ms. A thread that has
 asked for a shorter slice need not wait (EEVDF since Linux 6.12; older kernels ignore the request). With another busy
 process on the same core, the request lowered the 99th percentile of the wake-up from 3.4 ms to 0.2 ms. The request
 matters most for ZeroMQ's I/O threads. A unit that has sent a message begins its next job at once. Without the request,
-the I/O thread that carries the message waits on the same core for the end of the job's slice: 1.6 ms between two units.
+the thread that carries the message waits on this core for the end of the job's slice: 1.6 ms for two units.
 """
 
 from __future__ import annotations
@@ -209,11 +209,11 @@ def last_level_bytes(cores: Iterable[int]) -> int:
 
 
 def moved_of_kept(kept_bytes: int) -> int:
-    """Return the bytes that a stage reads from memory again in each frame, of the bytes that it keeps between frames.
+    """Return how many of the `kept_bytes` a stage reads from memory again in each frame.
 
     If the kept bytes exceed the last-level cache, all of them are read again, else none.
 
-    `kept_bytes`: number of bytes that the stage keeps, such as a network's weights.
+    `kept_bytes`: number of bytes that the stage keeps between frames, such as a network's weights.
     """
     return 0 if kept_bytes <= last_level_bytes(here.cores()) else kept_bytes
 
@@ -255,7 +255,7 @@ _KILLS = here.oom_kills()
 
 
 def require_memory(part: int = 1) -> None:
-    """Raise TrilaneError if a limit on memory is below the need of the smallest run, divided by `part`."""
+    """Raise TrilaneError if a limit on memory is below 1 / `part` of what the smallest run needs."""
     if (limit := _address_limit()) < LEAST_ADDRESS_BYTES // part:
         found = f"found a limit of {limit // MIB} MiB of addresses (ulimit -v)"
         expected = f"expected at least {ADDRESS_BYTES // MIB} MiB for a run"
@@ -282,9 +282,9 @@ def shortage() -> str:
 
 
 def ended_by_system() -> str:
-    """If the kernel has ended a process for lack of memory since this process began, return part of a sentence.
+    """Return, as part of a sentence, that the kernel has ended a process because memory ran out; "" if it has not.
 
-    Otherwise return "".
+    Only time since the begin of this process counts.
     """
     if here.oom_kills() <= _KILLS:
         return ""
@@ -326,7 +326,7 @@ def use_slice(slice_ns: int) -> bool:
 
 @contextlib.contextmanager
 def awake(wanted: bool = True) -> Iterator[str]:
-    """Keep idle cores of the whole machine awake inside the `with` block, if this is `wanted`.
+    """If `wanted`, keep idle cores of the whole machine awake inside the `with` block.
 
     Yield AWAKE; if cores may sleep, yield `sleep: ` and the reason. A sleeping core takes 50 us and more to react to a
     message; a core that is kept awake takes power. Usually only root may keep cores awake. When the process ends, the

@@ -52,7 +52,7 @@ class Option:
     offered: tuple[str, ...] | None = None
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
-        """Make pydantic refuse, for the field, a text that is not among `words`."""
+        """Make pydantic refuse a text that is not among `words`; without `words`, every text is accepted."""
         return one_of(*self.words).__get_pydantic_core_schema__(source, handler) if self.words else handler(source)
 
 
@@ -133,7 +133,7 @@ def one_of(*words: str) -> AfterValidator:
 
 Text = Annotated[str, BeforeValidator(text_of)]
 Texts = Annotated[tuple[str, ...], BeforeValidator(texts_of)]
-#: The name of something bundled, or a path.
+#: The name of something that is bundled with Trilane, or a path.
 Name = Annotated[Text, AfterValidator(_not_empty)]
 OnePath = Annotated[Path, BeforeValidator(path_of)]
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -174,11 +174,11 @@ class Options(BaseModel):
             raise BadInputError(name, repr(word), expected(field)) from None
 
     def changed(self, **values: Any) -> Self:
-        """Return a copy of the options with `values`, by field name. Raises BadInputError as `checked` does."""
+        """Return a copy whose fields named in `values` have these values. Raises BadInputError as `checked` does."""
         return self.checked({**dict(self), **values})
 
     def as_json(self) -> dict[str, Any]:
-        """Return the value of every option as a JSON value, by field name, as the report contains them."""
+        """Return all options as the report contains them: JSON values by field name."""
         return {
             name: list(value) if isinstance(value, tuple) else str(value) if isinstance(value, PurePath) else value
             for name, value in self

@@ -1,4 +1,4 @@
-"""The signals that end a command. They act as Ctrl-C does, so that files in work are finished or removed.
+"""The signals that end a command. They act as Ctrl-C does, so that unfinished files are completed or removed.
 
 Rule: this module imports nothing of Trilane, because a command imports it before anything else.
 """

@@ -1,7 +1,7 @@
 """The avatar's U-Nets as tables: encoders, decoder, heads and normalisations.
 
-Rule: each channel count, kernel and stride stands only here. The trained network (`training/`), and the layers whose
-work predictions count (`hw_profiles/`), are both built from these tables.
+Rule: no other file states these channel counts, kernels and strides. Both the trained network (`training/`) and the
+layers from which predictions count work (`hw_profiles/`) are built from these tables.
 Sources: He et al. 2015 (ResNet18); Sandler et al. 2018 (MobileNetV2); Howard et al. 2019 (MobileNetV3 large); Tan and
 Le 2019 with the changes of TensorFlow's EfficientNet-Lite (no squeeze, ReLU6, stem and head unscaled).
 """
@@ -62,9 +62,9 @@ def squeeze_channels(channels: int) -> int:
 
 
 def _repeated(spec: Sequence[tuple[int, int, int, int, int]], before: int) -> tuple[MobileBlock, ...]:
-    """Return the blocks that `spec` describes by rows (kernel, expansion factor, channels, repeats, stride).
+    """Return the blocks of `spec`, whose rows are (kernel, expansion factor, channels, repeats, stride).
 
-    The first block, which `before` channels enter, has the row's stride; its repeats have stride 1.
+    The first block of a row has the row's stride; its repeats have stride 1. `before`: input channels of the first row.
     """
     rows = []
     for kernel, expansion, channels, repeats, stride in spec:

@@ -1,6 +1,6 @@
-"""Words and numbers that all folders share, about avatars, units, profiles, the host, stages, sources of figures.
+"""Words and numbers that all folders share, about avatars, units, profiles, the host, stages and sources of figures.
 
-Rule: each list and each phrase stands only here.
+Rule: no other file repeats one of these lists or phrases.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ TARGET_FPS = 30.0
 #: Longest virtual time of a prediction, minutes.
 MAX_MINUTES = 24 * 60
 
-#: Names of the avatars that are part of the package.
+#: Names of the bundled avatars.
 AvatarName = Literal["default", "hiker", "dancer"]
 AVATARS: tuple[AvatarName, ...] = get_args(AvatarName)
 #: Help text for an option that names an avatar.
 AVATARS_HELP = f"{', '.join(f'`{name}`' for name in AVATARS)}, or the folder of an avatar."
 
-#: Name of the background that is drawn, and no file.
+#: Name of the background that Trilane draws itself, without a file.
 ROOM = "room"
 
 #: Numbers of channels of the neural texture that the GPU packs in one pass, ascending; the largest of them.
 CHANNELS = (4, 8, 12, 16)
 MAX_CHANNELS = CHANNELS[-1]
-#: Most smaller levels of the neural texture. The fifth level of a usual texture of 512x512 has 16 texels along a side;
-#: a sixth would have too few for a body.
+#: Largest number of smaller levels of the neural texture. The fifth level of a usual texture of 512x512 has 16 texels
+#: along a side; a sixth would have too few for a body.
 MOST_TEXTURE_LEVELS = 5
 #: Methods by which a network is calibrated, and the usual method.
 CALIBRATION_METHODS = ("minmax", "percentile", "entropy")
@@ -79,5 +79,5 @@ MEASURED = "measured in this run"
 COMPUTED = "computed"
 #: Source of a ratio of a measured figure to a computed one.
 COMPARED = "measured in this run, over computed"
-#: Source of a figure that nobody has for this avatar.
+#: Text in place of a source, if there is no figure for this avatar.
 NO_FIGURES = "no figures"

@@ -1,4 +1,4 @@
-"""Writes output files that are whole or absent: under a temporary name in the same folder, then renamed.
+"""Writes output files so that they are whole or absent: under a temporary name in the same folder, then renamed.
 
 Rule: if writing ends early for any reason, the old file stays as it was, and no other file is left. Only a process that
 is killed outright may leave its temporary file, `.trilane-*`.
@@ -24,7 +24,7 @@ REMOVED = "it was removed while it was written"
 
 @contextmanager
 def write_atomically(path: Path, remedy: str = "") -> Iterator[Path]:
-    """Yield a temporary path to write to. If the block ends without an error, the file there is renamed to `path`.
+    """Yield a temporary path to write to. If the block ends without an error, that file is renamed to `path`.
 
     The temporary path is new and has the suffix of `path`. If `path` is a device or a pipe (/dev/stdout), `path` itself
     is yielded.
@@ -46,7 +46,7 @@ def write_atomically(path: Path, remedy: str = "") -> Iterator[Path]:
 
 
 def require_writable(path: Path) -> None:
-    """Raise BadInputError if `write_atomically` cannot write `path`; called before long work."""
+    """Raise BadInputError if no file can be made in the folder of `path`; called before long work."""
     with _os_errors_about(path), tempfile.TemporaryFile(prefix=PREFIX, dir=path.parent):
         pass
 
@@ -67,7 +67,7 @@ def write_bytes(path: Path, content: bytes, remedy: str = "") -> None:
 def write_folder(folder: Path) -> Iterator[Path]:
     """Yield an empty folder to write files to. If the block ends without an error, the files move into `folder`.
 
-    The files replace those of the same names in `folder` one after the other; each file there is whole at any moment.
+    One after the other, the files replace files of the same names in `folder`; each file there is whole at any moment.
     Files with other names stay.
 
     Raises BadInputError if a file cannot be written. An OSError about a file elsewhere is not changed.
