@@ -32,7 +32,7 @@ UNITS_M = {"millimetres": 0.001, "centimetres": 0.01, "inches": 0.0254, "feet": 
 
 
 def _height_remedy(height: float) -> str:
-    """Return how to fix a body of the wrong `height`, metres: by the unit that would explain it, if any."""
+    """Return how to fix a body of the wrong `height`, metres; names the unit of measure that explains it, if any."""
     fitting = {name: unit for name, unit in UNITS_M.items() if LEAST_HEIGHT_M <= height * unit <= MOST_HEIGHT_M}
     if not fitting:
         return "give its places in metres, Y up"
@@ -120,7 +120,7 @@ _LAYOUT: dict[str, tuple[tuple[int | str, ...], bool]] = {
     "hands_meanl": ((45,), False),
     "hands_meanr": ((45,), False),
 }
-#: Key of an array (2,), which a file may lack: numbers of vertices and faces of the skin. The others are garments.
+#: Key of an array (2,), which a file may lack: how many first vertices and faces are skin. The rest are garments.
 SKIN_KEY = "skin"
 _LIMITS = {"V": MAX_VERTICES, "F": MAX_FACES, "T": 3 * MAX_FACES}
 
@@ -144,8 +144,8 @@ class Body:
     `hand_components`: left (C,45) and right (C,45), principal components of hand poses.
     `hand_mean` (90,): mean hand pose, axis-angle, left then right.
     `offsets` (V,3): vectors from the rest shape to the drawn surface, such as clothes and hair; None for a bare body.
-    `skin`: numbers of the first vertices and faces, which are the skin; the others are garments that hang, such as a
-    skirt. None if all of them are the skin.
+    `skin`: (number of vertices, number of faces) of the skin, which comes first; the rest are garments that hang, such
+    as a skirt. None if the whole body is skin.
     """
 
     source: str
@@ -321,7 +321,7 @@ def _check_layout(path: Path, arrays: dict[str, NDArray[Any]]) -> None:
 
 
 def _instead_of_body(names: Collection[str]) -> str:
-    """Return a part of a message: the array `names` of a file that is no body, and whether the file is a motion."""
+    """Return a part of a message about a file that is no body: its array `names`, and whether it is a motion."""
     listed = f"arrays that were found: {', '.join(sorted(names)[:MOST_NAMED]) or 'none'}"
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
     motion = ": a motion, which `trilane run --motion` takes" if MOTION_KEYS & set(names) else ""
@@ -367,7 +367,7 @@ def weights_of_one(weights: F32) -> F32:
 def _skin(path: Path, arrays: dict[str, NDArray[Any]]) -> tuple[int, int] | None:
     """Return the numbers of vertices and faces of the skin; None without the array.
 
-    Raises BadInputError if it is no such array, if the skin has garments' vertices, or if a joint depends on one.
+    Raises BadInputError for another array, and if a face of the skin or a joint depends on a garment's vertex.
     """
     array, vertices, faces = arrays.get(SKIN_KEY), len(arrays["v_template"]), len(arrays["f"])
     if array is None:

@@ -3,7 +3,7 @@
 Rule: this file defines the joint numbers; other code looks up joints by name.
 
 Rotations are exact at every angle. A rotation by the angle t = |v| about v has the quaternion w = cos(t/2), u = v
-sin(t/2) / t. Then R - I = 2 (u u^T - (u.u) I + w [u]x) (O. Rodrigues, 1840). No digits cancel in this form near 0 or
+sin(t/2) / t. R - I is then 2 (u u^T - (u.u) I + w [u]x) (O. Rodrigues, 1840). No digits cancel in this form near 0 or
 pi.
 """
 
@@ -56,7 +56,7 @@ RIGHT_HAND = slice(3 * 40, 3 * 55)
 #: At this x and below, sin(x) / x is exactly 1 in float64. Smaller half angles are raised to this x, so an angle of 0
 #: needs no special case.
 _TINY = 1e-150
-#: Largest joint angle (radians) and coordinate (metres); float64 and float32 lose too many digits beyond it.
+#: Largest Euclidean norm of a pose (radians) and of the root's transform (metres). Beyond it, too many digits are lost.
 MAX_VALUE = 1e6
 
 
@@ -140,7 +140,7 @@ class Skeleton:
         `pose` (J * 3,): axis-angle, radians.
         `translation` (3,): translation of the root in body space, metres; None for no translation.
         `world` (4,4): transform from body space to the world; None for the identity.
-        Raises BadInputError when a number is not finite, or when the angles or coordinates are beyond a million.
+        Raises BadInputError when a number is not finite, or when the norm of the pose or place is above MAX_VALUE.
         """
         self._angles.reshape(-1)[:] = np.asarray(pose, np.float64).reshape(-1)
         _require_finite(self._angles, "pose", "joint angles below 1e6 rad")

@@ -10,10 +10,10 @@ w' - w over b and the joints below b. As in `weight_error_bound`, the change of 
 sum_b |E_b| |y_b - y_parent|. The turn of b moves p by |y_b - y_parent| = 2 sin(t_b / 2) dist(p, axis of b) <= 2 sin(t_b
 / 2) |p - c_b|.
 
-Pose blend shapes move p by at most r = sum_b r_b |R_b - I|, with r_b the norm of the vertex's block of blend shapes of
-joint b. If they are left out, the skinned vertex moves by at most r, because skinning averages rigid motions. If they
-are kept, |p - c_b| grows by at most r. The Frobenius norm |R_b - I| is 2 sqrt(2) sin(t_b / 2). Vertices are bounded in
-groups: each term takes its largest value in the group.
+Let r_b be the norm of the vertex's block of pose blend shapes of joint b. All these shapes move p by at most
+r = sum_b r_b |R_b - I|. If they are left out, the skinned vertex moves by at most r, because skinning averages rigid
+motions. If they are kept, |p - c_b| grows by at most r. The Frobenius norm |R_b - I| is 2 sqrt(2) sin(t_b / 2).
+Vertices are bounded in groups: each term takes its largest value in the group.
 """
 
 from __future__ import annotations
@@ -218,7 +218,7 @@ def _bound(detail: Detail, lever: F64, change: F64, blend: F64) -> float:
 
 
 def _terms(shaped: ShapedBody) -> Arrays:
-    """Return the terms of the bounds, named as in the module's proof, each the largest of a group of vertices.
+    """Return the terms of the bounds, each the largest in a group of vertices, in the symbols of the module's proof.
 
     `lever`, `change` (levels,G,54): |E_b| |p - c_b| and |E_b|, for each of G groups. `blend` (G,54): r_b.
     `reach` (55,): as in `DetailBounds`.

@@ -155,7 +155,7 @@ def _network_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[st
 
 
 def split_work(work: Work, share: float) -> tuple[Work, Work]:
-    """Return (first operators of `work` that together do `share` of its products, the other operators)."""
+    """Return (fewest first operators of `work` that do at least `share` of its products, the other operators)."""
     macs, cut = 0, 0
     for cut, operator in enumerate(work.operators, 1):  # noqa: B007
         macs += operator.macs
@@ -173,7 +173,7 @@ class Steady:
     """The application in its settled state.
 
     `busy` and the causes of `idle` add up to 1 for each unit. If units share a core, `preempted` is the share of time
-    in which another unit works on it.
+    in which another unit works on this core.
 
     `frame_ms`: mean frame time.
     `latency_ms`: mean latency; None if no frame is presented.

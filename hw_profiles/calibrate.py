@@ -164,7 +164,7 @@ class Calibrated:
 
 
 def is_own_table(path: Path) -> bool:
-    """Return whether the table `path` lists networks in files. A table of reference networks has a column `encoder`."""
+    """Return whether `path` is a table of networks in files. A table of reference networks has a column `encoder`."""
     if not path.is_file():
         return False
     lines = [line for line in read_text(path, "a table of measured rows").splitlines() if not line.startswith("#")]

@@ -1,9 +1,9 @@
 """The whole fit of tensor engines: the numbers of every chip, their cross-validation, and tables and pictures of both.
 
 Every stated error comes from rows whose network was left out of the fit. A chip without rows of an engine gets the
-numbers of a related chip, times the ratio of the two chips on another engine that both have. Such numbers are
-`assumed`. The head of a chip's profile, the part before MARK, is written by hand and stays. This module writes
-everything from MARK on.
+numbers of a related chip, times a ratio. It is the ratio of the two chips' numbers on another engine that both have.
+Such numbers are `assumed`. The head of a chip's profile, the part before MARK, is written by hand and stays. This
+module writes everything from MARK on.
 """
 
 from __future__ import annotations
@@ -41,13 +41,13 @@ from trilane.writing import write_atomically
 #: Share of the left-out rows that lie in their 80 % intervals by construction. It is more than 80 % because a user's
 #: network differs more from the networks of the fit than these differ from each other.
 COVERED = 0.87
-#: A chip whose published times say nothing about the engine: they are minutes, or layers did not run on the engine.
+#: Chips whose published times say nothing about the engine: the times are minutes, or layers ran on other units.
 LEFT_ASIDE = ("865",)
 #: The chip of the generation before, for a chip that has only anchors.
 BEFORE = {"8elite5": "8elite"}
 #: The closest relative that has rows of an engine, for a chip without such rows.
 RELATIVE = {"xelite": "8gen2", "qcs6490": "sa8295p", "8elite5": "8elite"}
-#: The engines on which a chip and its relative are compared, by the engine that the chip has no rows of.
+#: By engine: the engines on which a chip without rows of this engine is compared with its relative.
 SIBLING: dict[EngineName, tuple[EngineName, ...]] = {
     "int8_tflite": ("int8_qnn_dlc",),
     "int8_qnn_dlc": ("int8_tflite",),
@@ -131,7 +131,7 @@ class Study:
 
 
 def misses_of(rows: Sequence[LeftOut]) -> tuple[F64, F64, F64]:
-    """Return three arrays (rows,): misses, errors that the fit's numbers leave, and unlikeness of the networks.
+    """Return three arrays (rows,): misses, relative errors from the spreads of the numbers, unlikeness of the networks.
 
     A miss is the absolute logarithm of predicted / published time. The unlikeness is `LeftOut.unlike`.
     """
@@ -268,7 +268,7 @@ def with_table(text: str, table: str, path: Path) -> str:
 
 
 def plot_errors(study: Study, path: Path) -> None:
-    """Draw the published against the predicted time of each left-out row, by engine, on logarithmic axes.
+    """Draw the predicted against the published time of each left-out row, by engine, on logarithmic axes.
 
     `path`: path of the file; its ending is one of `trilane.hw_profiles.governor.SUFFIXES`.
     Raises MissingPartError without Matplotlib, BadInputError for another ending or a file that cannot be written.

@@ -469,7 +469,7 @@ def predict_rows(fitted: Fitted, rows: Sequence[Latency], layers: Mapping[str, L
 def fit_anchors(fitted: Fitted, before: str, rows: Sequence[Latency], layers: Mapping[str, Layers]) -> Fitted:
     """Return the numbers of a chip that has only the anchors `rows`.
 
-    The prior of its rates is one STEP faster than the chip `before` it. The factors of `fitted` stay.
+    The prior of its rates is one STEP faster than the rates of the chip `before` it. The factors of `fitted` stay.
 
     `fitted`: numbers of all other chips.
     `layers`: layers of each network, by name.
@@ -541,7 +541,7 @@ FP16_OVER_INT8 = {"arithmetic_tmac_s": 0.25, "operator_us": 1.5, "job_us": 1.5}
 RATE_SPREAD = 0.5
 #: Prior slowness of each chip: how many times slower than the 8 Gen 2 it is, by claimed TOPS and memory.
 SLOWER = {"qcs6490": 4, "sa8295p": 1.8, "8gen1": 1.7, "8gen2": 1, "8gen3": 0.75, "8elite": 0.6, "xelite": 1}
-#: On-chip memory of the engine for activations, in MB: the VTCM of its generation.
+#: On-chip memory of the engine for activations, in MiB: the VTCM of its generation.
 ON_CHIP_MB = {"v66": 4, "v68": 4, "v69": 4, "v73": 8, "v75": 8, "v79": 8, "v81": 8}
 #: Speed-up from one generation to the next, as seen in the other chips. The prior of a chip with only a few anchors is
 #: the chip before it, with all rates faster by this factor, and with this spread.

@@ -1,10 +1,10 @@
 """Temperatures of a device, the rules that throttle its units, and the application over minutes under these rules.
 
 The device's body warms in minutes, and each unit's junction warms above the body in seconds. Each is an RC element,
-T' = (T_below + R P - T) / tau, solved exactly over a step of constant power (lumped models of phones: Bhat, Gumussoy
-and Ogras, 2019). The rules are `step_wise` and `power_allocator` of the Linux thermal framework
-(Documentation/driver-api/thermal). Each rule is a function of temperatures and power that moves one unit by one corner
-per call. In a run on this machine a corner becomes a duty: its clock divided by the highest clock.
+T' = (T_below + R P - T) / tau, and is solved exactly over a step of constant power. Source: lumped models of phones by
+Bhat, Gumussoy and Ogras, 2019. The rules are `step_wise` and `power_allocator` of the Linux thermal framework
+(Documentation/driver-api/thermal). Each rule is a function of temperatures and power that moves at most one unit by one
+corner per call. In a run on this machine a corner becomes a duty: its clock divided by the highest clock.
 
 Between two polls of the governor the application stays in the settled state of its corners; nothing else changes the
 power. Reports and pictures only summarise the moments. Matplotlib is an optional dependency; an error names it if it is
@@ -94,7 +94,7 @@ class Throttle:
         return min(requested + self.steps[unit], len(CORNERS) - 1)
 
     def lower(self, requested: Mapping[UnitName, int], power_w: Mapping[UnitName, float]) -> None:
-        """Move the unit with the most power one corner down, of those that are above the last corner.
+        """Of the units that are above the last corner, move the one with the most power one corner down.
 
         `requested`: index into CORNERS of the requested corner, by unit. `power_w`: present power by unit, watts.
         """
@@ -430,7 +430,7 @@ def caps_of(moments: Sequence[Moment]) -> Throttling:
 
 
 def timeline_of(moments: Sequence[Moment]) -> list[dict[str, Any]]:
-    """Return every n-th moment as JSON values, with n such that about MOST_SHOWN moments remain."""
+    """Return every n-th moment as JSON values; of more than MOST_SHOWN moments, fewer than 2 * MOST_SHOWN remain."""
     return [
         {
             "t_s": m.t_s,

@@ -1,7 +1,7 @@
 """Reads any ONNX graph for its operators and shapes: float, quantised, or without weights.
 
 The file may come from a stranger. Sizes are checked before memory is allocated, and the values of weights are dropped
-as soon as their shape is known. No other file is opened: a graph keeps only values of weights in other files.
+as soon as their shape is known. No other file is opened, because other files have only values of weights.
 `image_network` turns a graph whose only input is a picture into the network of the application.
 """
 
@@ -25,7 +25,7 @@ from trilane.unexpected_value import UnexpectedValue
 
 MAX_BYTES = 512 << 20
 MAX_NODES = 50_000
-#: Number of checked graphs that are cached, and the largest file that is: a graph without weights, or with few.
+#: Number of checked graphs that are cached, and bytes of the largest such file: it has few weights or none.
 REMEMBERED, REMEMBERED_BYTES = 16, 1 << 20
 #: In earlier operator sets, operators broadcast only if an attribute says so, which changes shapes.
 OLDEST_OPSET = 7

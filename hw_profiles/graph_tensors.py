@@ -189,11 +189,11 @@ def _made(graph: onnx.GraphProto) -> Iterator[str]:
 
 
 def in_order(graph: onnx.GraphProto) -> None:
-    """Sort the operators so that each comes after those whose results it reads, and drop operators that nothing reads.
+    """Sort the operators so that each comes after all that it reads, and drop operators that no output depends on.
 
     `graph`: graph that is changed in place; if its operators are in order, their order stays.
 
-    Raises UnexpectedValue for a circle.
+    Raises UnexpectedValue for a circle, or if no output depends on an operator.
     """
     maker = {name: index for index, node in enumerate(graph.node) for name in node.output if name}
     before = [{maker[name] for name in node.input if name in maker} for node in graph.node]
@@ -233,7 +233,7 @@ STAND_INS = {
 
 Values = dict[str, NDArray[np.generic]]
 
-#: Operators whose results are no larger than all their inputs together, or than the product of two inputs.
+#: Operators whose results are no larger than all their inputs together, or than the product of their inputs.
 _BOUNDED = frozenset(
     (
         *("Add", "Sub", "Mul", "Div", "Mod", "Min", "Max", "Neg", "Abs", "Floor", "Ceil", "Round", "Sqrt", "Pow"),
@@ -417,7 +417,7 @@ def _shown(value: onnx.ValueInfoProto) -> str:
 
 
 def fold(model: onnx.ModelProto, shapes: Mapping[str, tuple[int, ...]]) -> bool:
-    """Replace operators whose inputs are all known by their values; return whether there were such operators.
+    """Replace the operators that can be computed now with their results. Return whether there were any.
 
     `model`: model of the graph; it is changed in place.
     `shapes`: shape of each tensor that has a known one, by name.

@@ -198,9 +198,9 @@ def host_tables() -> dict[str, Any]:
 
 
 def network_threads() -> int:
-    """Return the number of threads of the DSP unit in the profile `host`, which is also its number of cores.
+    """Return the number of threads of the DSP unit in the profile `host`: two fewer than the usable cores, at least 1.
 
-    The peak rates of the unit are those of all its cores.
+    The unit's peak rates in this profile are the rates of as many cores.
     """
     return max(1, len(usable_cores()) - 2)
 
@@ -250,7 +250,7 @@ def _cores(place: Place) -> str:
 
 
 def unit_rows(placement: Placement) -> dict[str, Any]:
-    """Return, by unit of `placement`, a row with `cores` and `threads` for JSON."""
+    """Return a row with `cores` and `threads` for JSON, by the unit's name."""
     return {unit: {"cores": list(place.cores), "threads": place.threads} for unit, place in placement.items()}
 
 

@@ -87,7 +87,7 @@ def place_units(
 
 
 def on_cores(profile: Profile, placement: Placement) -> Profile:
-    """Return `profile` with its units on the cores of `placement`, and the network's unit with its threads there."""
+    """Return `profile` with the cores that `placement` gives its units, and the threads for the network's unit."""
     units = {}
     for name, unit in profile.units.items():
         place = placement[name]

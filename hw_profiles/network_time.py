@@ -44,7 +44,7 @@ from trilane.hw_profiles.unit_times import (
 )
 from trilane.units import BURST, UNITS, UnitName
 
-#: Least relative error of the time with which the term that causes it is named.
+#: A term is named if it causes at least this relative error of the time.
 NAMED_FROM = 0.05
 
 #: Reason for a time that is only a lower bound.
@@ -86,7 +86,7 @@ class Interval(NamedTuple):
 
 
 def spread_of(around: Interval) -> float:
-    """Return the standard deviation of the time's logarithm for which the 80 % interval `around` stands."""
+    """Return the standard deviation of the time's logarithm that the 80 % interval `around` implies."""
     return math.log(around.high_ms / around.low_ms) / 2 / SIGMAS
 
 
@@ -94,7 +94,7 @@ def price(profile: Profile, work: Work, unit: UnitName, corners: Corners) -> Net
     """Return the time of one job of the network when nothing else runs.
 
     `profile`: hardware profile of the chip.
-    `work`: work of the network, which may have several hundred operators.
+    `work`: work of the network.
     `unit`: unit that runs it.
     `corners`: corner of each unit.
     """
@@ -258,7 +258,7 @@ def predict_network(
     `governor`: name in GOVERNORS; None for the profile's governor.
     `wanted`: rate to judge, and limit of power.
 
-    Raises BadInputError for an unknown name, a time out of range, and operators that cannot be counted.
+    Raises BadInputError for an unknown name or a time out of range.
     """
     work, corners = graph.work, corners_of(profile, performance_profile)
     time = price(profile, work, unit, corners)

@@ -43,9 +43,9 @@ from trilane.hw_profiles.operators import (
 
 #: Name of a weight in a graph without weights, in which each weight is an input.
 WEIGHT_INPUT = re.compile(r"w\d+")
-#: Number of first inputs of a batch normalisation that count: data, scale and shift, which take in mean and variance.
+#: Number of inputs of a batch normalisation that count: data, scale, shift. The others are folded into these.
 SCALE_AND_SHIFT = 3
-#: Least dimensions of a tensor that is convolved: pictures, channels, one side.
+#: Least number of axes of a tensor that is convolved: batch, channels, one side.
 CONVOLVED = 3
 
 
@@ -160,7 +160,7 @@ def count_work(model: Any) -> Work:
     An operator whose results depend only on constants and shapes costs nothing. An operator without a rule counts only
     the movement of its elements, and has `ruled` False.
 
-    Raises BadInputError for a tensor without a static shape.
+    Raises BadInputError for a tensor without a static shape, or a convolution whose tensors do not fit.
     """
     shapes = _shapes(model)
     graph = model.graph
@@ -205,10 +205,10 @@ def graph_facts(model: Any) -> dict[str, Any]:
 
 
 def constant_tensors(graph: Any) -> set[str]:
-    """Return the names of the tensors that do not depend on the network's input: weights, and results of weights.
+    """Return the names of the tensors that depend only on weights and shapes.
 
-    In a graph without weights, an input of the graph counts as a weight if its name is `w<n>`. It also counts as a
-    weight if it is not the first input of a layer with weights.
+    An input of the graph counts as a weight if its name is `w<n>`, unless all inputs have such names. It also counts as
+    a weight if a convolution or normalisation reads it after its first input.
     """
     names = {i.name for i in graph.initializer} | _weight_inputs(graph) | {""}  # "" is an input that is left out
     for node in graph.node:

@@ -3,11 +3,11 @@
 If no table names an operator, its time follows from the elements that it moves, and reports name the operator. The
 count of a product follows only from shapes and attributes; `network_work.py` counts convolutions.
 
-A term is a kind of work with its own cost (`TERMS`); this file knows no chip. Channels are rounded up to the
-blocks in which the Hexagon keeps them: a convolution's inputs to 16, its outputs to 32, all other activations to 8. The
-runtime folds a ReLU and a clip into the layer before them, a batch normalisation into the convolution before it, and a
-sum of two tensors into the convolution that makes one of them. A permutation between channels first and
-channels last costs nothing, because the engine always has channels last.
+A term is a kind of work with its own cost (`TERMS`); this file knows no chip. Channels are rounded up to the Hexagon's
+blocks: a convolution's inputs to 16, its outputs to 32, all other activations to 8. The runtime folds a ReLU and a clip
+into the layer before them, and a batch normalisation into the convolution before it. It folds a sum of two tensors into
+the convolution that makes one of them. A permutation between channels first and channels last costs nothing, because
+the engine always has channels last.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ OF_SHAPES = frozenset(["Shape", "Size"])
 #: Index of the second factor among the inputs, for convolutions and for other products of two tensors.
 CONVOLUTIONS = {"Conv": 1, "ConvTranspose": 1, "ConvInteger": 1, "DeformConv": 1, "FusedConv": 1, "QLinearConv": 3}
 PRODUCTS = {"Gemm": 1, "MatMul": 1, "MatMulInteger": 1, "QLinearMatMul": 3, "FusedMatMul": 1, "Einsum": 1}
-#: Recurrent layers. Every step's vector is multiplied by their inputs 1 and 2, which are weights.
+#: Recurrent layers. Their inputs 1 and 2 are weights, which multiply the vector of every step.
 RECURRENT = frozenset(["LSTM", "GRU", "RNN"])
 #: Normalisations that read their input twice: for its mean and variance, and to apply them.
 STATISTICS = frozenset(
@@ -214,8 +214,8 @@ RENAMES = frozenset(
 )
 #: Activations that a runtime folds into the layer before them.
 FOLDED_ACTIVATIONS = frozenset(["Relu", "Clip"])
-#: Layers into which such an activation is folded.
 NORMALISATIONS = ("BatchNormalization", "InstanceNormalization", "GroupNormalization", "LayerNormalization")
+#: Layers into which such an activation is folded.
 TAKES = frozenset(
     ("Conv", "ConvTranspose", "Gemm", "MatMul", "Add", "Mul", "Concat", "MaxPool", "Resize", *NORMALISATIONS)
 )
@@ -445,7 +445,7 @@ def _movement(node: Any, kind: str, moved: int, names: _Graph) -> Iterator[tuple
 
 
 def _padded(shape: tuple[int, ...]) -> int:
-    """Return the elements of a tensor of `shape` with its channels, the second axis, rounded up to whole blocks."""
+    """Return the elements of a tensor of `shape`; with four axes, axis 1 (channels) is rounded up to whole blocks."""
     if len(shape) != 4:
         return prod(shape)
     return shape[0] * _up(shape[1], ACTIVATION_BLOCK) * shape[2] * shape[3]

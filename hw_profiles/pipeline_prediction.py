@@ -47,7 +47,7 @@ from trilane.units import HOST, NS_PER_MS, UNITS, UnitName
 SIMULATED_FRAMES: Final = 1000
 #: Approximate number of frames of a run whose source is always ready.
 FED_FRAMES: Final = 2000
-#: Largest number of frames of such a run: nothing delays a stage without time that only `latest` inputs read.
+#: Most frames of such a run. A first stage that takes no time is never delayed if only `latest` inputs read it.
 MOST_FED: Final = 2 * FED_FRAMES
 EVEN: Final = (840, 60)  # least common multiples of the numbers up to 8, and up to 6
 BLOCK: Final = 4096  # number of frames whose times are drawn at once
@@ -256,7 +256,6 @@ def predict_file(
     """Return the prediction of `file`, with the keys of report.json.
 
     `prices`: time of each stage, by name.
-
     `frames`: number of frames of the simulated run; 0: the file's number, or 1000 if it has none.
     `seed`: seed of all random numbers.
     """
@@ -353,7 +352,7 @@ def fed_bound_ms(file: PipelineFile, times_ms: Mapping[str, float]) -> float:
 
 
 def repeats_after(file: PipelineFile) -> int:
-    """Return the number of frames after which the keys `every` and the pattern of the bypass select the same stages."""
+    """Return after how many frames the keys `every` and the pattern of the bypass select the same stages again."""
     return math.lcm(*file.periods.values(), len(file.bypass[1].pattern or ".") if file.bypass else 1)
 
 
@@ -362,8 +361,8 @@ def steady_ms(run: Simulation, stop_ns: int, repeats: int) -> float:
 
     The first half does not count, because slots may fill for hundreds of frames. The time after `stop_ns` does not
     count, because the pipeline runs empty. The order of the jobs repeats after a multiple of `repeats`, because slots
-    fill in turn. Therefore a multiple of EVEN * `repeats` frames counts, if the run has so many. If fewer than two
-    frames are presented there, the result is the whole time.
+    fill in turn. Therefore the number of frames that count is a multiple of 840 * `repeats` (`EVEN`); in a shorter
+    run, of 60 * `repeats` or `repeats`. If fewer than two frames are presented there, the result is the whole time.
 
     `repeats`: result of `repeats_after`.
     """

@@ -279,7 +279,7 @@ def _frame_times(profile: Profile, mean_ms: float, frames: Sequence[float]) -> d
 
 
 def ema_range_ms(profile: Profile, mean_ms: float) -> tuple[float, float]:
-    """Return (least, largest) exponential average of 20 frame times in ms; neither is below the display's interval."""
+    """Return (least, largest) 20-frame exponential average in ms; the first is not below the display's interval."""
     half = profile.application.ema20_half_range_fraction.or_else(0) * mean_ms
     return max(profile.application.display_ms.or_else(0), mean_ms - half), mean_ms + half
 

@@ -123,7 +123,7 @@ class ApplicationPrediction(Record):
     `fps_start`, `fps_settled`: rate at the first moment, and in the last fifth of the moments.
     `display_capped`: whether the display or the wanted rate limits the rate at the first moment.
     `stages`, `units`: by name. `efficiency`: time of the slowest unit's stages, divided by the frame time.
-    `power_w`: power of the device, watts. `base_power_w`: part of it for all but the units.
+    `power_w`: power of the device, watts. `base_power_w`: its part without the units.
     `base_power_kind`: kind of the profile's number. `power`: power of the settled device.
     `temperature_c`, `caps`, `timeline`: course over minutes; without one, no temperature is set.
     `rate`, `power_limit`: answers about the rate and the limit that were wanted.

@@ -119,7 +119,7 @@ def _sentence(fps: float, times: FrameInterval, missed: Mapping[str, int], frame
 
 
 def _short(ms: float) -> str:
-    """Return `ms` as text with three digits, without an exponent."""
+    """Return `ms` as text: three digits below 100, a whole number from 100 on."""
     return f"{ms:.3g}" if ms < 100 else f"{ms:.0f}"
 
 

@@ -35,7 +35,7 @@ Corners = tuple[Corner, Corner, Corner]
 
 
 def interval_around(middle: float, error: float) -> tuple[float, float]:
-    """Return the ends of the interval around `middle` that holds SHARE.
+    """Return the ends of the interval around `middle` that contains the true value with probability SHARE.
 
     `error`: standard deviation of the value's logarithm.
     """
@@ -151,7 +151,7 @@ class EngineRates(ProfileTable):
     job_us: Cost = Field(description="Fixed time of a job.")
 
 
-#: (key of `EngineRates`, factor from the key's unit of measure to base units) of each rate of a term.
+#: By the name of a rate: (its key in `EngineRates`, factor from the key's unit of measure to base units).
 KEY_OF_RATE = {
     "arithmetic": ("arithmetic_tmac_s", 1e12),
     "activation": ("activation_gb_s", 1e9),
@@ -194,7 +194,7 @@ class Engine(ProfileTable):
         return self.factors[term].or_else(1.0) if term in self.factors else 1.0
 
     def seconds_per_unit(self, rate: str) -> float:
-        """Return the time in seconds of one product, activation element, weight element, operator or job, by `rate`."""
+        """Return the time in seconds of one unit of `rate`: a product, an element, an operator or a job."""
         key, unit = KEY_OF_RATE[rate]
         value: float = getattr(self.rates, key).or_else(1.0)
         if rate in ("operator", "job"):
@@ -365,17 +365,17 @@ class Thermal(ProfileTable):
 
     @property
     def ambient(self) -> float:
-        """Return the temperature of the surroundings, °C; 25 if unknown."""
+        """The temperature of the surroundings, °C; 25 if unknown."""
         return self.ambient_c.or_else(25.0)
 
     @property
     def skin_limit(self) -> float:
-        """Return the limit of the device's surface, °C; 45 if unknown."""
+        """The limit of the device's surface, °C; 45 if unknown."""
         return self.skin_limit_c.or_else(45.0)
 
     @property
     def resistance(self) -> float:
-        """Return the thermal resistance from the device to the surroundings, K/W; 5 if unknown."""
+        """The thermal resistance from the device to the surroundings, K/W; 5 if unknown."""
         return self.device_k_per_w.or_else(5.0)
 
 

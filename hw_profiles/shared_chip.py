@@ -1,7 +1,7 @@
 """Predicts several tenants on one chip: avatars, networks and pipeline files, each at its rate, with power and heat.
 
 `tenants.py` computes the times of their jobs, and `trilane.scheduler.shared_units` decides whose job waits. This file
-computes how much a network slows while other jobs use the memory: the network has the bandwidth that these jobs leave
+computes how much a network slows while other jobs use the memory. The network has the bandwidth that these jobs leave
 (Gables, Hill and Reddi, 2019). Each avatar's camera, display and composition take `application_use_fraction` of the
 bandwidth all the time. A network on another unit takes the bytes that it moves, spread over its time. Jobs of one unit
 follow each other and never compete. A network that nothing slows has the time of `network_time.price`. Keys of the
@@ -29,7 +29,7 @@ from trilane.units import HOST, INFER, NS_PER_MS, NS_PER_S, SUSTAINED, UNITS
 MOST_TENANTS = 8
 #: Largest share of the bandwidth that other jobs can take, so that some is always left.
 MOST_USE = 0.95
-#: A run lasts at least LEAST_S virtual seconds and LEAST_FRAMES of the slowest tenant, but at most MOST_S.
+#: A run lasts at least LEAST_S virtual seconds and LEAST_FRAMES frames of the slowest tenant, but at most MOST_S.
 LEAST_S, LEAST_FRAMES, MOST_S = 10.0, 64, 600.0
 
 
@@ -38,7 +38,7 @@ class Together:
     """The settled state of several tenants, with each unit at one voltage corner, which fixes its clock.
 
     `runs`: simulated run of each tenant.
-    `stages_ms`: for each tenant, the mean time of a job by stage if no other tenant ran.
+    `stages_ms`: for each tenant, the mean time of a job by stage if no network of another tenant ran.
     `busy`: share of the time in which each unit works for all tenants.
     `by_tenant`: for each tenant, the share of the time in which each unit works for this tenant.
     """
@@ -209,7 +209,7 @@ def predict_beside(
     `governor`: name in GOVERNORS; None for the profile's governor.
     `turns`: name in TURNS, the rule that chooses whose job a unit takes if several wait.
 
-    Raises BadInputError for an unknown name or a time out of range.
+    Raises BadInputError for an unknown performance profile or governor, or a time out of range.
     """
     corners = corners_of(profile, performance_profile)
     at = cache(lambda where: together(profile, tenants, where, turns))

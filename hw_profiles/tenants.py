@@ -113,7 +113,7 @@ class Tenant:
 
     @property
     def hardware(self) -> Mapping[str, str]:
-        """The chip's unit for each unit of the pipeline; a unit outside of the chip has its own name there."""
+        """The chip's unit for each unit of the pipeline; its own name for a unit that is not on the chip."""
         return {unit: unit for unit in UNITS}
 
     @property
@@ -312,7 +312,7 @@ SharingPipeline = Tenant | FileTenant
 
 
 class _Priced(NamedTuple):
-    """A network that the chip's model prices. `factor`: time at the chosen end of its interval, over the expected."""
+    """A network that the chip's model prices. `factor`: time at the chosen end of its interval / expected time."""
 
     work: Work
     chip: Profile

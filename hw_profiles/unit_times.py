@@ -6,9 +6,9 @@ share, and from six rates of the chip:
     cost of a term    amount * factor / rate             factor: shared by all chips; rate: the chip's, one of six
     time of a layer   (a^4 + m^4 + s^4)^(1/4) + w + o    arithmetic, activations moved, spill; weights, fixed
 
-Products, movement and spill happen at the same time, so the slowest decides, with a smooth transition if two are about
-equal (as in the roofline of Williams, Waterman and Patterson, 2009). Spill is the elements that do not fit on the chip.
-The tensor whose next reader comes last is moved out first (Belady, 1966: no rule moves less). No measured time is
+Products, movement and spill happen at the same time, so the slowest decides (as in the roofline of Williams, Waterman
+and Patterson, 2009). The transition is smooth if two are about equal. Spill is the elements that do not fit on the
+chip. The tensor whose next reader comes last is moved out first (Belady, 1966: no rule moves less). No measured time is
 looked up.
 
 For any other unit, the time is the sum over operators by a roofline:
@@ -63,8 +63,8 @@ class EngineTime:
 
     `layers`: time by layer and bound (layers, 5).
     `job`: time that belongs to no layer.
-    `shares`: share of each term in the growth of the whole time (terms,); a term that runs behind a slower one has a
-    small share.
+    `shares`: derivative of the time's logarithm by the logarithm of each term's cost (terms,); they sum to 1. A term
+    that runs beside a slower term has a small share.
     """
 
     layers: F64
@@ -249,7 +249,7 @@ def time_on(
 def relative_error(job: JobTime, unit: Unit) -> float:
     """Return the expected relative error of the time of `job` on `unit`.
 
-    It is the stated error, and the error of a peak that the profile does not know.
+    It combines the stated error with the error of the peak, if the profile does not know the peak.
     """
     return math.hypot(stated_error(job, unit), unit.peak.relative_error if assumes_peak(unit) else 0.0)
 

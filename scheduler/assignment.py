@@ -8,9 +8,9 @@ dropped: frames that must be late, or frames that a newer frame has made stale.
 
 A frame must be late if even the earliest end of its last stage is past its deadline. While service times stay as they
 were lately, this earliest end is never later than the real end. Therefore no frame is given up that could be in time.
-At every stage older frames go first. A frame begins at a stage when two things have ended: the older frames' work at
-this stage, and the frame's own work at the stages before. If the last frame at the beginning of a bypass took the
-bypass, the frames that have yet to come there are assumed to take it.
+At every stage older frames go first. A frame begins at a stage when the older frames have left this stage, and the
+frame itself has left the stages before. If the last frame at the beginning of a bypass took the bypass, the frames that
+have yet to come there are assumed to take it.
 
 In a graph whose branches meet, a frame that one branch has begun can no longer become stale (flow.py).
 """

@@ -5,7 +5,7 @@ simulated units. One loop (`run_loop`) serves all drivers, which differ only in 
 
 Theory of operation. A driver calls `step` with the time and the events since the last step. The core answers with
 actions to do now and with the time at which it wants to be asked again. The same steps give the same answers, so a run
-can be replayed from its events alone. One step does five things, in this order:
+can be replayed from its times and events. One step does five things, in this order:
 - Each event changes the state of slots, frames and units.
 - When the alarm has gone off, a unit whose deadline has passed is killed or started again. A unit whose pause for its
   duty is over may work again.
@@ -20,10 +20,10 @@ is free behind it. This alone holds back the stages before a slow stage.
 Bypass. A frame may skip the stages between two stages of a chain, if the first of these two stages says so. The frame
 keeps its slot, waits in it for the second stage, and overtakes no other frame (flow.py).
 
-Dirty units. A step looks only at units for which something has changed: the unit's own job ended, a frame came to one
-of its stages, a slot became free behind one of its stages, or its life or duty changed. Code that changes one of these
-calls `mark_dirty`. A dispatch may make a unit dirty that this step has already looked at; the step then looks at it
-again.
+Dirty units. A step looks only at dirty units. A unit becomes dirty when its job ends, a frame comes to one of its
+stages, or a slot becomes free behind one. A change of its life or duty makes it dirty too. Code that changes one of
+these calls `mark_dirty`. A dispatch may make a unit dirty that this step has already looked at; the step then looks at
+it again.
 
 The alarm is a time before which no unit's deadline passes and no unit's pause ends (`next_alarm_ns`). A new alarm is
 computed from all units only after the old one has gone off or was reset. An event that moves a deadline to a later time
@@ -264,7 +264,7 @@ class Core:
         return None if frame is None else frame.ready_ns[self._stage_named[job.stage].position]
 
     def _step_work(self, ladder: WorkLadder, stage: StageState, frame: FrameState, service_ns: int) -> None:
-        """Give the ladder a measured service time; if this changes the rung, set the estimates of all stages to it."""
+        """Give the ladder a measured service time. If the rung changes, set all stages' estimates for the new rung."""
         ladder.learn(stage.position, frame.rung, service_ns)
         if stage.position == ladder.last and ladder.consider():
             self.flow.rung = ladder.rung
@@ -307,7 +307,7 @@ class Core:
         unit = self.units[event.unit]
         # Only a unit that passed its deadline is stopping.
         loss = Loss(LossKind.HUNG if unit.life == STOPPING else LossKind.DIED, unit.name)
-        unit.move(UnitDied, self.now_ns + back_off_ns(unit.failures + 1))  # its deadline is now that of its restart
+        unit.move(UnitDied, self.now_ns + back_off_ns(unit.failures + 1))  # the deadline is now the time of its restart
         unit.failures += 1
         unit.update_queue_capacity()
         self._reset_alarm()

@@ -112,7 +112,7 @@ class Job(NamedTuple):
     """One stage of one frame on one unit, from an input slot to an output slot.
 
     `slot_in`: index of the input slot; for several inputs, the result of `packed`. If a bypass ends at the stage, the
-    slots of the edge at which the bypass begins are numbered after those of the input edge.
+    numbers of the bypass's slots begin after the slots of the input edge.
     `slot_out`: index of the output slot.
     `epoch`: epoch of the output edge, or of the input edge if there is no output edge. An edge's epoch grows when a
     unit at the edge dies.
@@ -143,7 +143,7 @@ class JobDone(NamedTuple):
 
     `job`: number of the job, `Job.id`.
     `t_begin_ns`, `t_end_ns`: times of the job's begin and end.
-    `t_sampled_ns`: time at which the frame was sampled, from its header; only from the first stage, else 0.
+    `t_sampled_ns`: time at which the stage sampled the frame; 0 from a stage that waits for other stages.
     `preempted_ns`: time within the job in which the unit had no core.
     `asleep_ns`: time within the job in which the unit slept and no device of its own worked.
     `preempted_before_ns`: time between the unit's last job and this one in which the unit had no core.
@@ -187,7 +187,7 @@ class Pong(NamedTuple):
 
 
 class SchedulerStalled(NamedTuple):
-    """The driver did nothing for `ns` since the last step; units get as much more time to answer."""
+    """The driver did nothing for `ns` since the last step; units get this much more time to answer."""
 
     ns: int
 
@@ -347,6 +347,8 @@ class Graph:
     (flow.py).
     `from_release`: whether the latency begins with the frame's release. If not, it begins when the first stage samples
     the frame.
+
+    Raises UnexpectedValue for stages, edges or a bypass that do not fit together.
     """
 
     stages: tuple[StageSpec, ...]
@@ -370,10 +372,7 @@ class Graph:
             self._check_bypass(names, self.bypass)
 
     def _check_inputs(self) -> None:
-        """Raise UnexpectedValue for a stage with wrong inputs, or with `every` below 1.
-
-        Right inputs are a few different earlier stages.
-        """
+        """Raise UnexpectedValue for unknown, later, repeated or too many inputs, and for an `every` below 1."""
         known: set[str] = set()
         for stage in self.stages:
             if stage.inputs is None:

@@ -98,8 +98,8 @@ def side_of(stage: StageState, slot_in: int) -> tuple[EdgeSlots | SourceLine, in
 def stale_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
     """Return the slot of the oldest frame that waits for the stage on the bypass, if this frame is stale; else -1.
 
-    The slot is numbered as in `Job.slot_in`. The frame is stale if a newer waiting frame could go as soon. A frame that
-    skips may rely on an earlier frame that does not skip, and therefore never makes that frame stale.
+    The slot is numbered as in `Job.slot_in`. The frame is stale if a newer waiting frame could be taken as early. A
+    frame that skips may rely on an earlier frame that does not skip, and therefore never makes that frame stale.
     """
     own, bypassed = stage.input, stage.bypassed
     if own is None or bypassed is None or not bypassed.lines[SKIPPING]:
@@ -315,7 +315,7 @@ class Flow:
         self.mark_roots_dirty()
 
     def _leave(self, frame: int) -> None:
-        """Take a frame out of flight that no stage has left to do; if it was not presented, it counts as dropped."""
+        """Take a frame out of flight after its last stage; if it was not presented, it counts as dropped."""
         state = self.frames.pop(frame)
         if state.is_presented:
             self.aside -= 1

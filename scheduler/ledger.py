@@ -28,7 +28,7 @@ class IdleCause(NamedTuple):
 
     `name`: its key in reports and traces.
     `account`: account that gets its time; ASSIGNED for a part of the time in which a job was assigned.
-    `meaning`: what is so meanwhile, in the words of the dashboard.
+    `meaning`: why the unit is idle, in the dashboard's words.
     `told`: what a comparison says of the unit.
     `joins`: whether only a unit with a stage of several inputs has this cause.
     """
@@ -55,7 +55,7 @@ CAUSES: Final = (
         "join", JOIN, "some inputs of a frame are there, others not", "waits for the other inputs of a frame", True
     ),
 )
-#: The name of the cause of a unit's time without a job, by its account.
+#: The name of each cause of time without a job, by the account that gets this time.
 NAMES: Final = {cause.account: cause.name for cause in CAUSES if cause.account != ASSIGNED}
 
 
@@ -166,8 +166,8 @@ class _UnitBook:
 class Books:
     """Settings of a ledger.
 
-    `target_period_ns`: as for `trilane.scheduler.stats.due_ns`.
-    `sketch`: function that makes a sketch, as for `trilane.scheduler.stats.Samples`.
+    `target_period_ns`: longest frame time that counts as in time; 0: the frames' deadlines count.
+    `sketch`: function that makes a sketch for the percentiles of many values; None: all values are kept.
     """
 
     target_period_ns: int = 0

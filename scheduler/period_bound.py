@@ -10,10 +10,10 @@ longer.
 If frames can take a bypass, the bound ignores the slots. The period of a run may then be longer than the bound.
 
 With `every` a stage takes one frame of several. The pattern of the jobs repeats after a hyperperiod, the least common
-multiple of all values of `every`, and each job of a hyperperiod counts by itself. An input with `latest` never delays
-the stage that writes its stream. The same holds for an edge whose rule replaces waiting frames (triple, orphan).
+multiple of all values of `every`. Each job of a hyperperiod counts by itself. An input with `latest` never delays the
+stage that writes its stream. The same holds for an edge whose rule replaces waiting frames (triple, orphan).
 
-Rule: the arithmetic is exact, in whole ns and fractions. Newton's method finds the largest ratio. Each step searches a
+Rule: the arithmetic is exact, in whole ns and fractions. Newton's method finds the largest ratio. Each step looks for a
 cycle whose ratio is above the largest ratio so far (Bellman and Ford). The search ends when there is no such cycle.
 """
 

@@ -13,8 +13,9 @@ conditions hold:
 - *A unit does one job at a time.* Its jobs of a frame take at most T.
 - *A core does one thing at a time.* The time that all units need on a core is at most T. A unit with one thread and
   several cores *floats*: the kernel runs it on any core that is free. For every set of cores, the work that cannot go
-  to other cores is at most the work that the set can do in T. The kernel fails to use a share of this time, which is
-  taken off. By Hall's condition the work can be divided among the cores exactly if this holds for all sets.
+  to other cores is at most the work that the set can do in T. The kernel leaves a share of this time unused, so only
+  `ROOM_USED` of it counts. By Hall's condition the work can be divided among the cores exactly if this holds for all
+  sets.
 - *Each of a job's parallel regions waits for its slowest thread.* Let other units have core c for the share o(c) of the
   time. A job of several threads goes on only while all its cores are free. If the other units come independently, the
   cores are all free for the share p, the product of 1 - o(c) over the cores. The job's time divided by p is at most T.
@@ -126,7 +127,7 @@ MOST_FLOATING: Final = 4
 
 
 def placements(cores: Sequence[CpuCore], times: Times, fixed: Placement) -> Iterator[Placement]:
-    """Yield each placement of the units of `times`; placements that an exchange of equal cores makes alike count once.
+    """Yield each placement of the units of `times`. Placements that differ only by exchanging equal cores count once.
 
     Cores are equal if they have the same speed, the same units and equal siblings. The core with the lowest number
     stands for all equal cores. A unit with one thread has one core, or floats between two cores of the same speed.

@@ -21,7 +21,7 @@ the least use by at most a twentieth, because less work would save nothing.
 
 The ladder changes at once to a rung of less work. It returns to more work by one rung, after `patience` successive
 frames in which that rung's use was at most `ROOM`. If it must leave that rung within `patience` frames, the patience
-doubles, up to `MOST_PATIENCE`.
+doubles, up to `MOST_PATIENCE`. If it leaves the rung later, the patience is `PATIENCE` again.
 """
 
 from __future__ import annotations
@@ -70,8 +70,8 @@ class Policy:
     """One row of `POLICIES`.
 
     `choose`: function that returns the job that a unit takes, from the jobs that could begin.
-    `meaning`: what it does, in the words of helps.
-    `told`: what a comparison says of a run under it.
+    `meaning`: what the policy does, for help texts.
+    `told`: what a comparison says of a run under this policy.
     `in_flight`: limit of frames between admission and presentation; 0: the policy sets no limit.
     `newest`: whether a stage takes the newest waiting frame; all older waiting frames are stale and dropped.
     `drop_late`: whether a frame that cannot meet its deadline is dropped before its next stage.

@@ -9,12 +9,12 @@ jobs. On a seat with turns one job runs at a time. The other jobs wait, and thei
 seat all jobs run at once, each with an equal share. An example is a core of this machine: the kernel switches between
 the processes on the core. A unit does its own jobs in the order in which they were handed to it.
 
-Turns. The first waiting job of each pipeline is a candidate, and a rule of `TURNS` chooses one. A running job is never
+Turns. The first waiting job of each unit is a candidate, and a rule of `TURNS` chooses one. A running job is never
 taken off its seat. Source of the rule `deadline`: Liu and Layland, Journal of the ACM 20 (1973).
 
-At one instant, all events and all deadlines of the schedulers come first; each of them is a step of one `Core`. Only
-then do jobs begin, so that the choice sees every job that is ready at this instant. Running jobs change their speed
-when other jobs begin or end. The work that is left of a job is kept as a whole number, in units of ns / `ONE`.
+At one instant, all events and all deadlines of the schedulers come first; each of them is a step of one `Core`. Jobs
+begin after these steps, so that the choice sees every job that is ready at this instant. Running jobs change their
+speed when other jobs begin or end. The work that is left of a job is kept as a whole number, in units of ns / `ONE`.
 
 Accounts. If a job waits while another pipeline has its seat, this time counts as preempted before the job
 (`JobDone.preempted_before_ns`). On a divided seat, the share of the other jobs counts as preempted within the job
@@ -41,10 +41,10 @@ ROUND_ROBIN: Final = "round-robin"
 
 
 class Waiting(NamedTuple):
-    """The first job of a pipeline that waits for a seat.
+    """A job that waits for a seat: the first waiting job of a unit.
 
-    `behind`: number of pipelines whose turn comes before this pipeline's turn. The pipeline that had the seat last has
-    the largest number, and the pipeline after it has 0.
+    `behind`: number of pipelines whose turn comes before the turn of the job's pipeline. The pipeline that had the seat
+    last has the largest number, and the pipeline after it has 0.
     `deadline_ns`: deadline of the job's frame, or NEVER.
     `order`: number that grows with each hand-over of a job to a unit.
     """
@@ -336,8 +336,8 @@ class BesideDriver:
 def simulate_beside(members: Sequence[Member], *, keep: bool = False, **driver: Any) -> list[Simulation]:
     """Run all `members` to their ends, and return a Simulation for each, in their order.
 
-    Frames that still waited before the first stage at a `Stop` do not count as requested. In each report the key
-    `response_ms` is added: summary of the times from release to presentation, of the frames with a deadline.
+    Frames that still waited before the first stage at a `Stop` do not count as requested. Each report also has the key
+    `response_ms`: a summary of the times from release to presentation of the frames with a deadline.
 
     `keep`, `driver`: arguments of BesideDriver, which also lists the errors.
     """

@@ -83,10 +83,10 @@ class UnitState:
     """The state of one unit.
 
     `life`: DOWN, STARTING, READY or STOPPING, by the table `TABLE`.
-    `deadline_ns`: time by which the event must come that this life waits for.
+    `deadline_ns`: latest time of the event that the unit waits for in this life.
     `queue`: the running job, then the job dispatched ahead.
     `queue_capacity`: number of jobs that the unit may hold now (`update_queue_capacity`).
-    `head_since_ns`: time since which the running job could run.
+    `head_since_ns`: time from which the running job could run.
     `hold_until_ns`: end of the pause that the unit's duty asks for; NEVER: no pause.
     `duty`: share of the time for which the unit may work, in thousandths.
     `failures`: number of the unit's deaths since it last ended a job.
@@ -153,7 +153,7 @@ class UnitState:
             self.queue_capacity = HELD_JOBS if self.duty == FULL_DUTY else 1
 
     def expected_end_ns(self) -> int:
-        """Return when, by its stage's estimate, the running job should end, in ns. Raises IndexError if no job runs."""
+        """Return the estimated time in ns at which the running job ends. Raises IndexError if no job runs."""
         name = self.queue[0].stage
         for stage in self.stages:
             if stage.name == name:
@@ -162,10 +162,10 @@ class UnitState:
 
 
 class SourceLine:
-    """The frames that wait for a stage without inputs; has the methods of `EdgeSlots`.
+    """The frames that wait for a stage without inputs. It has the methods of `EdgeSlots` that such a stage needs.
 
-    A run has source lines if several stages have no inputs, or if `every` of the only such stage is above 1. The number
-    of a frame serves as its slot.
+    A run has source lines if several stages have no inputs, or if `every` of the only such stage is above 1. An input
+    with `latest` does not count here. The number of a frame serves as its slot.
     """
 
     def __init__(self) -> None:
@@ -238,7 +238,7 @@ class StageState:
     `others`: lines of frames that wait at the further `inlets`.
     `slots_of`: inputs whose slots a job names, in the order of `Job.slot_in`.
     `feeder`: unit that fills the input, if every job of the stage reads one slot of the same edge; else None.
-    `joins`: whether `Job.slot_in` stands for the slots of several inputs, and must be unpacked.
+    `joins`: whether `Job.slot_in` must be unpacked (`trilane.scheduler.events.unpacked`).
     `bypassed`: for the stage at which a bypass ends, the output edge of the stage at which the bypass begins.
     `readers`: stages that read the output by an input without `latest`, in the order of the output's lines.
     `period`: distance between the frames that the stage does, in frames.
@@ -365,7 +365,7 @@ class FrameState:
 def build(graph: Graph) -> tuple[list[StageState], dict[str, UnitState], list[EdgeSlots]]:
     """Return the connected states of a graph: (stages in the graph's order, units by name, edges as in `graph.edges`).
 
-    Raises ValueError for an unknown rule of an edge.
+    Raises ValueError for an unknown rule of an edge, or for one slot behind a stage that an input with `latest` reads.
     """
     units = {name: UnitState(name) for name in graph.units}
     stages = [StageState(spec.name, units[spec.unit], position) for position, spec in enumerate(graph.stages)]

@@ -273,8 +273,8 @@ class FrameTimeSamples:
     def row(self) -> dict[str, float | None]:
         """Return the object `frame_time_ms` of a report, in ms.
 
-        Its keys are those of the function `summary_ms`, least and largest exponential average (`ema20_min`,
-        `ema20_max`), `jitter`, and interval of the mean (`mean_low`, `mean_high`). The exponential average (weight
+        It has the keys of the function `summary_ms`, the least and largest exponential average (`ema20_min`,
+        `ema20_max`), `jitter`, and the interval of the mean (`mean_low`, `mean_high`). The exponential average (weight
         2 / (SPAN + 1)) counts from frame SPAN on; in a shorter run, only its last value counts. Jitter is the mean
         absolute difference of successive times; None for fewer than two times.
         """
@@ -310,7 +310,7 @@ class FrameTimeSamples:
 
 
 def due_ns(deadline_ns: int, before_ns: int | None, target_period_ns: int) -> int:
-    """Return the time in ns after whose passing a frame is late; NEVER if nothing says when the frame is due.
+    """Return the time in ns after which a frame is late; NEVER if nothing says when the frame is due.
 
     `deadline_ns`: time of the frame's own deadline; NEVER without one.
     `before_ns`: time at which the frame before it was presented; None if the time since then is no frame time.
@@ -324,7 +324,7 @@ def due_ns(deadline_ns: int, before_ns: int | None, target_period_ns: int) -> in
 class Lateness:
     """How late frames were, by `due_ns`.
 
-    `count`: number of these frames.
+    `count`: number of frames with a due time.
     `missed`: number of frames that came after their deadline.
     """
 
@@ -350,10 +350,10 @@ class Lateness:
 
 @lru_cache(maxsize=4096)
 def student_tails(t: float, freedom: float) -> float:
-    """Return the probability that Student's t is beyond ±`t`.
+    """Return the probability that the absolute value of Student's t is above `t`, which is at least 0.
 
     `freedom`: degrees of freedom, a whole number or inf.
-    Abramowitz and Stegun, Handbook of Mathematical Functions, 26.7.3 and 26.7.4.
+    Source: Abramowitz and Stegun, Handbook of Mathematical Functions, 26.7.3 and 26.7.4.
     """
     if freedom == inf or t == inf:
         return erfc(t / sqrt(2))

@@ -5,13 +5,13 @@ Rule: the scheduler is the real `Core`; only the units and the cores are simulat
 With cores of their own (`VirtualDriver`), the units are queues of jobs whose service times come from a function. A heap
 with the key (t_ns, priority, seq) orders the events.
 
-On shared cores (`SharedCores`), every job's needs are given: CPU time of its unit's threads, and time in which the
-threads need no core (a device works, or the unit sleeps). A unit with one thread is on one core at a time. It wakes on
-the core where it was last. If another unit is there, it wakes on the one of its cores that has the fewest units. A core
-that becomes idle pulls a unit that shares another core. If a unit begins to share a core while another core is already
-idle, the idle core pulls this unit at the next tick (BALANCE_NS). The units on a core have equal shares of it. A unit
-of several threads is on all of its cores at once. The core with the most units sets its speed, because each parallel
-region waits for its slowest thread.
+On shared cores (`SharedCores`), two needs of each job are given: CPU time of its unit's threads, and time without a
+core. In the time without a core, a device works or the unit sleeps. A unit with one thread is on one core at a time. It
+wakes on the core where it was last. If another unit is there, it wakes on the one of its cores that has the fewest
+units. A core that becomes idle pulls a unit that shares another core. If a core becomes shared while another core is
+already idle, the idle core pulls a unit at the next tick (BALANCE_NS). The units on a core have equal shares of it. A
+unit of several threads is on all of its cores at once. The core with the most units sets the unit's speed, because each
+parallel region waits for its slowest thread.
 
 Equal shares stand for the kernel's time slices. Moves and changes of threads cost nothing here, because the given CPU
 times of jobs include them.
@@ -67,7 +67,7 @@ def none_skips(_frame: int, _fresh: bool) -> bool:
 class Simulation:
     """The result of a simulated run.
 
-    `report`: keys of report.json.
+    `report`: report with the keys of report.json.
     `recording`, `jobs`: recording and finished jobs, if they are kept; else None and empty.
     `shown_ns`: time in ns at which each frame was presented, by the frame's number.
     """
@@ -152,7 +152,7 @@ class VirtualDriver:
                 gc.enable()
 
     def wait(self, deadline_ns: int) -> tuple[int, tuple[Event, ...]]:
-        """Return (time in ns, the next valid event); if the core's deadline comes first, it comes without an event."""
+        """Return (time in ns, the next valid event). If the core's deadline comes first, return it with no event."""
         heap = self._heap
         while heap and heap[0][0] <= deadline_ns:
             at_ns, _, _, event, epoch = heappop(heap)
@@ -227,7 +227,7 @@ def simulate(
     """Simulate a run to its end, and return the result.
 
     `graph`, `settings`, `service`, `keep`, `driver`: arguments of VirtualDriver.
-    `target_period_ns`: as in `trilane.scheduler.ledger.Books`.
+    `target_period_ns`: longest frame time that counts as in time; 0: the frames' deadlines count.
 
     Raises ValueError for an unknown policy or edge, RuntimeError if nothing can ever happen again.
     """
@@ -284,14 +284,14 @@ class _Unit:
 
 
 class SharedCores:
-    """The `trilane.scheduler.core.Core` of one run on simulated cores. Equal inputs give equal runs.
+    """Runs one `trilane.scheduler.core.Core` on simulated cores. Equal inputs give equal runs.
 
-    If its unit is free, a job begins as soon as the scheduler hands it over.
+    A job begins as soon as the scheduler has handed it over and its unit is free.
 
     `places`: cores and threads of every unit.
     `needs`: function that returns the needs of a job.
     `message_ns`: time from the end of a job until the scheduler hears of it.
-    `scheduler_ns`: CPU time that the scheduler takes after that, on the cores of the first stage's unit.
+    `scheduler_ns`: CPU time that the scheduler then takes for the message, on the cores of the first stage's unit.
     """
 
     def __init__(

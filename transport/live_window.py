@@ -1,4 +1,4 @@
-"""A window into a running run: the newest picture comes out, the camera's steering goes in. Rule: no process waits.
+"""A window into a run: the newest picture comes out, the camera's steering goes in. Rule: no process waits.
 
 The window is one region of memory without a name (memfd), which every process maps. A viewer writes down the time of
 each look; the presenting stage copies a picture in only if the last look was a short time ago. There are two buffers,
@@ -100,7 +100,7 @@ class LiveWindow:
 
     @classmethod
     def opened(cls, path: Path, height: int, width: int) -> LiveWindow:
-        """Return the window at `path` for pictures of `height` x `width` pixels; raises OSError."""
+        """Return the window at `path` for pictures of `height` x `width` pixels; raises OSError and ValueError."""
         fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         try:
             return cls(fd, height, width)

@@ -49,10 +49,10 @@ class RunJob(NamedTuple):
     `stage`: place in the unit's list of stages, from 0.
     `frame`: number of the frame.
     `slot_in`, `slot_out`: slots of the stage's input edge and output edge; -1 if the stage has no such edge. If a
-    bypass ends at the stage, `slot_in` counts on: the slots of the bypassed edge follow those of the input edge. If the
-    stage has several inputs, `slot_in` packs a slot of each.
-    `epoch`: epoch of the edge of `slot_out`.
-    `t_dispatch_ns`: time from which the unit has the job, in ns of CLOCK_MONOTONIC.
+    bypass ends at the stage, the numbers of the bypass's slots begin after the slots of the input edge. If the stage
+    has several inputs, `slot_in` holds a slot of each, the first in the lowest byte.
+    `epoch`: epoch of the output edge, or of the input edge if there is no output edge.
+    `t_dispatch_ns`: time at which the scheduler handed over the job, in ns of CLOCK_MONOTONIC.
     `fresh`: 1 when the stage must ignore what earlier frames left behind, else 0.
     `rung`: rung of the frame's work, 0 for all of it.
     """
@@ -85,7 +85,7 @@ class Ready(NamedTuple):
 class Done(NamedTuple):
     """From a unit: the job `id` has ended. Points in time are ns of CLOCK_MONOTONIC, durations are ns.
 
-    `t_sampled_ns`: time at which the pipeline's first stage sampled the frame's input; 0 for other stages.
+    `t_sampled_ns`: time at which the stage sampled the frame's input; 0 from a stage that waits for other stages.
     `preempted_ns`: duration of the job's parts in which the unit had no core.
     `asleep_ns`: duration of the job's parts in which the unit slept and no device worked for it.
     `preempted_before_ns`: duration between the previous job and this job in which the unit had no core.
@@ -395,7 +395,7 @@ class HeartbeatSocket:
 def context_on_cores(cores: Sequence[int]) -> zmq.Context[zmq.Socket[bytes]]:
     """Return a ZeroMQ context for a unit. Its I/O thread runs on `cores` and preempts other work there when it wakes.
 
-    `cores`: cores other than the unit's own, where the I/O thread would wait behind the unit's next job.
+    `cores`: cores other than the unit's own. On the unit's own cores, the I/O thread would wait behind the next job.
     Call this from the thread that makes the first socket. The I/O thread inherits the short time slice set here, and
     the caller keeps the short slice too.
     """

@@ -2,7 +2,7 @@
 
 One slot holds one header, then the payload; stages get views of a slot, never copies. Every header begins with
 `FRAME_FIELDS`, which the unit's loop fills in; the pipeline defines the other fields. Everything that a later stage
-needs to know about a frame travels in the frame's packet; no stage asks another.
+needs to know about a frame travels in the frame's packet; no stage asks another stage.
 
 Each edge has one region of memory without a name (memfd), of a fixed size. The parent makes the regions and keeps their
 descriptors; child processes inherit the descriptors and map the regions. The kernel frees a region when the last

@@ -1,4 +1,4 @@
-"""Says which unit each slot of an edge belongs to. Rule: a slot changes hands only by a transition of the table.
+"""Says which unit each slot of an edge belongs to. Rule: a slot changes its state only by an entry of `TRANSITIONS`.
 
     FREE --claim--> WRITING --commit--> READY --take--> READING --release--> FREE
 
@@ -37,7 +37,7 @@ MAX_SLOTS = 64
 
 
 class SlotError(Exception):
-    """The caller asked for a transition that the table does not have: a defect of the code, not of a user's input."""
+    """The caller asked for a transition that is not in `TRANSITIONS`: a defect of the code, not of a user's input."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class EdgeSlots:
     `lines`: for each reader that takes frame by frame, the slots that wait for it, oldest frame first.
     `ready`: the first line.
     `newest`: for each reader of the newest frame, the slot that it holds; -1 before the first frame.
-    `epoch`: number that grows at each fault.
+    `epoch`: number that grows when the process of a unit at the edge is lost.
     """
 
     def __init__(self, rule: EdgeRule, lines: int = 1, newest: int = 0) -> None:
