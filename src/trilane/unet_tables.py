@@ -56,9 +56,11 @@ class MobileEncoder:
 def squeeze_channels(channels: int) -> int:
     """Return the number of inner channels of a squeeze-and-excitation: `channels` / 4, rounded to a multiple of 8.
 
-    The result is at least 8.
+    The result is at least 8, and never below 90 % of `channels` / 4, as in the authors' code of MobileNetV3.
     """
-    return max(8, (channels // 4 + 4) // 8 * 8)
+    quarter = channels // 4
+    rounded = max(8, (quarter + 4) // 8 * 8)
+    return rounded if rounded >= 0.9 * quarter else rounded + 8
 
 
 def _repeated(spec: Sequence[tuple[int, int, int, int, int]], before: int) -> tuple[MobileBlock, ...]:
