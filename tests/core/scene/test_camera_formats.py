@@ -635,7 +635,7 @@ def test_times_in_a_column_of_places_are_refused(tmp_path: Path, column: int) ->
 @pytest.mark.parametrize(
     ("bad", "note"),
     [
-        (np.nan, "1 samples not finite or no rotation"),
+        (np.nan, "1 samples not finite"),
         (4 / 30, "1 samples with repeated or decreasing times"),
         (1 / 30, "1 samples with repeated or decreasing times"),
     ],
