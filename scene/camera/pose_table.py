@@ -22,6 +22,7 @@ from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.scene.camera.recorded import AUTO, FILM_RATE_HZ, LENGTH_UNITS, are_rotations
+from trilane.scene.recordings import EARLIEST_S, LATEST_S
 from trilane.scene.rotations import matrix_from_quat, normalised
 
 MAX_ROWS = 1_000_000
@@ -35,8 +36,6 @@ LEAST_STEP_S, FAST_STEP_S = 0.9e-3, 3e-3
 #: Times since 1970, or times with fractions, keep their unit for steps up to SURE_STEP_S, such as those between key
 #: frames. For steps up to LONGEST_STEP_S, another unit is as likely.
 SURE_STEP_S, LONGEST_STEP_S = 3.0, 60.0
-#: Times from 2001 to 2100, in seconds since 1970, count as times of a clock. Other times may start at any number.
-EARLIEST_S, LATEST_S = 1e9, 4.1e9
 #: Number of lines of numbers from which a table's layout is found.
 LOOKED_AT = 20
 #: Whole numbers below MOST_FRAMES are frame numbers if their median step is 1. Also, at least the share LEAST_GROWING
