@@ -89,7 +89,7 @@ class Bundle:
 
         Raises BadInputError.
         """
-        arrays = read_npz(self.texture_path, TEXTURE_KEYS, "a neural texture")
+        arrays = _texture_arrays(self.texture_path, self.manifest.network.channels)
         if "levels" not in arrays:
             return None
         check_levels(arrays["levels"], arrays["texture"], self.texture_path)
@@ -111,13 +111,19 @@ def read_texture(path: Path, channels: int) -> NDArray[np.float32]:
 
     `channels`: number of channels that the texture must have. Raises BadInputError.
     """
+    arrays = _texture_arrays(path, channels)
+    return _decoded(arrays["texture"], arrays.get("scale"), path)
+
+
+def _texture_arrays(path: Path, channels: int) -> dict[str, NDArray[Any]]:
+    """Return the arrays in the file `path`: `texture` (H, W, `channels`), and perhaps others. Raises BadInputError."""
     arrays = read_npz(path, TEXTURE_KEYS, "a neural texture")
     if "texture" not in arrays:
         raise BadInputError(path, "no array 'texture'", "a neural texture")
     shape = arrays["texture"].shape
     if len(shape) != 3 or min(shape[:2]) < 2 or max(shape[:2]) > MAX_SIDE or shape[2] != channels:
         raise BadInputError(path, f"a texture of shape {shape}", f"(H, W, {channels}) with sides of 2 to {MAX_SIDE}")
-    return _decoded(arrays["texture"], arrays.get("scale"), path)
+    return arrays
 
 
 def bundle_folder(name: str | Path) -> Path:

@@ -61,9 +61,12 @@ class IntegerNetwork:
         """
         texts = [prop.value for prop in self.model.metadata_props if prop.key == FLOAT_LAYERS_KEY]
         try:
-            return frozenset(str(name) for text in texts for name in json.loads(text))
-        except (ValueError, TypeError, RecursionError) as error:
-            raise BadInputError(self.where, f"{FLOAT_LAYERS_KEY} {texts}", "a JSON list of names") from error
+            lists = [json.loads(text) for text in texts]
+        except (ValueError, RecursionError):
+            lists = [None]
+        if not all(isinstance(names, list) for names in lists):
+            raise BadInputError(self.where, f"{FLOAT_LAYERS_KEY} {texts}", "a JSON list of names")
+        return frozenset(str(name) for names in lists for name in names)
 
     @property
     def digest(self) -> str:
@@ -152,15 +155,22 @@ ZERO_POINT_TYPES = {
 
 
 def check_network(model: onnx.ModelProto, where: str) -> NetworkFile:
-    """Return `model` as a checked network. Raises BadInputError, which names `where` and the wrong node."""
-    for node in model.graph.node:
+    """Return `model` as a checked network. Raises BadInputError, which names `where` and the wrong node.
+
+    Initializers that the graph also lists as inputs are removed from its inputs.
+    """
+    graph = model.graph
+    for node in graph.node:
         if node.domain not in ("", "ai.onnx") or node.op_type not in OPERATORS:
             name = f"{node.domain}:{node.op_type}" if node.domain else node.op_type
             raise BadInputError(where, f"operator {name} in node {node_name(node)!r}", "operators a DSP has")
+    _check_order(graph, where)
+    constants = constants_of(model)
+    inputs = [value for value in graph.input if value.name not in constants]
+    del graph.input[:]
+    graph.input.extend(inputs)
     shape = _check_input(model, where)
     _check_output(model, where, shape)
-    graph = model.graph
-    constants = constants_of(model)
     for node in graph.node:
         if node.op_type in ("QuantizeLinear", "DequantizeLinear"):
             _check_affine(node, constants, where)
@@ -169,9 +179,21 @@ def check_network(model: onnx.ModelProto, where: str) -> NetworkFile:
     return NetworkFile(where, model, shape, _affine(first, constants, where), _affine(last, constants, where))
 
 
+def _check_order(graph: onnx.GraphProto, where: str) -> None:
+    """Raise BadInputError unless each node has inputs and outputs, and makes tensors once, before they are read."""
+    seen: set[str] = set()
+    for node in graph.node:
+        if not node.output or not (node.input or node.op_type == "Constant"):
+            raise BadInputError(where, f"node {node_name(node)!r} without inputs or outputs", "at least one of each")
+        seen.update(node.input)
+        if again := (seen & set(node.output)) - {""}:
+            found = f"{min(again)!r}, made by node {node_name(node)!r} and made or read before"
+            raise BadInputError(where, found, "nodes in the order of the work, each with new names")
+        seen.update(node.output)
+
+
 def _check_input(model: onnx.ModelProto, where: str) -> tuple[int, int, int, int]:
-    constants = {tensor.name for tensor in model.graph.initializer}
-    inputs = [value for value in model.graph.input if value.name not in constants]
+    inputs = model.graph.input
     if len(inputs) != 1:
         raise BadInputError(where, f"{len(inputs)} inputs", "one input, N x H x W x C uint8")
     n, h, w, c = _static_shape(inputs[0], where)

@@ -156,14 +156,14 @@ def _drawn_otherwise(validation: Validation, drawn: DrawnAs) -> str:
 
 def _no_figures(bundle: Bundle, changed: Sequence[str], why: str, how: str = "", remark: str = "") -> dict[str, Any]:
     """Return the keys of `refused`. Their `why` ends with the command that measures the figures."""
-    command = f"{VALIDATE} {shlex.quote(name_of(bundle.folder))}{how}"
+    command = f"{VALIDATE} {name_of(bundle.folder)}{how}"
     return {"source": NO_FIGURES, "changed": list(changed), "why": f"{why}; `{command}` measures it{remark}"}
 
 
 def name_of(folder: Path) -> str:
-    """Return the word by which a command names the avatar in `folder`: a name of AVATARS, or the path."""
+    """Return the word by which a command names the avatar in `folder`: a name of AVATARS, or the quoted path."""
     known = (name for name in AVATARS if folder.absolute() == bundle_folder(name).absolute())
-    return next(known, str(folder))
+    return next(known, shlex.quote(str(folder)))
 
 
 # The tensor sizes that an avatar needs, and its loss in smaller ones. Rule: they come from the avatar's validation, or

@@ -27,19 +27,15 @@ from numpy.typing import NDArray
 from trilane.arrays import Shape
 from trilane.scene.camera.path import CameraPath, Optics
 from trilane.scene.lens import Known, Lens, cover
-from trilane.scene.recordings import natural
+from trilane.scene.recordings import EARLIEST_S, GAP, LATEST_S, natural
 from trilane.scene.rotations import quat_from_matrix
 
 #: Numbers in names count a film's frames if at least the share LEAST_IN_STEP of neighbours is one step apart. Also, the
 #: film must have fewer than MOST_MISSING frames for each picture.
 LEAST_IN_STEP, MOST_MISSING = 0.5, 4
 NAMED_GAPS = 3
-#: A step between times is a gap if it is longer than this many usual steps.
-GAP = 1.5
-#: Patterns of names that are times since 1970, with their unit in seconds; and the range of such times, the years 2001
-#: to 2100.
+#: Patterns of names that are times since 1970, with their unit in seconds.
 CLOCKS = {r"\d{10}\.\d{1,9}": 1.0, r"\d{13}": 1e-3, r"\d{16}": 1e-6, r"\d{19}": 1e-9}
-EARLIEST_S, LATEST_S = 1e9, 4.1e9
 ROUNDING_S = 1e-6
 LAST_NUMBER = re.compile(r"(.*?)(\d{1,15})(\D*)\Z", re.DOTALL)
 

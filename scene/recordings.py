@@ -45,6 +45,8 @@ NOTHING = Detected()
 
 #: A time step longer than this many median steps is reported as a gap.
 GAP = 1.5
+#: Times from 2001 to 2100, in seconds since 1970, count as times of a clock. Other times may start at any number.
+EARLIEST_S, LATEST_S = 1e9, 4.1e9
 
 #: A function from a sample's index to the sample's place in its file, for messages.
 PlaceOf = Callable[[int], str]

@@ -1,13 +1,15 @@
 """Scene files (TOML): their schema, how they are loaded, and a message about the first error.
 
 The schema checks types and ranges; the loaders check whether a named file exists and what it contains. The values of a
-scene file never change, except that its paths are made absolute. The file's name replaces a missing `name`.
+scene file never change, except that its paths are made absolute. The file's name replaces a missing `name`, with
+hyphens for characters that a name cannot have.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -39,7 +41,7 @@ LEAST_FPS = 1e-3  # far below that, a period in nanoseconds overflows
 LONGEST_S = 1e6  # longest motion, seconds
 FARTHEST_M = 1e4  # farthest coordinate of an avatar, metres; there float32 still resolves millimetres
 
-NAME = r"^[\w .-]+$"
+NAME, NO_NAME, LONGEST_NAME = r"^[\w .-]+$", r"[^\w .-]", 80
 
 LISTED = Strict(strict=False)  # lets a list of the file become a tuple
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -78,7 +80,7 @@ class AvatarSpec(Table):
     name: str | None = Field(
         default=None,
         min_length=1,
-        max_length=80,
+        max_length=LONGEST_NAME,
         pattern=NAME,
         description="Name of the avatar, different from all others; `avatar1`, `avatar2`, ... if not given.",
     )
@@ -302,7 +304,9 @@ def _scene_size(size: str) -> str:
 class Scene(Table):
     """The content of a scene: what its pictures show, and how they are drawn."""
 
-    name: str = Field(default="scene", min_length=1, max_length=80, pattern=NAME, description="Name of the scene.")
+    name: str = Field(
+        default="scene", min_length=1, max_length=LONGEST_NAME, pattern=NAME, description="Name of the scene."
+    )
     fps: float = Field(
         default=30.0, ge=LEAST_FPS, le=1000, allow_inf_nan=False, description="Frames per second of the scene's time."
     )
@@ -485,7 +489,7 @@ def load_scene(path: Path) -> dict[str, Any]:
         values = tomllib.loads(read_text(path, "a scene file (TOML)"))
     except (ValueError, RecursionError) as error:  # raised also for numbers and lists that are too long
         raise BadInputError(path, f"no valid TOML ({error})", "a scene file (TOML)") from None
-    values.setdefault("name", path.stem)
+    values.setdefault("name", re.sub(NO_NAME, "-", path.stem)[:LONGEST_NAME])
     scene = scene_from(path, values)
     base = path.absolute().parent
     values["background"] = located(scene.background, base)

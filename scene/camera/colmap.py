@@ -129,6 +129,8 @@ def read_cameras_text(path: Path) -> dict[int, ColmapCamera]:
             camera = int(words[0])
         except ValueError as error:
             raise BadInputError(where, str(error), CAMERAS) from None
+        if camera in cameras:
+            raise BadInputError(where, f"a second camera {camera}", "one line for each camera")
         cameras[camera] = checked_camera(where, BY_NAME[words[1]], (numbers[0], numbers[1]), numbers[2:])
     return cameras
 

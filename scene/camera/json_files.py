@@ -148,11 +148,7 @@ def _place_of(index: int) -> str:
 
 def _matrix(path: Path, index: int, frame: Any) -> NDArray[np.float64]:
     where = f"{path}: {_place_of(index)}"
-    value = frame.get("transform_matrix") if isinstance(frame, dict) else None
-    try:
-        matrix = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise BadInputError(where, "something else than numbers", "a 4x4 matrix") from None
+    matrix = _numbers(where, frame.get("transform_matrix") if isinstance(frame, dict) else None, "a 4x4 matrix")
     if matrix.shape not in ((4, 4), (3, 4)):
         raise BadInputError(where, f"shape {matrix.shape}", "a 4x4 matrix")
     if _is_singular(matrix):
@@ -160,6 +156,14 @@ def _matrix(path: Path, index: int, frame: Any) -> NDArray[np.float64]:
             where, "a matrix without an inverse", "a 4x4 matrix, camera to world", "leave this view out"
         )
     return matrix[:3]
+
+
+def _numbers(where: str, value: Any, expected: str) -> F64:
+    """Return the numbers in `value`, a list of a JSON file; null is NaN. Raises BadInputError for any other content."""
+    array = np.array(value, dtype=object)
+    if not {type(each) for each in array.flat} <= {int, float, type(None)}:
+        raise BadInputError(where, "something else than numbers", expected)
+    return array.astype(np.float64)
 
 
 def _is_singular(matrix: NDArray[np.float64]) -> bool:
@@ -233,6 +237,9 @@ def _number(where: str, value: Any, key: str) -> float | None:
 
 
 RECORD3D_FILE = "metadata.json"
+#: Range of the rate that a file may state, as of camera.rate_hz.
+LEAST_HZ, MOST_HZ = 1e-3, 1000.0
+CORRECT_RATE = "correct it, or set camera.rate_hz"
 RECORD3D = "Record3D's metadata: `poses`, `K`, `w` and `h`"
 
 
@@ -263,27 +270,30 @@ def load_record3d(path: Path, rate_hz: float | None = None) -> RawCamera:
 
 def _array(path: Path, content: Mapping[str, Any], key: str, columns: int) -> F64:
     """Return the table (N, `columns`) at `key` of `content`. Raises BadInputError when it has another shape."""
-    try:
-        array = np.array(content.get(key), dtype=np.float64)
-    except (TypeError, ValueError):
-        raise BadInputError(f"{path}: {key}", "something else than numbers", f"rows of {columns} numbers") from None
+    array = _numbers(f"{path}: {key}", content.get(key), f"rows of {columns} numbers")
     if array.ndim != 2 or array.shape[1] != columns:
         raise BadInputError(f"{path}: {key}", f"shape {array.shape}", f"rows of {columns} numbers")
     return array
 
 
 def _times(path: Path, content: Mapping[str, Any], count: int, rate_hz: float | None) -> tuple[F64, str]:
-    """Return (times of the poses (N,), seconds; their source in words). `count`: number N of poses."""
+    """Return (times of the poses (N,), seconds; their source in words). `count`: number N of poses.
+
+    Raises BadInputError for another number of times, and for a rate that cannot be.
+    """
     if rate_hz is None and content.get("frameTimestamps"):
         values = content["frameTimestamps"]
         rows = {"frameTimestamps": [[value] for value in values] if isinstance(values, list) else None}
         times = _array(path, rows, "frameTimestamps", 1)[:, 0]
-        if len(times) == count:
-            return times - times[np.isfinite(times).argmax()], "by `frameTimestamps`"
+        if len(times) != count:
+            expected = f"{count}, one for each of `poses`"
+            raise BadInputError(f"{path}: frameTimestamps", f"{len(times)} times", expected, CORRECT_RATE)
+        return times - times[np.isfinite(times).argmax()], "by `frameTimestamps`"
     fps = content.get("fps")
-    own = float(fps) if isinstance(fps, int | float) and not isinstance(fps, bool) and 0 < fps <= 1000 else None
-    rate = rate_hz or own or FILM_RATE_HZ
-    how = "as given" if rate_hz else "by `fps`" if own else "assumed"
+    if not (rate_hz or fps is None or (type(fps) in (int, float) and LEAST_HZ <= fps <= MOST_HZ)):
+        raise BadInputError(f"{path}: fps", repr(fps)[:40], f"a number from {LEAST_HZ:g} to {MOST_HZ:g}", CORRECT_RATE)
+    rate = rate_hz or fps or FILM_RATE_HZ
+    how = "as given" if rate_hz else "by `fps`" if fps else "assumed"
     return np.arange(count) / rate, f"{rate:g} a second {how}"
 
 

@@ -8,7 +8,6 @@ another order, which would give a camera that looks in arbitrary directions.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -23,6 +22,7 @@ from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.scene.camera.recorded import AUTO, FILM_RATE_HZ, LENGTH_UNITS, are_rotations
+from trilane.scene.recordings import EARLIEST_S, LATEST_S
 from trilane.scene.rotations import matrix_from_quat, normalised
 
 MAX_ROWS = 1_000_000
@@ -36,8 +36,6 @@ LEAST_STEP_S, FAST_STEP_S = 0.9e-3, 3e-3
 #: Times since 1970, or times with fractions, keep their unit for steps up to SURE_STEP_S, such as those between key
 #: frames. For steps up to LONGEST_STEP_S, another unit is as likely.
 SURE_STEP_S, LONGEST_STEP_S = 3.0, 60.0
-#: Times from 2001 to 2100, in seconds since 1970, count as times of a clock. Other times may start at any number.
-EARLIEST_S, LATEST_S = 1e9, 4.1e9
 #: Number of lines of numbers from which a table's layout is found.
 LOOKED_AT = 20
 #: Whole numbers below MOST_FRAMES are frame numbers if their median step is 1. Also, at least the share LEAST_GROWING
@@ -396,9 +394,10 @@ MATRIX = 12
 ROW_ORDER = "the order r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
 #: Largest deviation of a quaternion's length from 1; rounding to two decimal places changes the length by 0.01 at most.
 MOST_OFF = 0.02
-#: A column is a clock if all steps differ from their median by less than the share EVEN. A column is no clock if a step
-#: differs by UNEVEN or more. It is judged only if it has LEAST_OF_A_CLOCK rows.
-EVEN, UNEVEN, LEAST_OF_A_CLOCK = 0.01, 0.5, 8
+#: A column is a clock if all steps differ from their median by less than the share EVEN. A column is no clock if more
+#: than BAD_STEPS of them, and more than the share BAD_SHARE, differ by UNEVEN or more. A bad time makes two such steps.
+#: A column is judged only if it has LEAST_OF_A_CLOCK rows.
+EVEN, UNEVEN, BAD_STEPS, BAD_SHARE, LEAST_OF_A_CLOCK = 0.01, 0.5, 2, 0.05, 8
 
 
 @dataclass(frozen=True)
@@ -504,19 +503,21 @@ def _require_times(path: Path, times: F64, places: F64) -> None:
 
     The steps of a clock are equal. No camera moves so evenly along an axis while it is sampled at uneven times.
     """
-    if len(times) < LEAST_OF_A_CLOCK or _worst_step(times) < UNEVEN:
+    if len(times) < LEAST_OF_A_CLOCK or _steps_off(times, UNEVEN) <= max(BAD_STEPS, BAD_SHARE * len(times)):
         return
-    even = [name for name, column in zip("xyz", places.T, strict=True) if _worst_step(column) < EVEN]
+    even = [name for name, column in zip("xyz", places.T, strict=True) if not _steps_off(column, EVEN)]
     if even:
-        found = f"times whose steps differ, and in the place of {even[0]} numbers that grow by equal steps"
+        found = f"times that do not grow by equal steps, and in the place of {even[0]} numbers that do"
         raise BadInputError(path, found, "the times in the column of times", SAY_ORDER)
 
 
-def _worst_step(column: F64) -> float:
-    """Return the largest deviation of the steps of `column` (N,) from their median, as a share of the median."""
-    steps = np.diff(column)
-    median = float(np.median(steps))
-    return float(np.abs(steps - median).max() / median) if median > 0 and np.isfinite(steps).all() else math.inf
+def _steps_off(column: F64, share: float) -> int:
+    """Return the number of steps of `column` (N,) that differ from their median by `share` of it or more.
+
+    All steps count if the median is not above 0.
+    """
+    since, median = elapsed(column)
+    return int(np.count_nonzero(~(np.abs(np.diff(since) - median) < share * median)))
 
 
 def _began(times: F64, unit: str) -> float | None:

@@ -259,6 +259,7 @@ def hands_note(poses: NDArray[np.float64]) -> str:
 
 ROMP_POSES, ROMP_PLACES, ROMP_PERSONS = "smpl_thetas", "cam_trans", "track_ids"
 ROMP_RATE_HZ = 30.0
+LARGEST_TRACK = 1e9
 _NUMBER = re.compile(r"(\d+)(?:\.[A-Za-z]+)?$")
 
 
@@ -315,11 +316,7 @@ def _rows_of_person(found: list[FoundTable]) -> tuple[list[int], str]:
     """Return (row of the chosen person in each frame, -1 in a frame without the person; a note on the person)."""
     counts = [len(_rows_in(frame, ROMP_POSES)) for frame in found]
     if all(frame.has(ROMP_PERSONS) for frame in found):
-        persons = [
-            as_numbers(f"{frame.where}[{ROMP_PERSONS}]", _rows_in(frame, ROMP_PERSONS), "numbers").ravel()
-            for frame in found
-        ]
-        tracks = [[int(each) for each in ids[:count]] for ids, count in zip(persons, counts, strict=True)]
+        tracks = [_tracks_in(frame)[:count] for frame, count in zip(found, counts, strict=True)]
         times = Counter(track for each in tracks for track in set(each))
         if times:
             person, most = times.most_common(1)[0]
@@ -333,6 +330,16 @@ def _rows_of_person(found: list[FoundTable]) -> tuple[list[int], str]:
         else ""
     )
     return [0 if count else -1 for count in counts], f"the first person of each frame is read{several}"
+
+
+def _tracks_in(frame: FoundTable) -> list[int]:
+    """Return the track of the person in each row of `frame`. Raises BadInputError for anything but whole numbers."""
+    where = f"{frame.where}[{ROMP_PERSONS}]"
+    tracks = as_numbers(where, _rows_in(frame, ROMP_PERSONS), "numbers").ravel()
+    wrong = tracks[~(np.abs(tracks) <= LARGEST_TRACK)]  # `~` includes NaN, which no comparison holds for
+    if wrong.size:
+        raise BadInputError(where, f"{wrong[0]:g}", f"whole numbers up to {LARGEST_TRACK:g}")
+    return [int(track) for track in tracks]
 
 
 def _row_place(frame: FoundTable, row: int) -> F64 | None:
@@ -498,6 +505,8 @@ def _measured(layout: ArrayLayout, found: FoundTable, frames: int) -> NDArray[np
     mask = found.array(layout.mask)
     if mask.shape != (frames,) or mask.dtype.kind not in "biuf":
         raise BadInputError(f"{found.where}[{layout.mask}]", f"shape {mask.shape}", f"({frames},), true or false")
+    if not mask.any():
+        raise BadInputError(f"{found.where}[{layout.mask}]", "no frame that was measured", "at least one")
     return np.asarray(mask != 0)
 
 
@@ -507,6 +516,8 @@ def _betas(layout: ArrayLayout, found: FoundTable) -> F64 | None:
         return None
     where = f"{found.where}[{layout.betas}]"
     betas = found.numbers(layout.betas)
+    if betas.ndim > 2:
+        raise BadInputError(where, f"shape {betas.shape}", "(n,), or a row for each frame")
     flat = betas.mean(axis=0) if betas.ndim == 2 and len(betas) > 1 else betas.reshape(-1)
     if flat.size > MAX_BETAS or not np.isfinite(flat).all():
         raise BadInputError(where, f"{flat.size} values, some not finite or too many", "finite numbers")

@@ -189,6 +189,16 @@ def test_textures_on_either_side_of_their_limits(tmp_path: Path, case: str) -> N
     assert str(raised.value) == f"{made.texture_path}: found {sentence}"
 
 
+@pytest.mark.parametrize("case", ["no texture", "flat"])
+def test_levels_need_a_texture(tmp_path: Path, case: str) -> None:
+    made = bundle(tmp_path, np.zeros((2, 2, 3), np.float16))
+    arrays, sentence = TEXTURES[case]
+    np.savez(made.texture_path, levels=np.zeros((1, 1, 3), np.float16), **arrays)
+    with pytest.raises(BadInputError) as raised:
+        made.read_levels()
+    assert str(raised.value) == f"{made.texture_path}: found {sentence}"
+
+
 def test_a_network_that_contradicts_its_manifest(tmp_path: Path) -> None:
     """Scales may differ by 1e-5 of themselves, zero points and channels not at all."""
     made = bundle(tmp_path, np.zeros((2, 2, 3), np.float16))

@@ -25,7 +25,9 @@ from trilane.avatars.network_file import (
     node_name,
     parse_network,
     read_network,
+    reshaped,
 )
+from trilane.avatars.network_split import split
 from trilane.errors import BadInputError
 
 Change = Callable[[onnx.ModelProto], None]
@@ -157,6 +159,20 @@ def made_by_nothing(model: onnx.ModelProto) -> None:
     node_of(model, "to_nhwc").input[0] = "nowhere"
 
 
+def own_input(model: onnx.ModelProto) -> None:
+    model.graph.node.insert(3, helper.make_node("Transpose", ["turned"], ["turned"], "round"))
+    node_of(model, "conv1").input[0] = "turned"
+
+
+def made_twice(model: onnx.ModelProto) -> None:
+    model.graph.node.insert(2, helper.make_node("Transpose", ["nchw"], ["real"], "back"))
+
+
+def nothing_made(model: onnx.ModelProto) -> None:
+    model.graph.node.insert(0, helper.make_node("Constant", [], [], value=numpy_helper.from_array(np.float32(3))))
+
+
+ORDER = "made or read before, expected nodes in the order of the work, each with new names"
 RANGE = "expected a number from 1e-30 to 1e+30"
 
 
@@ -209,11 +225,15 @@ REFUSED: dict[str, tuple[Change, str]] = {
     ),
     "read twice": (read_twice, "input used by ['bytes_in', 'second'], expected a DequantizeLinear of the bytes"),
     "not read": (
-        inputs_of("bytes_in", "mid_q", "in_scale", "in_zero"),
+        inputs_of("bytes_in", "w1", "in_scale", "in_zero"),
         "input used by [], expected a DequantizeLinear of the bytes",
     ),
     "read by another": (op("bytes_in", "Relu"), "input used by ['bytes_in'], expected a DequantizeLinear of the bytes"),
     "made by another": (op("to_nhwc", "Relu"), "output made by node 'to_nhwc', expected a QuantizeLinear to bytes"),
+    "a node that reads itself": (own_input, f"'turned', made by node 'round' and {ORDER}"),
+    "a tensor made twice": (made_twice, f"'real', made by node 'back' and {ORDER}"),
+    "no input": (inputs_of("to_nhwc"), "node 'to_nhwc' without inputs or outputs, expected at least one of each"),
+    "no output": (nothing_made, "node 'Constant that makes nothing' without inputs or outputs, expected"),
     "made by nothing": (made_by_nothing, "nothing that makes 'nowhere', expected a QuantizeLinear"),
 }
 
@@ -266,6 +286,15 @@ def test_several_transposes_may_lie_before_the_ends() -> None:
     assert check_network(model, "here").input == Affine(0.5, 7)
 
 
+def test_initializers_may_be_listed_as_inputs_too() -> None:
+    model = net((1, 32, 32, 3))
+    model.graph.input.insert(0, helper.make_tensor_value_info("in_scale", TensorProto.FLOAT, []))
+    network = check_network(model, "here")
+    assert network == check_network(net((1, 32, 32, 3)), "here")
+    assert reshaped(network, 64, 32).shape == (1, 64, 32, 3)
+    assert split(network, ["mid_q"])[0].inputs == {"bytes": (1, 32, 32, 3)}
+
+
 def test_layers_in_float_are_named() -> None:
     model = net()
     network = IntegerNetwork("here", model)
@@ -291,10 +320,11 @@ def test_layers_in_float_are_named() -> None:
                 check_integer_layers(network)
         else:
             check_integer_layers(network)
-    model.metadata_props[-1].value = "3"
-    with pytest.raises(BadInputError) as raised:
-        _ = network.float_layers
-    assert str(raised.value) == "here: found trilane.float_layers ['3'], expected a JSON list of names"
+    for value in ("3", '"abc"', '{"conv2": 1}', "["):
+        model.metadata_props[-1].value = value
+        with pytest.raises(BadInputError) as raised:
+            _ = network.float_layers
+        assert str(raised.value) == f"here: found trilane.float_layers {[value]}, expected a JSON list of names"
 
 
 def test_names_and_constants_of_a_graph() -> None:

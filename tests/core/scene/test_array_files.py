@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import re
 from pathlib import Path
 from typing import Any
 
@@ -182,6 +183,13 @@ def test_glamr_has_persons_in_a_world_with_z_up(tmp_path: Path) -> None:
     assert "1 frames that were not measured left out" in raw.notes
     motion = load_motion(AvatarSpec(motion=str(path)), tmp_path)
     assert "Z up, as the body stands" in motion.notes
+    for change, sentence in (
+        ({"exist_frames": np.zeros(5)}, "[exist_frames]: found no frame that was measured, expected at least one"),
+        ({"smpl_beta": np.ones((2, 3, 4))}, "[smpl_beta]: found shape (2, 3, 4), expected (n,), or a row for each"),
+    ):
+        save(path, {"person_data": {0: {**person(5), **change}}})
+        with pytest.raises(BadInputError, match=re.escape(sentence)):
+            read(path)
 
 
 # --- ROMP ---
@@ -236,6 +244,11 @@ def test_romp_with_nobody_or_arrays_that_do_not_fit(tmp_path: Path) -> None:
         BadInputError, match=r"results\.1\.jpg\]\[cam_trans\]: found shape \(2, 3\), expected a row of 3"
     ):
         romp(tmp_path / "a.npz", {"1.jpg": {**seen(1), "cam_trans": np.zeros((2, 3))}})
+    for track in (np.nan, 1e300):
+        with pytest.raises(
+            BadInputError, match=rf"track_ids\]: found {re.escape(f'{track:g}')}, expected whole numbers"
+        ):
+            romp(tmp_path / "a.npz", {"1.jpg": {**seen(1), "track_ids": np.array([track])}})
     with pytest.raises(BadInputError, match=r"\[smpl_thetas\]: found one number"):
         romp(tmp_path / "a.npz", {"1.jpg": {**seen(1), "smpl_thetas": 3.0}})
 

@@ -176,10 +176,15 @@ def test_record3d_without_times_and_lenses_of_frames(tmp_path: Path) -> None:
         ("perFrameIntrinsicCoeffs", [[1, 2, 3, 4]], "perFrameIntrinsicCoeffs: found 1 rows, expected 5, one for each"),
         ("frameTimestamps", 3, "frameTimestamps: found shape (), expected rows of 1 numbers"),
         ("frameTimestamps", ["x"], "frameTimestamps: found something else than numbers"),
+        ("frameTimestamps", [0, 1], "frameTimestamps: found 2 times, expected 5, one for each of `poses`; correct it"),
+        ("fps", -3, "fps: found -3, expected a number from 0.001 to 1000; correct it, or set camera.rate_hz"),
+        ("fps", True, "fps: found True, expected a number"),
     ):
         path.write_text(json.dumps({**content, key: value}))
         with pytest.raises(BadInputError, match=re.escape(f"{path}: {sentence}")):
             load(path)
+        if key in ("frameTimestamps", "fps"):
+            assert load(path, rate_hz=5).times_s == pytest.approx(np.arange(5) / 5)
 
 
 def test_kitti_times(tmp_path: Path) -> None:
@@ -348,6 +353,7 @@ BROKEN_TEXT: dict[str, tuple[str, str, str]] = {
         VIEW,
         "cameras.txt, line 1: found 3 parameters, expected 4 of PINHOLE",
     ),
+    "twice": (PINHOLE * 2, VIEW, "cameras.txt, line 2: found a second camera 1, expected one line for each camera"),
     "word": ("1 SIMPLE_PINHOLE 640 480 500 x 240\n", VIEW, "cameras.txt, line 1: found could not convert"),
     "wide": ("1 SIMPLE_PINHOLE 640 480 1 320 240\n", VIEW, "cameras.txt, line 1: found a field of view of"),
     "name": (
@@ -540,6 +546,18 @@ REFUSED_KEYS: dict[str, tuple[Any, str]] = {
         {"frames": [{"transform_matrix": ONE}, {"transform_matrix": "x"}]},
         ": frames[1].transform_matrix: found something else than numbers, expected a 4x4 matrix",
     ),
+    "true in a matrix": (
+        {"frames": [{"transform_matrix": [[True, 0, 0, 0], *ONE[1:]]}]},
+        ": frames[0].transform_matrix: found something else than numbers, expected a 4x4 matrix",
+    ),
+    "quotes in a matrix": (
+        {"frames": [{"transform_matrix": [["3", 0, 0, 0], *ONE[1:]]}]},
+        ": frames[0].transform_matrix: found something else than numbers, expected a 4x4 matrix",
+    ),
+    "rows in a matrix": (
+        {"frames": [{"transform_matrix": [[1, 0, 0], *ONE[1:]]}]},
+        ": frames[0].transform_matrix: found something else than numbers, expected a 4x4 matrix",
+    ),
     "shape": (
         {"frames": [{"transform_matrix": [[1] * 4] * 5}]},
         ": frames[0].transform_matrix: found shape (5, 4), exp",
@@ -607,7 +625,34 @@ def test_times_in_a_column_of_places_are_refused(tmp_path: Path, column: int) ->
     table[:, column] = times
     file = tmp_path / "swapped.txt"
     np.savetxt(file, table, fmt="%.6f")
-    with pytest.raises(BadInputError, match=f"in the place of {'xyz'[column - 1]} numbers that grow by equal steps"):
+    with pytest.raises(BadInputError, match=f"in the place of {'xyz'[column - 1]} numbers that do"):
         read_pose_table(file, TableClock(None, "auto"), TUM_NAMES, "a table")
     np.savetxt(file, np.column_stack([times, poses]), fmt="%.6f")
     assert len(read_pose_table(file, TableClock(None, "auto"), TUM_NAMES, "a table").turns) == len(times)
+
+
+@pytest.mark.parametrize("rows", [10, 100])
+@pytest.mark.parametrize(
+    ("bad", "note"),
+    [
+        (np.nan, "1 samples not finite"),
+        (4 / 30, "1 samples with repeated or decreasing times"),
+        (1 / 30, "1 samples with repeated or decreasing times"),
+    ],
+)
+def test_a_bad_time_leaves_out_its_own_pose_of_a_camera_that_moves_evenly(
+    tmp_path: Path, rows: int, bad: float, note: str
+) -> None:
+    table = np.zeros((rows, 8))
+    table[:, 0], table[:, 1], table[:, 7] = np.arange(rows) / 30, 0.1 * np.arange(rows), 1
+    table[5, 0] = bad
+    np.savetxt(tmp_path / "a.txt", table)
+    camera = load(tmp_path / "a.txt", format="tum", up_axis="y")
+    assert len(camera.times_s) == rows - 1 and any(text.startswith(note) for text in camera.notes)
+    table[:, 0] = np.arange(rows) / 30 + 0.5 * (np.arange(rows) > 5)
+    np.savetxt(tmp_path / "a.txt", table)
+    assert len(load(tmp_path / "a.txt", format="tum", up_axis="y").times_s) == rows
+    table[:, 0] = -np.arange(rows)
+    np.savetxt(tmp_path / "a.txt", table)
+    with pytest.raises(BadInputError, match="times that do not grow by equal steps, and in the place of x numbers"):
+        load(tmp_path / "a.txt", format="tum", up_axis="y")

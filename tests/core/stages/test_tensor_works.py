@@ -97,12 +97,13 @@ def test_a_loss_is_that_of_the_next_smaller_size_that_was_measured() -> None:
 def test_losses_are_read_from_a_validation_of_these_files(tiny_bundle: Path, tmp_path: Path) -> None:
     from trilane.training.validate import with_sizes
 
-    own = shutil.copytree(tiny_bundle, tmp_path / "own")
-    assert "validate" in size_loss(load_bundle(own), 1).source
+    own = shutil.copytree(tiny_bundle, tmp_path / "my own")
+    how = f"`trilane avatar validate '{own}'` first, then `trilane avatar validate '{own}' --sizes` measures them"
+    assert size_loss(load_bundle(own), 1).source.endswith(how)
     manifest = load_bundle(own).manifest
     write_manifest(own, validated(load_bundle(own)))
     first = load_bundle(own)
-    assert size_loss(first, 1).source.endswith(f"`trilane avatar validate {own} --sizes` measures them")
+    assert size_loss(first, 1).source.endswith(f"`trilane avatar validate '{own}' --sizes` measures them")
     sizes = {"64x64": 30.0, "32x64": 28.5, "32x32": 25.0}
     measured = BySize(date=date(2026, 3, 4), runtime="ort", seed=1, per_band=2, held_out=("a",), psnr_db=sizes)
     assert first.manifest.validation is not None
