@@ -71,7 +71,9 @@ class FollowedRun:
             return RunState.REMOVED
         if PARTIAL.fullmatch(self.folder.name) is None:
             return RunState.FINISHED
-        return RunState.GOES_ON if is_locked(self.folder) else RunState.KILLED
+        if is_locked(self.folder):
+            return RunState.GOES_ON
+        return RunState.KILLED if self.folder.is_dir() else self.state  # without a folder, it was moved this very moment
 
     @property
     def silent_ns(self) -> int:

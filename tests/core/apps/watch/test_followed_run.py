@@ -87,6 +87,15 @@ def test_a_run_is_followed_while_it_gets_its_name() -> None:
     assert (run.state, run.folder) == (RunState.FINISHED, Path("runs/walk"))
 
 
+def test_a_run_that_gets_its_name_while_its_lock_is_looked_at_was_not_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def moved(folder: Path) -> bool:
+        folder.rename("runs/walk")
+        return False
+
+    monkeypatch.setattr(followed_run, "is_locked", moved)
+    assert follow(made(Path("runs/walk.5.partial"))).state is RunState.FINISHED
+
+
 def test_a_run_that_removes_its_folder_says_nothing_more() -> None:
     with RunFolder(Path("runs/walk")) as folder:
         made(folder.work / "x")
