@@ -146,7 +146,7 @@ def _what_ifs(answers: list[dict[str, Any]]) -> Table:
 
     table = Table("what if", "frame, ms", "fps", "latency, ms", "always fed, ms", "dropped", "holds")
     for answer in answers:
-        rate, frame, latency = (answer.get(key) for key in ("rate", "frame_time_ms", "latency_ms"))
+        rate, frame, latency = answer.get("rate"), answer["frame_time_ms"], answer["latency_ms"]
         table.add_row(
             without_controls(answer["what_if"]) or "the file",
             _digits(frame["mean"]) if frame["samples"] else "unknown",

@@ -73,7 +73,8 @@ class FollowedRun:
             return RunState.FINISHED
         if is_locked(self.folder):
             return RunState.GOES_ON
-        return RunState.KILLED if self.folder.is_dir() else self.state  # without a folder, it was moved this very moment
+        # a folder that is gone was moved or removed this very moment
+        return RunState.KILLED if self.folder.is_dir() else self.state
 
     @property
     def silent_ns(self) -> int:
