@@ -76,7 +76,7 @@ def network(
     width: WidthOption = 64,
     size: FixedSizeOption = "512x512",
     channels: ChannelsOption = 16,
-    seed: Annotated[int, typer.Option(help="Seed of the random weights.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Seed of the random weights.")] = 0,
     json: JsonOption = False,
 ) -> None:
     """Export an untrained float network: ONNX, static shape, input `tensor`, output `rgba`."""

@@ -249,9 +249,7 @@ def _table(rows: list[dict[str, Any]]) -> Any:
 
 
 def _text(value: Any) -> str:
-    from rich.markup import escape
-
-    return f"{value:.4g}" if isinstance(value, float) else escape(str(value))
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def meaning(bench: str, option: str) -> str:

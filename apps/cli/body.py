@@ -111,8 +111,10 @@ def vertices(
 def _check_poses(path: Path, frames: NDArray[np.float64], expected: str) -> NDArray[np.float64]:
     import numpy as np
 
+    from trilane.body.joints import POSE_SIZE
+
     frames = frames[None] if frames.ndim == 1 else frames
-    if frames.ndim != 2 or not len(frames):
+    if frames.ndim != 2 or not len(frames) or frames.shape[1] != POSE_SIZE:
         raise BadInputError(path, f"shape {frames.shape}", expected)
     broken = ~np.isfinite(frames).all(axis=1)
     if broken.any():

@@ -74,12 +74,12 @@ def check(file: FileArgument, svg: SvgOption = None, profile: ProfileOption = No
         print(text, end="")
         return
     console = stdout_console()
-    console.print(_head(checked), soft_wrap=True, markup=False)
+    console.print(_head(checked), soft_wrap=True)
     console.print(_stages(checked))
     if checked.memory:
         console.print(_streams(checked))
     for line in _tail(checked):
-        console.print(line, soft_wrap=True, markup=False)
+        console.print(line, soft_wrap=True)
 
 
 def _head(checked: CheckedFile) -> str:
@@ -95,7 +95,6 @@ def _head(checked: CheckedFile) -> str:
 
 def _stages(checked: CheckedFile) -> Table:
     """Return a table with a row for each stage, grouped by unit."""
-    from rich.markup import escape
     from rich.table import Table
 
     from trilane.apps.check.checked import what
@@ -108,8 +107,8 @@ def _stages(checked: CheckedFile) -> Table:
             if stage.unit != unit:
                 continue
             every = f", every {stage.every}" if stage.every > 1 else ""
-            kind = escape(" ".join(filter(None, (stage.kind, without_controls(what(stage))))))
-            reads = escape(", ".join(map(_input, stage.inputs))) or "-"
+            kind = " ".join(filter(None, (stage.kind, without_controls(what(stage)))))
+            reads = ", ".join(map(_input, stage.inputs)) or "-"
             price = checked.prices.get(name)
             time, source = ("?", "-") if price is None else (f"{price.time.mean_ms:.4g}", price.source or "-")
             table.add_row(title, name, kind + every, reads, time, source)
@@ -127,7 +126,6 @@ def _input(each: PortInput) -> str:
 
 
 def _streams(checked: CheckedFile) -> Table:
-    from rich.markup import escape
     from rich.table import Table
 
     from trilane.transport.slots import edge_rule
@@ -140,7 +138,7 @@ def _streams(checked: CheckedFile) -> Table:
         size, slots = checked.memory[name], str(edge_rule(rule).slots)
         memory = "?" if size is None else f"{size / 1e6:.3g} MB"
         readers = ", ".join(checked.file.readers[name])
-        table.add_row(name, readers, rule, slots, escape(without_controls(ports)), memory)
+        table.add_row(name, readers, rule, slots, without_controls(ports), memory)
     return table
 
 
@@ -209,5 +207,5 @@ def init(
     except UnexpectedValue as error:
         raise BadInputError.at("--input-shape", error) from None
     console = stdout_console()
-    console.print(write_new_file(out, networks, video, unit, shapes), markup=False, soft_wrap=True, end="")
-    console.print(f"\nwritten: {out}; next: trilane check {out}, trilane run {out}", markup=False, soft_wrap=True)
+    console.print(write_new_file(out, networks, video, unit, shapes), soft_wrap=True, end="")
+    console.print(f"\nwritten: {out}; next: trilane check {out}, trilane run {out}", soft_wrap=True)

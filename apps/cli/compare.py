@@ -292,13 +292,12 @@ def _trial_table(pairs: Sequence[TrialPair]) -> Table:
 
 
 def _table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    """Return a table with the column `titles` and `rows` of cells. Cells are plain texts, without Rich's markup."""
+    """Return a table with the column `titles` and `rows` of cells."""
     from rich.table import Table
-    from rich.text import Text
 
     table = Table(*titles)
     for row in rows:
-        table.add_row(*map(Text, row))
+        table.add_row(*row)
     return table
 
 

@@ -59,27 +59,30 @@ class _Kept:
 
 def stderr_console() -> Console:
     """Return Rich's console on stderr, for messages and progress. Writes to a pipe without a reader do not fail."""
-    from rich.console import Console
-
-    return Console(stderr=True, file=cast("IO[str]", _Kept(sys.stderr, errno.EPIPE)), highlight=False)
+    return _console(sys.stderr, errno.EPIPE, stderr=True)
 
 
 def stdout_console() -> Console:
     """Return Rich's console on stdout, for results in text. If stdout is no terminal, the console has 120 columns."""
+    return _console(sys.stdout, width=None if sys.stdout.isatty() else 120)
+
+
+def _console(stream: IO[str], *lost: int, **settings: Any) -> Console:
+    """Return a console that prints texts as they are, in tables too: `[red]` and `:key:` in a name mean nothing."""
     from rich.console import Console
 
-    file = cast("IO[str]", _Kept(sys.stdout))
-    return Console(file=file, highlight=False, width=None if sys.stdout.isatty() else 120)
+    file = cast("IO[str]", _Kept(stream, *lost))
+    return Console(file=file, highlight=False, markup=False, emoji=False, **settings)
 
 
 def say(text: str) -> None:
     """Print a message on stderr, without wrapping."""
-    stderr_console().print(text, soft_wrap=True, markup=False)
+    stderr_console().print(text, soft_wrap=True)
 
 
 def print_line(text: str) -> None:
     """Print a line of a result on stdout, without wrapping."""
-    stdout_console().print(text, soft_wrap=True, markup=False)
+    stdout_console().print(text, soft_wrap=True)
 
 
 def note(text: str) -> None:
@@ -145,7 +148,7 @@ def print_kept(parts: Iterable[Any]) -> None:
     with console.capture() as written:
         for part in parts:
             is_text = isinstance(part, str)
-            console.print(without_controls(part) if is_text else part, soft_wrap=is_text, markup=False)
+            console.print(without_controls(part) if is_text else part, soft_wrap=is_text)
     with suppress(BrokenPipeError):
         sys.stdout.write(written.get())
         sys.stdout.flush()
@@ -167,9 +170,10 @@ def verdict_text(lines: Iterable[Sequence[str]], width: int) -> Text:
 
     found = Text()
     for label, said in lines:
-        first, *rest = wrap(without_controls(said), width - INDENT, break_long_words=False, break_on_hyphens=False)
+        room = max(width - INDENT, 1)
+        parts = wrap(without_controls(said), room, break_long_words=False, break_on_hyphens=False)
         found.append(f"{label:<{INDENT}}", STYLES.get(label, "bold"))
-        found.append("\n".join([first, *(" " * INDENT + each for each in rest)]) + "\n")
+        found.append(f"\n{'':{INDENT}}".join(parts) + "\n")
     found.rstrip()
     return found
 

@@ -10,7 +10,7 @@ import shutil
 import sys
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -18,6 +18,9 @@ from trilane import machine
 from trilane.apps.cli.commands import Commands, JsonOption
 from trilane.apps.cli.console import print_json, stdout_console
 from trilane.errors import EGL_LINE, install_line, package_line, reason
+
+if TYPE_CHECKING:
+    from rich.text import Text
 
 app = Commands()
 
@@ -99,8 +102,10 @@ def _int8() -> PartCheck:
 def _memfd() -> PartCheck:
     try:
         handle = os.memfd_create("trilane-doctor", os.MFD_CLOEXEC)
-        os.ftruncate(handle, 4096)
-        os.close(handle)
+        try:
+            os.ftruncate(handle, 4096)
+        finally:
+            os.close(handle)
     except (AttributeError, OSError) as error:
         return PartCheck(
             "memfd", reason(error), works=False, install="needs Linux 3.17 or newer with memfd_create allowed"
@@ -143,21 +148,22 @@ def checks(gl: dict[str, Any] | None) -> list[PartCheck]:
     return [*machine, _runtimes(), *_packages()]
 
 
-def _state(check: PartCheck) -> str:
+def _state(check: PartCheck) -> Text:
+    from rich.text import Text
+
     if check.works:
-        return "[green]works[/green]"
-    return "[red]missing[/red]" if check.needed else "[yellow]absent[/yellow]"
+        return Text("works", "green")
+    return Text("missing", "red") if check.needed else Text("absent", "yellow")
 
 
 def _print_table(rows: list[PartCheck]) -> None:
-    from rich.markup import escape
     from rich.table import Table
 
     table = Table(title="What this machine has", title_justify="left")
     for column in ("part", "state", "found", "fix"):
         table.add_column(column, overflow="fold")
     for row in rows:
-        table.add_row(row.name, _state(row), escape(row.found), "" if row.works else escape(row.install))
+        table.add_row(row.name, _state(row), row.found, "" if row.works else row.install)
     stdout_console().print(table)
 
 

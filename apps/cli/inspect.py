@@ -250,7 +250,6 @@ def _table(kind: str, measurements: Sequence[Measurement]) -> Table:
 
     `kind`: kind of all these measurements: run, wall or layer. It is the title of the first column.
     """
-    from rich.markup import escape
     from rich.table import Table
 
     cells = [_cells(each) for each in measurements]
@@ -260,7 +259,7 @@ def _table(kind: str, measurements: Sequence[Measurement]) -> Table:
         table.add_column(name, no_wrap=name != "what")
     for each, row in zip(measurements, cells, strict=True):
         label = without_controls(each.name if len(each.name) <= 60 else f"{each.name[:40]}…{each.name[-19:]}")
-        table.add_row(escape(label), *(escape(row[name]) for name in columns))
+        table.add_row(label, *(row[name] for name in columns))
     return table
 
 

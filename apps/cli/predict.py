@@ -56,9 +56,9 @@ def predict_pipeline_file(options: PredictOptions, path: Path, as_json: bool) ->
     machine, requested = answer["machine"], first["frames"]["requested"]
     where = f"{machine['title']}, {answer['config']['performance_profile']}" if machine else "times of the file"
     name = without_controls(path.name)
-    console.print(f"{name} (virtual clock), {where}; {requested} frames, seed {answer['config']['seed']}", markup=False)
+    console.print(f"{name} (virtual clock), {where}; {requested} frames, seed {answer['config']['seed']}")
     if first["what_if"]:  # the file as it is has no prediction, because it lacks times
-        console.print(f"with {without_controls(first['what_if'])}", markup=False, soft_wrap=True)
+        console.print(f"with {without_controls(first['what_if'])}", soft_wrap=True)
     _show_file(console, first)
     if len(answer["pipelines"]) > 1:
         console.print(_what_ifs(answer["pipelines"]))
@@ -77,7 +77,7 @@ def _show_file(console: Console, answer: Mapping[str, Any]) -> None:
     dropped = sum(frames["dropped"].values())
     console.print(f"frames          {frames['presented']} of {frames['requested']} presented, {dropped} dropped")
     for cause, count in frames["dropped"].items():
-        console.print(f"                {count} by {cause}", markup=False)
+        console.print(f"                {count} by {cause}")
     console.print(f"always fed      {_ms(needs['mean'])}{_span(needs['low'], needs['high'])} a frame")
     cycle = " -> ".join(answer["cycle"])
     limit = f", by {answer['limit'].replace('_', ' ')}: {cycle}" if cycle else ""
@@ -107,8 +107,8 @@ def _ms(value: float) -> str:
 
 
 def _digits(value: float) -> str:
-    """Return `value` with four significant digits; from 10000 on, as a whole number, so that it has no exponent."""
-    return f"{value:.4g}" if value < 1e4 else f"{value:.0f}"
+    """Return `value` with four significant digits; a larger number as a whole number, without an exponent."""
+    return f"{value:.4g}" if value < 9999.5 else f"{value:.0f}"
 
 
 def _span(low: float | None, high: float | None, share: str = f", {SHARE_TEXT}") -> str:
@@ -142,17 +142,16 @@ def _units(answer: Mapping[str, Any]) -> Table:
 
 def _what_ifs(answers: list[dict[str, Any]]) -> Table:
     """Return a table with a row for each --set. If the file has all times, the file itself has the first row."""
-    from rich.markup import escape
     from rich.table import Table
 
     table = Table("what if", "frame, ms", "fps", "latency, ms", "always fed, ms", "dropped", "holds")
     for answer in answers:
-        rate = answer.get("rate")
+        rate, frame, latency = answer.get("rate"), answer["frame_time_ms"], answer["latency_ms"]
         table.add_row(
-            escape(without_controls(answer["what_if"])) or "the file",
-            _digits(answer["frame_time_ms"]["mean"]),
-            f"{answer['fps']:.1f}",
-            _digits(answer["latency_ms"]["mean"]),
+            without_controls(answer["what_if"]) or "the file",
+            _digits(frame["mean"]) if frame["samples"] else "unknown",
+            f"{answer['fps']:.1f}" if frame["samples"] else "unknown",
+            _digits(latency["mean"]) if latency["samples"] else "unknown",
             _digits(answer["needs_ms"]["mean"]),
             f"{sum(answer['frames']['dropped'].values())}",
             "-" if rate is None else rate["sentence"].partition(": ")[2].partition(";")[0],

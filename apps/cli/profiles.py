@@ -232,7 +232,7 @@ def fit_chips(
         write_bytes(path, text.encode())
     if plot is not None:
         plot_errors(study, plot)
-    stdout_console().print(as_markdown(study), highlight=False)
+    stdout_console().print(as_markdown(study))
 
 
 def _document(result: ProfileFit | Calibrated) -> dict[str, Any]:
@@ -299,8 +299,6 @@ def _show_calibrated(result: Calibrated) -> None:
 
 
 def _cells(each: CheckedRow) -> tuple[str, ...]:
-    from rich.markup import escape
-
     predictions = (
         cell
         for ms, around, error in (
@@ -309,7 +307,7 @@ def _cells(each: CheckedRow) -> tuple[str, ...]:
         )
         for cell in (f"{ms:.3g} ({around.low_ms:.3g}-{around.high_ms:.3g})", f"{100 * error:+z.0f} %")
     )
-    return (escape(without_controls(each.row.network)), each.row.unit, f"{each.row.ms:.4g}", *predictions)
+    return (without_controls(each.row.network), each.row.unit, f"{each.row.ms:.4g}", *predictions)
 
 
 def _fit_document(result: ProfileFit) -> dict[str, Any]:

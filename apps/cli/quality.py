@@ -194,11 +194,10 @@ def _out_of_bounds(row: dict[str, Any], bounds: dict[str, float]) -> Iterator[st
 
 def _print_rows(rows: list[dict[str, Any]], columns: tuple[str, ...]) -> None:
     from rich.table import Table
-    from rich.text import Text
 
     table = Table(*columns)
     for row in rows:
-        table.add_row(*(Text(_shown(row[key])) for key in columns))
+        table.add_row(*(_shown(row[key]) for key in columns))
     stdout_console().print(table)
 
 

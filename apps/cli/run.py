@@ -76,7 +76,6 @@ DashboardOption = Annotated[
 def _hooks() -> Iterator[Hooks]:
     """Yield the run's callbacks, which show messages and progress on stderr. Progress is shown only on a terminal."""
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-    from rich.text import Text
 
     from trilane.apps.run.run_job import Hooks
 
@@ -92,7 +91,7 @@ def _hooks() -> Iterator[Hooks]:
         bar.update(tasks[what], completed=presented)
 
     with bar:
-        yield Hooks(progress, lambda text: bar.console.print(Text(text), soft_wrap=True))
+        yield Hooks(progress, lambda text: bar.console.print(text, soft_wrap=True))
 
 
 @app.command(epilog=EPILOG)
@@ -196,8 +195,6 @@ def _title(report: Report) -> str:
 
 
 def _caption(report: Report) -> str:
-    from rich.markup import escape
-
     cpu, gl = report.machine.cpu, report.machine.gl
     cores = ", ".join(f"{unit} {','.join(map(str, shares.cores))}" for unit, shares in report.units.items())
     lines = [
@@ -222,7 +219,7 @@ def _caption(report: Report) -> str:
     if report.check:
         lines += _check(report.check)
     lines += [accuracy_line(name, facts) for name, facts in report.accuracy.items()]
-    return escape("\n".join(lines))
+    return "\n".join(lines)
 
 
 def _made(made: Made) -> str:

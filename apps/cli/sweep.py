@@ -297,9 +297,9 @@ def progress(left: int, whole: int) -> Iterator[Callable[[TrialRecord], None]]:
             remaining = f"{timedelta(seconds=round(seconds))} left"
             done = whole - left + ended
             if not console.is_terminal:
-                console.print(f"{done}/{whole} {_line(record)}; {remaining}", soft_wrap=True, markup=False)
+                console.print(f"{done}/{whole} {_line(record)}; {remaining}", soft_wrap=True)
             elif record.status != "done":
-                console.print(_line(record), soft_wrap=True, markup=False)
+                console.print(_line(record), soft_wrap=True)
             bar.update(task, completed=done, left=remaining)
 
         yield told
@@ -345,7 +345,7 @@ def print_summary(ended: SweepSummary, definition: Definition, clock: str) -> No
     stdout_console().print(table)
     counts = ended.counts
     counted = ", ".join(f"{counts[key]} {key}" for key in ("trials", "done", "failed", "lost", "skipped"))
-    stdout_console().print(f"{counted}; {clock} clock", markup=False)
+    stdout_console().print(f"{counted}; {clock} clock")
     if again := [record for record in ended.trials if record.repeated]:
         unsure = sum(bool(record.unsure) for record in again)
         print_line(f"the machine was not quiet: runs done again: {len(again)}, UNSURE still: {unsure}")
@@ -370,8 +370,6 @@ def marked(word: str, record: TrialRecord) -> str:
 
 
 def text(value: Any) -> str:
-    from rich.markup import escape
-
     if value is None:
         return ""
-    return f"{value:.4g}" if isinstance(value, float) else escape(str(value))
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

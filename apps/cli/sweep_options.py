@@ -115,12 +115,14 @@ class SweptCommand:
         """Return the name and the value of the option that begins with `token`.
 
         `left`: words after `token`. The first of them is the value, unless `token` contains `=` or the option is a
-        flag. Raises BadInputError for an unknown option, and for a missing value.
+        flag. Raises BadInputError for an unknown option, for a missing value, and for a value of a flag.
         """
         spelling, has_value, value = token.partition("=")
         for name, parameter in self._parameters.items():
             if spelling in (*parameter.opts, *parameter.secondary_opts) and parameter.param_type_name == "option":
                 if _is_flag(parameter):
+                    if has_value:
+                        raise BadInputError("options", repr(token), f"{spelling} without a value")
                     return name, spelling in parameter.opts
                 return name, value if has_value else _next(spelling, left)
         self._named(spelling.lstrip("-"))  # raises an error, except for the name of an argument

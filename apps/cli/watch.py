@@ -299,7 +299,7 @@ def _units(figures: MomentFigures) -> Table:
         filled = round(BAR * unit.window.busy)
         bar = FULL * filled + EMPTY * (BAR - filled)
         does = _doing(unit, figures.state)
-        _add_row(table, name, bar, _percent(unit.window.busy), _percent(unit.run.busy), _idle(unit), does)
+        table.add_row(name, bar, _percent(unit.window.busy), _percent(unit.run.busy), _idle(unit), does)
     return table
 
 
@@ -307,13 +307,6 @@ def _table(*names: str) -> Table:
     from rich.table import Table
 
     return Table(*names, box=None, pad_edge=False)
-
-
-def _add_row(table: Table, *cells: str) -> None:
-    """Add a row of plain `cells` to `table`, because a name of a stage or unit may look like Rich's markup."""
-    from rich.text import Text
-
-    table.add_row(*map(Text, cells))
 
 
 def _idle(unit: UnitFigures) -> str:
@@ -338,7 +331,7 @@ def _times(figures: MomentFigures) -> Table:
     table = _table(f"of the {WINDOW}, ms", "mean", *PERCENTILES, "max", "samples")
     for name, times in (("frame time", figures.frame_time_ms), ("latency", figures.latency_ms)):
         values = [_time(times, key) for key in ("mean", *PERCENTILES, "max")]
-        _add_row(table, name, *values, f"{times['samples']:.0f}")
+        table.add_row(name, *values, f"{times['samples']:.0f}")
     return table
 
 
@@ -360,7 +353,7 @@ def _stages(figures: MomentFigures) -> Table:
     table = _table("stage", "unit", "waiting", "ms", "MB a job", "least")
     for name, stage in figures.stages.items():
         moved, least = _moved(stage.bytes)
-        _add_row(table, name, stage.unit, str(stage.waiting), f"{stage.service_ms:.1f}", moved, least)
+        table.add_row(name, stage.unit, str(stage.waiting), f"{stage.service_ms:.1f}", moved, least)
     return table
 
 

@@ -98,7 +98,7 @@ def compare(
     late_frames = sorted({job.frame for job in late})
     settings = run_settings(policy, frames, round(1e9 / release_fps(pace, fps)))
     virtual = _virtual_ms(pace, settings, edge, _skipping(jobs))
-    measured = _measured_ms(jobs, late_frames)
+    measured = _median_ms(jobs, late_frames)
     return PaceComparison(
         profile=pace.profile,
         performance_profile=pace.performance_profile,
@@ -109,7 +109,7 @@ def compare(
         virtual_ms=virtual,
         measured_ms=measured,
         compared_share=_share(jobs, late_frames),
-        ratio=None if measured is None else measured / virtual,
+        ratio=None if measured is None or virtual is None else measured / virtual,
     )
 
 
@@ -119,8 +119,8 @@ def _skipping(jobs: Sequence[JobRecord]) -> set[int]:
     return ends - between
 
 
-def _virtual_ms(pace: Pace, settings: Settings, edge: str, skipping: Set[int]) -> float:
-    """Return the median time between presented frames in virtual time, ms.
+def _virtual_ms(pace: Pace, settings: Settings, edge: str, skipping: Set[int]) -> float | None:
+    """Return the median time between presented frames in virtual time, ms; None for fewer than two frames.
 
     `pace`: pace of all jobs. `settings`: settings of the scheduler. `edge`: rule of all edges. `skipping`: numbers of
     the frames that take the bypass.
@@ -133,7 +133,7 @@ def _virtual_ms(pace: Pace, settings: Settings, edge: str, skipping: Set[int]) -
         skips=lambda frame, _fresh: frame in skipping,
         keep=True,
     )
-    return float(np.median(np.diff(_presented(result.jobs)[1]))) / 1e6
+    return _median_ms(result.jobs)
 
 
 def _presented(jobs: Sequence[JobRecord]) -> tuple[list[int], list[int]]:
@@ -154,7 +154,8 @@ def _in_time(jobs: Sequence[JobRecord], late_frames: Sequence[int]) -> list[tupl
     return [(frame, interval) for frame, interval in pairs if frame not in disturbed]
 
 
-def _measured_ms(jobs: Sequence[JobRecord], late_frames: Sequence[int]) -> float | None:
+def _median_ms(jobs: Sequence[JobRecord], late_frames: Sequence[int] = ()) -> float | None:
+    """Return the median of `_in_time` in ms; None if no frame is left."""
     kept = _in_time(jobs, late_frames)
     return float(np.median([interval for _, interval in kept])) / 1e6 if kept else None
 

@@ -92,10 +92,10 @@ class PaceComparison(Record):
     `stage_ms`: time in ms to which a job was stretched, by stage.
     `host_slower`: number of jobs that took longer on this machine than `stage_ms`, by stage.
     `late_frames`: numbers of the frames of these jobs.
-    `virtual_ms`: median frame time in virtual time.
+    `virtual_ms`: median frame time in virtual time; null if fewer than two frames are presented.
     `measured_ms`: median frame time of the run, without late frames and frames near them; null if no frame is left.
     `compared_share`: share of the frames that `measured_ms` counts.
-    `ratio`: `measured_ms` / `virtual_ms`; null if `measured_ms` is null.
+    `ratio`: `measured_ms` / `virtual_ms`; null if either is null.
     """
 
     profile: str
@@ -104,7 +104,7 @@ class PaceComparison(Record):
     stage_ms: dict[str, float]
     host_slower: dict[str, int]
     late_frames: tuple[int, ...]
-    virtual_ms: float
+    virtual_ms: float | None
     measured_ms: float | None
     compared_share: float
     ratio: float | None

@@ -11,6 +11,7 @@ import glob
 import os
 import shutil
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -27,7 +28,7 @@ def require_free(target: Path) -> None:
     """Raise BadInputError if `target` exists, or if a live run will rename its folder to `target`."""
     found = "a file or folder" if target.exists() else ""
     for other in _partial(target):
-        if _is_locked(other):
+        if is_locked(other):
             found = f"a run that goes on, in {other.name}"
     if found:
         raise BadInputError(target, found, "a name that is free", "choose another --out")
@@ -62,7 +63,9 @@ class RunFolder:
 
     def __init__(self, target: Path) -> None:
         self.target = target.absolute()
-        self.work = self.target.with_name(f"{self.target.name}.{os.getpid()}.partial")
+        names = (self.target.with_name(f"{self.target.name}.{number}.partial") for number in count(os.getpid()))
+        taken = {*_partial(self.target)}  # in a container, a killed run often had the number of this process
+        self.work = next(name for name in names if name not in taken)
         self._reserve = self.work / ".reserved"
         self._made: list[Path] = []
         self._lock = -1
@@ -76,6 +79,7 @@ class RunFolder:
             self._reserve_space()
         except OSError as error:
             self._remove()
+            self._unlock()
             if remedy(error, ""):  # a limit of the process, which holds for any other folder too
                 raise UnwrittenError(self.target, error) from None
             raise BadInputError.of_os_error(self.target, error, WRITABLE, "choose another --out") from None
@@ -132,10 +136,15 @@ class RunFolder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        is_there = self._keep or self._is_there()
-        os.close(self._lock)
+        try:
+            self._end(error)
+        finally:
+            self._unlock()
+
+    def _end(self, error: BaseException | None) -> None:
         if self._keep:
             return
+        is_there = self._is_there()
         self.release()
         if not is_there:
             self._remove()
@@ -170,8 +179,14 @@ class RunFolder:
         except OSError:
             return False
 
+    def _unlock(self) -> None:
+        if self._lock >= 0:
+            os.close(self._lock)
+
     def _remove(self) -> None:
-        shutil.rmtree(self.work, ignore_errors=True)
+        """Remove the folder `work` if this object made it, and the parent folders that it made."""
+        if self._is_there():
+            shutil.rmtree(self.work, ignore_errors=True)
         for folder in reversed(self._made):
             try:
                 folder.rmdir()
@@ -184,14 +199,14 @@ def _partial(target: Path) -> Iterator[Path]:
     return target.parent.glob(f"{glob.escape(target.name)}.*.partial")
 
 
-def _is_locked(folder: Path) -> bool:
+def is_locked(folder: Path) -> bool:
     """Return whether a live process holds the lock of `folder`. A removed folder has no lock."""
     try:
         fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except OSError:
         return False
     try:
-        fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
     finally:

@@ -6,6 +6,7 @@ that the report or the live run names.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any, Final
 
@@ -187,19 +188,20 @@ def _image(config: Mapping[str, Any], accuracy: Mapping[str, Mapping[str, Any]],
         if facts.get("source", NO_FIGURES) == NO_FIGURES:
             return f"{UNKNOWN}: {facts.get('why', 'the avatar has no validation')}; this run: --check 4"
     error, worst = min(map(_validated, accuracy.values()))
-    seen = "" if worst is None else f", worst view {worst:.1f}"
+    seen = "" if worst == math.inf else f", worst view {worst:.1f}"
     return f"{error:.1f} dB{seen} (validation); this run: --check 4"
 
 
-def _validated(facts: Mapping[str, Any]) -> tuple[float, float | None]:
+def _validated(facts: Mapping[str, Any]) -> tuple[float, float]:
     """Return (usual PSNR, PSNR of the worst view) from the validation of an avatar, in dB.
 
     The usual PSNR is the mean; without a mean, it is the PSNR of the worst band of zoom. An unknown PSNR of the worst
-    view is None. `facts`: the avatar's entry in the block `accuracy` of the report.
+    view is infinite. `facts`: the avatar's entry in the block `accuracy` of the report.
     """
     mean = facts.get("psnr_db")
     known = min(facts["psnr_db_by_band"].values()) if mean is None else mean
-    return known, (facts.get("worst") or {}).get("psnr_db")
+    worst = (facts.get("worst") or {}).get("psnr_db")
+    return known, math.inf if worst is None else worst
 
 
 def _tries(

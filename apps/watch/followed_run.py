@@ -12,8 +12,7 @@ from collections.abc import Callable, Iterator
 from enum import StrEnum
 from pathlib import Path
 
-import psutil
-
+from trilane.apps.run.run_folder import is_locked
 from trilane.errors import BadInputError, did_you_mean
 from trilane.pipeline.journal import NAME, JournalReader, Record, journal_in
 
@@ -24,14 +23,14 @@ EXPECTED = "a run folder with a journal"
 MOST_NAMED = 4
 NO_RECORD = "a journal without a record"
 CUT_OFF = "the journal stops here: the run was killed, or the file is cut off; what came after is not known"
-PARTIAL = re.compile(r"(?P<name>.+)\.(?P<pid>[0-9]{1,9})\.partial")
+PARTIAL = re.compile(r"(?P<name>.+)\.[0-9]{1,9}\.partial")
 
 
 class RunState(StrEnum):
     """The state of a run.
 
-    GOES_ON: its process lives. FINISHED: its folder has the final name. KILLED: its process died and left the partial
-    folder. REMOVED: its folder is gone, because a run that ends before any frame removes its folder.
+    GOES_ON: its process holds the folder's lock. FINISHED: its folder has the final name. KILLED: its process died and
+    left the partial folder. REMOVED: its folder is gone, because a run that ends before any frame removes its folder.
     """
 
     GOES_ON = "goes on"
@@ -60,9 +59,7 @@ class FollowedRun:
             remedy = "an older Trilane wrote it; run the scene again" if (folder / "report.json").is_file() else ""
             raise BadInputError(folder, without_journal(folder), EXPECTED, remedy)
         self.folder = folder
-        matched = PARTIAL.fullmatch(folder.name)
         self.name = run_name(folder)
-        self._pid = int(matched["pid"]) if matched else 0
         self._reader = JournalReader(journal)
         self._heard_ns = time.monotonic_ns()
 
@@ -74,7 +71,10 @@ class FollowedRun:
             return RunState.REMOVED
         if PARTIAL.fullmatch(self.folder.name) is None:
             return RunState.FINISHED
-        return RunState.GOES_ON if _is_alive(self._pid) else RunState.KILLED
+        if is_locked(self.folder):
+            return RunState.GOES_ON
+        # a folder that is gone was moved or removed this very moment
+        return RunState.KILLED if self.folder.is_dir() else self.state
 
     @property
     def silent_ns(self) -> int:
@@ -125,35 +125,29 @@ def follow(given: Path | None, *, wait: bool = False, sleep: Callable[[float], N
     """Return the run that `given` means.
 
     `given`: folder or journal of the run, or its name below runs/; None for the newest run below runs/.
-    `wait`: whether to wait until the run has begun; without waiting, a run that has not begun is an error.
+    `wait`: whether to wait until the run has begun; without waiting, a run that has not begun is an error. What a
+    killed run left counts as begun only if `given` names its partial folder.
     `sleep`: function that waits for a time in seconds.
     Raises BadInputError if the run is not found or has no journal.
     """
     while True:
         found = _newest(RUNS.glob(f"*/{NAME}")) if given is None else folder_of(given)
         if found is not None:
-            return FollowedRun(found)
-        if not wait:
+            run = FollowedRun(found)
+            if not wait or run.state is not RunState.KILLED or (given and found.name in given.parts):
+                return run
+        elif not wait:
             raise _missing(given)
         sleep(LOOK_S)
-
-
-def _is_alive(pid: int) -> bool:
-    """Return whether the process `pid` runs. A zombie, which has ended but is still listed, does not run."""
-    try:
-        return bool(psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
-    except psutil.NoSuchProcess:
-        return False
 
 
 def folder_of(given: Path) -> Path | None:
     """Return the folder of the run that `given` means (see `follow`), partial or complete; None if no such run exists.
 
-    For a journal, the folder around it is returned. Any other existing path is returned as it is, even if it is no run
-    folder.
+    A journal means the folder around it. Any other existing path is returned as it is, even if it is no run folder.
     """
     if given.name == NAME:
-        return given.parent
+        return folder_of(given.parent)
     places = [given] if given.is_absolute() or len(given.parts) > 1 else [given, RUNS / given]
     for place in places:
         if place.exists():

@@ -321,7 +321,7 @@ def looks(run: FollowedRun, pause: Callable[[], None]) -> Generator[RunLook]:
             yield RunLook(run.name, state, _as_reported(now, run.folder) if state is RunState.FINISHED else now)
         elif state is not RunState.GOES_ON:
             raise BadInputError(run.folder, NO_RECORD, EXPECTED)
-        if state is not RunState.GOES_ON or (figures is not None and figures.is_over):
+        if state is not RunState.GOES_ON:
             return
         pause()
 

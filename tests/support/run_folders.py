@@ -2,14 +2,28 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
-from collections.abc import Iterable, Mapping
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 
 from support.run_report import make_report
 from trilane.pipeline.journal import NAME, JournalWriter, Worked, journal_of
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.virtual import Simulation
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[Path]:
+    """Hold the lock of a run's `folder`, as the run does while it goes on."""
+    lock = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        yield folder
+    finally:
+        os.close(lock)
 
 
 def write_run(

@@ -17,6 +17,7 @@ import pytest
 from support.pipeline_files import BRANCHES, CUT, DEPTH, STREET, network, write_file
 from support.run_folders import write_run
 from support.run_report import make_report
+from trilane.apps.cli.predict import _digits
 from trilane.hw_profiles.application import Plan, Variant, simulated, stage_times_ms
 from trilane.hw_profiles.pipeline_prediction import given_price, predict_file, prices_of, steady_ms
 from trilane.hw_profiles.profile_files import load_runnable
@@ -292,6 +293,19 @@ def test_each_set_is_a_row(documents: Predict) -> None:
     assert [row["period_ms"] for row in rows] == [14, 24, 50]
     assert [row["latency_ms"]["p50"] for row in rows[2:]] == [2 + 15 + 3]
     assert rows[2]["needs_ms"]["mean"] == 15
+
+
+def test_a_row_says_what_is_unknown_of_a_single_frame(command: Command, tmp_path: Path) -> None:
+    lines = command("predict", write_file(tmp_path, DEPTH), "--frames", "1", "--set", "stages.seg.unit=b")[
+        0
+    ].splitlines()
+    (row,) = (line for line in lines if line.startswith("│ the file"))
+    assert [cell.strip() for cell in row.split("│")[2:5]] == ["unknown", "unknown", "19"]
+
+
+@pytest.mark.parametrize(("ms", "said"), [(9999.4, "9999"), (9999.5, "10000"), (12345.6, "12346"), (0.12345, "0.1235")])
+def test_times_have_no_exponent(ms: float, said: str) -> None:
+    assert _digits(ms) == said
 
 
 def test_newest_inputs_say_their_age(predict: Predict) -> None:

@@ -201,6 +201,10 @@ WRONG = {
     ),
     "size to validate": (("validate", "default", "--size", "100"), "--size: found "),
     "seed": (("validate", "default", "--seed", "-1"), "--seed: found '-1', expected greater than or equal to 0"),
+    "seed of weights": (
+        ("network", "--out", "n.onnx", "--seed", str(2**32)),
+        "--seed: found '4294967296', expected less than or equal to 4294967295",
+    ),
     "views": (("validate", "default", "--per-band", "1001"), "found '1001', expected less than or equal to 1000"),
 }
 

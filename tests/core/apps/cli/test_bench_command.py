@@ -62,7 +62,7 @@ def test_the_group_knows_its_benches_and_nothing_else(command: Command) -> None:
 def test_a_table_of_many_columns_is_turned_and_has_no_header() -> None:
     """Ten columns are rows; of a value that a row does not have the place is blank."""
     rows = [{f"column {n}": n for n in range(10)}, {"column 0": 0.25, "column 9": "[x]"}]
-    console = Console(width=60, file=io.StringIO())
+    console = Console(width=60, markup=False, file=io.StringIO())
     console.print(bench._table(rows))
     lines = [line.strip("┌┐└┘│├┤─┬┴┼ ").split("│") for line in console.file.getvalue().splitlines()]  # type: ignore[attr-defined]
     told = [[cell.strip() for cell in line] for line in lines if line != [""]]
@@ -75,7 +75,7 @@ def test_a_table_of_many_columns_is_turned_and_has_no_header() -> None:
 
 
 def test_a_table_of_few_columns_has_their_names() -> None:
-    console = Console(width=60, file=io.StringIO())
+    console = Console(width=60, markup=False, file=io.StringIO())
     console.print(bench._table([{"a": 1, "b": 2.0}, {"a": 3}]))
     words = console.file.getvalue().translate(str.maketrans(dict.fromkeys("┏┓┗┛┃┡┩━┳╇└┘│─┴", " "))).split()  # type: ignore[attr-defined]
     assert words == ["a", "b", "1", "2", "3"]

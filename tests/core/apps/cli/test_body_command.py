@@ -69,7 +69,7 @@ def one_is(value: float, pose: int) -> NDArray[Any]:
         (None, f"p.npy: found no such file, {SHAPE}"),
         (np.zeros((0, 165)), f"p.npy: found shape (0, 165), {SHAPE}"),
         (np.zeros((2, 2, 165)), f"p.npy: found shape (2, 2, 165), {SHAPE}"),
-        (np.zeros((2, 156)), "156"),
+        (np.zeros((2, 156)), f"p.npy: found shape (2, 156), {SHAPE}"),
         (np.full((2, 165), "x"), "dtype"),
         (one_is(np.inf, 2), "p.npy: found NaN or infinity in pose 2, expected finite joint angles"),
         (np.full((1, 165), np.nan), "p.npy: found NaN or infinity in pose 0, expected finite joint angles"),

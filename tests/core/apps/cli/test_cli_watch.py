@@ -5,9 +5,9 @@ from __future__ import annotations
 import io
 import json
 import os
-import signal
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from support.run_folders import locked
 from support.run_report import make_metrics, make_report
 from support.told_journal import told_journal
 from trilane.apps.cli import watch as cli_watch
@@ -100,14 +101,16 @@ def test_a_run_that_goes_on_is_looked_at_until_it_ends(command: Command, monkeyp
     folder = Path(f"runs/walk.{os.getpid()}.partial")
     folder.mkdir(parents=True)
     slept: list[float] = []
-    with JournalWriter(folder / NAME) as journal:
+    with JournalWriter(folder / NAME) as journal, locked(folder):
         journal.add(BEGUN)
         journal.flush()
-        parts = iter((RECORDS, END))
+        parts = iter((RECORDS, END, ()))
 
         def sleep(seconds: float) -> None:
             slept.append(seconds)
-            for record in next(parts):
+            if not (part := next(parts)):
+                folder.rename("runs/walk")
+            for record in part:
                 journal.add(record)
             journal.flush()
 
@@ -118,8 +121,9 @@ def test_a_run_that_goes_on_is_looked_at_until_it_ends(command: Command, monkeyp
         ("goes on", 0, False),
         ("goes on", 1, False),
         ("goes on", 1, True),
+        ("finished", 1, True),
     ]
-    assert slept == [0.5, 0.5]
+    assert slept == [0.5, 0.5, 0.5]
 
 
 def test_a_run_that_was_killed_is_shown_as_it_was(command: Command) -> None:
@@ -130,21 +134,12 @@ def test_a_run_that_was_killed_is_shown_as_it_was(command: Command) -> None:
 def test_a_run_that_is_killed_while_it_is_looked_at_says_so_and_ends(
     command: Command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its process has ended, but its parent has not asked for its exit code yet."""
-    process = os.fork()
-    if not process:
-        signal.pause()
-    written(f"runs/walk.{process}.partial", BEGUN, *RECORDS)
-
-    def sleep(_: float) -> None:
-        os.kill(process, signal.SIGKILL)
-        os.waitid(os.P_PID, process, os.WEXITED | os.WNOWAIT)
-
-    monkeypatch.setattr(time, "sleep", sleep)
-    try:
+    folder = Path("runs/walk.5.partial")
+    written(str(folder), BEGUN, *RECORDS)
+    with ExitStack() as run:
+        run.enter_context(locked(folder))
+        monkeypatch.setattr(time, "sleep", lambda _: run.close())
         lines = command("watch", "walk")[0].splitlines()
-    finally:
-        os.waitpid(process, 0)
     assert lines[0].startswith("run walk: goes on; ")
     killed = "run walk: killed: its process is gone, and the last line is as far as its journal goes"
     assert lines[-1] == killed
@@ -178,13 +173,14 @@ def test_openmetrics_without_its_library(command: Command, monkeypatch: pytest.M
 
 
 def test_an_interrupt_ends_it_without_a_word(command: Command, monkeypatch: pytest.MonkeyPatch) -> None:
-    written(f"runs/walk.{os.getpid()}.partial", BEGUN)
+    written("runs/walk.5.partial", BEGUN)
 
     def interrupt(_: float) -> Any:
         raise KeyboardInterrupt
 
     monkeypatch.setattr(time, "sleep", interrupt)
-    out, err = command("watch", "walk", code=130)
+    with locked(Path("runs/walk.5.partial")):
+        out, err = command("watch", "walk", code=130)
     assert len(out.splitlines()) == 4  # three of the heading, and one look
     assert "Traceback" not in err
 

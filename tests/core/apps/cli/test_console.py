@@ -12,7 +12,14 @@ from pathlib import Path
 
 import pytest
 
-from trilane.apps.cli.console import print_facts, print_json, stderr_console, stdout_console, stdout_kept
+from trilane.apps.cli.console import (
+    print_facts,
+    print_json,
+    stderr_console,
+    stdout_console,
+    stdout_kept,
+    verdict_text,
+)
 
 
 def open_descriptors() -> int:
@@ -80,6 +87,22 @@ def test_facts_are_a_row_for_every_key(capsys: pytest.CaptureFixture[str]) -> No
     ]
     print_facts(FACTS, as_json=True)
     assert json.loads(capsys.readouterr().out) == FACTS
+
+
+def test_a_name_is_printed_as_it_is_in_a_table_too(capsys: pytest.CaptureFixture[str]) -> None:
+    """It may look like Rich's markup or like the name of an emoji."""
+    print_facts({"file": "a[/b] :key: [red]"}, as_json=False)
+    for console in (stdout_console(), stderr_console()):
+        console.print("mine [/b] :key: [red]")
+    shown = "mine [/b] :key: [red]\n"
+    out, err = capsys.readouterr()
+    assert [" ".join(line.split()) for line in out.splitlines()] == ["file a[/b] :key: [red]", shown.strip()]
+    assert err == shown
+
+
+@pytest.mark.parametrize("width", [1, 6, 7])
+def test_a_verdict_has_a_place_in_the_narrowest_terminal(width: int) -> None:
+    assert verdict_text([("PASS", "30 fps"), ("TRY", "")], width).plain == "PASS  30\n      fps\nTRY"
 
 
 def test_numbers_in_sentences_have_no_colour(monkeypatch: pytest.MonkeyPatch) -> None:

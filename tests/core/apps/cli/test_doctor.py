@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 from collections import namedtuple
@@ -33,6 +34,16 @@ def test_what_runs_these_tests_is_there_and_what_was_tried_is_given_back() -> No
     assert [row.name for row in doctor.checks({**GL, "hardware": False}) if "software" in row.found] == [
         "EGL and OpenGL"
     ]
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+
+
+def test_memory_that_gets_no_size_is_given_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(*_: int) -> None:
+        raise OSError(errno.EPERM, "Operation not permitted")
+
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    monkeypatch.setattr(os, "ftruncate", refused)
+    assert doctor._memfd().found == "operation not permitted"
     assert len(list(Path("/proc/self/fd").iterdir())) == before
 
 

@@ -18,7 +18,7 @@ def table_text(report: dict[str, Any]) -> str:
     """The table as it is printed, each line without its frames and double spaces."""
     from rich.console import Console
 
-    console = Console(width=400, record=True, file=io.StringIO())
+    console = Console(width=400, markup=False, record=True, file=io.StringIO())
     console.print(run_table(Report.model_validate(report)))
     return "\n".join(" ".join(line.replace("│", " ").split()) for line in console.export_text().splitlines())
 

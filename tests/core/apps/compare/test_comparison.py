@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 
 from support.compared_runs import simulated, write_run
+from support.run_folders import locked
 from support.run_report import make_report
 from trilane.apps.compare import run_frames
 from trilane.apps.compare.comparison import NO_DIFFERENCE, TOO_FEW, Comparison, compare, document
@@ -476,8 +477,9 @@ def test_a_run_that_was_killed_is_compared_by_its_journal(
     frames, bound = other.runs[0].figures.frames, other.runs[0].figures.bound
     assert frames is not None and 60 < frames.presented == frames.requested < 120
     assert bound is not None and bound.stage is not None and (bound.unit.name, bound.stage.name) == ("dsp", "infer")
-    live = killed(tmp_path / "runs" / f"live.{os.getpid()}.partial", slow, facts, keep=0.8)
-    assert "it still goes on" in read_side(str(live)).runs[0].remark
+    live = killed(tmp_path / "runs" / "live.5.partial", slow, facts, keep=0.8)
+    with locked(live):
+        assert "it still goes on" in read_side(str(live)).runs[0].remark
     done = read_side(str(killed(tmp_path / "done", slow, facts))).runs[0]
     assert done.remark == "it has no report: compared by its journal"
     assert done.figures.frame_time_ms["mean"] == pytest.approx(slow.report["frame_time_ms"]["mean"])

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from support.run_folders import locked
 from support.trace_reading import read_trace
 from trilane.apps.explain.trace import write_predicted
 from trilane.hw_profiles.application import application_graph
@@ -57,8 +58,9 @@ def test_chrome_json_goes_where_it_is_asked_to(runs: Path, command: Command) -> 
 
 
 def test_a_run_that_goes_on_has_a_trace_so_far(runs: Path, command: Command) -> None:
-    going = runs.rename(runs.with_name(f"walk.{os.getpid()}.partial"))
-    _, err = command("trace", "walk", code=2)
+    going = runs.rename(runs.with_name("walk.5.partial"))
+    with locked(going):
+        _, err = command("trace", "walk", code=2)
     found = "found a run that goes on, expected --out FILE for its trace so far; its folder is its own"
     assert err == f"error: runs/{going.name}: {found}\n"
     command("trace", "walk", "--out", "so-far.pftrace")

@@ -46,6 +46,11 @@ def test_a_run_in_time_has_the_virtual_frame_time() -> None:
     assert (comparison.host_slower, comparison.late_frames, comparison.compared_share) == ({}, (), 1.0)
 
 
+def test_a_single_frame_has_no_frame_time() -> None:
+    comparison = compare(PACE, "pipelined", 1, jobs(frames=1))
+    assert (comparison.virtual_ms, comparison.measured_ms, comparison.ratio) == (None, None, None)
+
+
 def test_a_late_job_is_counted_and_its_neighbours_are_not_compared() -> None:
     comparison = compare(PACE, "pipelined", 40, jobs(late=20))
     assert comparison.host_slower == {"infer": 1}

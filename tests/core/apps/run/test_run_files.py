@@ -68,6 +68,39 @@ def test_a_second_run_with_one_name_is_refused_before_it_begins(tmp_path: Path) 
     assert names == ["run", "run [1]", f"run [1].{other.pid}.partial"]
 
 
+def test_a_killed_run_of_the_same_number_loses_nothing(tmp_path: Path) -> None:
+    """In a container, each run may have the same process number."""
+    left = tmp_path / f"run.{os.getpid()}.partial"
+    left.mkdir()
+    (left / "journal.msgpack").write_text("mine")
+    with RunFolder(tmp_path / "run") as folder:
+        assert folder.work.name == f"run.{os.getpid() + 1}.partial"
+    with RunFolder(tmp_path / "run") as folder:
+        folder.complete()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["run", left.name]
+    assert (left / "journal.msgpack").read_text() == "mine"
+
+
+def test_a_folder_that_another_made_stays_when_the_entry_fails(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path / "run")
+    folder.work.mkdir()
+    with pytest.raises(BadInputError, match="file exists"), folder:
+        pass
+    assert [*tmp_path.iterdir()] == [folder.work]
+
+
+def test_a_disk_without_room_leaves_no_lock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: int) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    before = len(list(Path("/proc/self/fd").iterdir()))
+    monkeypatch.setattr(os, "posix_fallocate", full)
+    with pytest.raises(BadInputError, match="no space left on device"), RunFolder(tmp_path / "run"):
+        pass
+    assert len(list(Path("/proc/self/fd").iterdir())) == before
+    assert [*tmp_path.iterdir()] == []
+
+
 def test_a_folder_that_was_not_completed_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), RunFolder(tmp_path / "a" / "b" / "run") as folder:
         (folder.work / "half").write_text("half")

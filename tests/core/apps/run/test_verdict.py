@@ -20,7 +20,7 @@ from trilane.apps.interface import load_run
 from trilane.apps.predict.predicted_verdict import pipeline_verdict, predicted_verdict
 from trilane.apps.run.report import Report, read_report
 from trilane.apps.run.verdict import COMPUTED, SO_FAR, Facts, LateFrames, NamedBound, Rate, Trust, judged, trust_of
-from trilane.apps.run.verdict_facts import verdict_of
+from trilane.apps.run.verdict_facts import facts_of, verdict_of
 from trilane.apps.watch.followed_run import FollowedRun
 from trilane.apps.watch.live_figures import looks
 from trilane.hw_profiles.prediction import ApplicationPrediction, MeanTime, PredictedStage, PredictedTimes
@@ -38,6 +38,19 @@ from trilane.scheduler.virtual import simulate
 QUIET = Trust(True, ("quiet machine (other programs 0.4 %)",))
 FAST = Facts(Rate(96.0, 92.0, 102.0), 30.0, LateFrames(299, 0), QUIET, frame_ms=10.4)
 US = 1000
+
+
+def test_of_two_avatars_alike_a_known_worst_view_counts() -> None:
+    avatar = {"source": "validation", "psnr_db": 31.0}
+    accuracy = {
+        "one": avatar,
+        "two": avatar | {"worst": {"psnr_db": 25.5}},
+        "three": avatar | {"worst": {"psnr_db": None}},
+    }
+    image = facts_of(Report.model_validate(make_report()), {}, accuracy).image
+    assert image == "31.0 dB, worst view 25.5 (validation); this run: --check 4"
+    image = facts_of(Report.model_validate(make_report()), {}, {"one": avatar}).image
+    assert image == "31.0 dB (validation); this run: --check 4"
 
 
 @pytest.mark.parametrize(

@@ -141,6 +141,8 @@ def test_values_are_what_the_command_makes_of_them() -> None:
         ("run --policy piplined", "'piplined', expected one of .*, pipelined.* did you mean 'pipelined'"),
         ("run --frames x", "--frames: found 'x', expected a whole number"),
         ("run --size", "--size without a value"),
+        ("run --video=no", "'--video=no', expected --video without a value"),
+        ("run --no-video=yes", "'--no-video=yes', expected --no-video without a value"),
         ("run --dashboard", "--dashboard, expected options of the trials; it waits for a person"),
         ("run --out x", "the sweep's own --out"),
         ("bench raster here", "'here'"),

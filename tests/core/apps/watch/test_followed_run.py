@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
+from support.run_folders import locked
 from trilane.apps.run.run_folder import RunFolder
 from trilane.apps.watch import followed_run
 from trilane.apps.watch.followed_run import RunState, follow
@@ -42,7 +44,9 @@ def made(folder: Path, at_s: int = 0) -> Path:
 def test_a_name_a_folder_and_a_journal_mean_the_run_that_goes_on(given: str) -> None:
     folder = made(Path(f"runs/walk.{os.getpid()}.partial"))
     run = follow(Path(given) if NAME not in given else folder / NAME)
-    assert (run.name, run.folder, run.state) == ("walk", folder, RunState.GOES_ON)
+    assert run.state is RunState.KILLED  # the number alone may be another process's
+    with locked(folder):
+        assert (run.name, run.folder, run.state) == ("walk", folder, RunState.GOES_ON)
     assert list(run.new()) == [BEGUN]
     assert list(run.new()) == []
 
@@ -83,6 +87,15 @@ def test_a_run_is_followed_while_it_gets_its_name() -> None:
     assert (run.state, run.folder) == (RunState.FINISHED, Path("runs/walk"))
 
 
+def test_a_run_that_gets_its_name_while_its_lock_is_looked_at_was_not_killed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def moved(folder: Path) -> bool:
+        folder.rename("runs/walk")
+        return False
+
+    monkeypatch.setattr(followed_run, "is_locked", moved)
+    assert follow(made(Path("runs/walk.5.partial"))).state is RunState.FINISHED
+
+
 def test_a_run_that_removes_its_folder_says_nothing_more() -> None:
     with RunFolder(Path("runs/walk")) as folder:
         made(folder.work / "x")
@@ -94,29 +107,36 @@ def test_a_run_that_removes_its_folder_says_nothing_more() -> None:
 def test_silence_counts_after_a_second_and_while_the_run_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [10**9]
     monkeypatch.setattr(followed_run.time, "monotonic_ns", lambda: now[0])
-    run = follow(made(Path(f"runs/walk.{os.getpid()}.partial")))
-    now[0] += 3 * 10**9
-    assert run.silent_ns == 3 * 10**9
-    assert len(list(run.new())) == 1
-    now[0] += 10**9
-    assert run.silent_ns == 0
-    now[0] += 1
-    assert run.silent_ns == 10**9 + 1
-    run.folder.rename("runs/walk")
-    assert run.silent_ns == 0
+    with locked(made(Path("runs/walk.5.partial"))) as folder:
+        run = follow(folder)
+        now[0] += 3 * 10**9
+        assert run.silent_ns == 3 * 10**9
+        assert len(list(run.new())) == 1
+        now[0] += 10**9
+        assert run.silent_ns == 0
+        now[0] += 1
+        assert run.silent_ns == 10**9 + 1
+        folder.rename("runs/walk")
+        assert run.silent_ns == 0
 
 
-def test_one_that_has_not_begun_is_waited_for() -> None:
+@pytest.mark.parametrize("given", ["runs/walk", "walk", f"runs/walk/{NAME}"])
+def test_one_that_has_not_begun_is_waited_for(given: str) -> None:
+    """What a killed run of that name left is not taken for it, unless its folder is named."""
+    left = made(Path("runs/walk.4.partial"))
     steps: Iterator[object] = iter((None, made))
     waited: list[float] = []
+    with ExitStack() as run:
 
-    def sleep(seconds: float) -> None:
-        waited.append(seconds)
-        if next(steps) is made:
-            made(Path("runs/walk.5.partial"))
+        def sleep(seconds: float) -> None:
+            waited.append(seconds)
+            if next(steps) is made:
+                run.enter_context(locked(made(Path("runs/walk.5.partial"))))
 
-    assert follow(Path("runs/walk"), wait=True, sleep=sleep).name == "walk"
+        assert follow(Path(given), wait=True, sleep=sleep).folder == Path("runs/walk.5.partial")
     assert len(waited) == 2
+    for named in (left, left / NAME):
+        assert follow(named, wait=True).folder == left
 
 
 @pytest.mark.parametrize(
@@ -125,6 +145,7 @@ def test_one_that_has_not_begun_is_waited_for() -> None:
         (None, "runs: found no run with a journal, expected a run folder with a journal; start one"),
         ("wolk", "wolk: found no such run, expected a run folder with a journal; did you mean 'walk'?"),
         ("elsewhere/walk", "elsewhere/walk: found no such run"),
+        (f"elsewhere/walk/{NAME}", f"elsewhere/walk/{NAME}: found no such run"),
         ("runs/wolk", "runs/wolk: found no such run, .*; did you mean 'runs/walk'?"),
         ("runs/x", r"runs/x: found no such run, expected a run folder with a journal; runs/ has old, walk$"),
         ("dangl", "dangl: found no such run, expected a run folder with a journal$"),
