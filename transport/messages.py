@@ -264,9 +264,7 @@ class JobPipe:
     def send(self, message: Message) -> None:
         """Send `message` without waiting. If the other end is closed or the pipe is full, drop `message`.
 
-        The scheduler learns of a lost or stuck unit from the end of the unit's process or from a missed deadline.
-
-        Raises as `pack` does.
+        The scheduler learns of a lost or stuck unit from its process's end or a missed deadline. Raises as `pack` does.
         """
         try:
             os.write(self._writes, pack(message))

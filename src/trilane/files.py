@@ -242,8 +242,7 @@ def npz_names(path: Path, expected: str) -> list[str]:
 def npz_pickles(path: Path, keys: Collection[str], most: int, expected: str) -> dict[str, bytes]:
     """Return the bytes of each array of Python objects in an `.npz` file, by the array's name.
 
-    The bytes are the `.npy` header and the pickle, which stays pickled. Raises BadInputError for a bad file, and if there
-    are more than `most` bytes.
+    The bytes are the `.npy` header and the pickle, which stays pickled. Raises BadInputError for bad or too large data.
 
     `keys`: names of arrays in the file; arrays of numbers are left out.
     `most`: most bytes that all returned arrays may have together.

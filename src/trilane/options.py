@@ -167,10 +167,7 @@ class Options(BaseModel):
 
     @classmethod
     def value_of(cls, name: str, word: str) -> Any:
-        """Return the value of field `name` for `word`, the text that the dashboard sent.
-
-        Raises BadInputError if `word` is no value of the field's type.
-        """
+        """Return the value of field `name` for `word`, a text of the dashboard. Raises BadInputError if it is unfit."""
         field = cls.model_fields[name]
         try:
             return None if word == NOTHING else TypeAdapter(kind_of(field)).validate_python(word)
