@@ -3,11 +3,11 @@
 Rule: a job begins when the last of its conditions is met. The conditions are its input, its unit, a free slot, a free
 place among the frames in flight, and its frame's release. If a job has several inputs, the last input counts. The path
 goes on with the job whose end met the last condition. The time between these two jobs belongs to neither: it is
-overhead, throttling or a restart. Therefore the pieces of a path follow each other without gaps, and add up to the time
-from the path's begin to its end.
+overhead, throttling, a restart or another wait. Therefore the pieces of a path follow each other without gaps, and add
+up to the time from the path's begin to its end.
 
 The job that met the last condition is known, not guessed. If a job was handed over while its unit did another job, it
-waited for that job. Any other job waited for a job whose end the scheduler heard of in the step that handed it over.
+waited for that other job. Otherwise it waited for a job whose end the scheduler heard of in the step of the hand-over.
 
 Units that share cores slow each other down, although neither needs the other's result. Therefore time in which a job on
 the path had no core belongs to the stage whose job had the core (`Sharing`). The kernel counted how long a job had no
@@ -29,7 +29,7 @@ from trilane.scheduler.events import Graph, Settings
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.stats import LEAST_FRAMES, batch_interval
 
-DELAY: Final = 256  # after so many further jobs, every job that ran at the same time as a job has ended
+DELAY: Final = 256  # number of later jobs after which every job that overlaps a job has ended
 
 
 class Taken(NamedTuple):
@@ -139,7 +139,7 @@ WHATS = {
     RELEASE: "no frame was released yet: the rate from outside",
     UNKNOWN: "before what is known",
 }
-#: The causes into which a gap between two jobs is divided, in this order; time that is left is overhead.
+#: The causes into which a gap between two jobs is divided, in this order. The rest is mostly overhead (`_overhead`).
 OF_GAPS = (LOST, DOWN, THROTTLED, HELD, PREEMPTED)
 MARGIN: Final = 32  # number of presented frames within which paths that end with different frames meet
 STEP: Final = 3 * LEAST_FRAMES
@@ -205,7 +205,7 @@ class Paths:
         self._presented: deque[Key] = deque(maxlen=kept)
 
     def add(self, explained: ExplainedJob) -> None:
-        """Add the job of the run that ended next."""
+        """Add a job; call this in the order of the jobs' ends."""
         job, key = explained.job, explained.key
         self._jobs[key] = explained
         if before := self._last_of_unit.get(job.unit):
@@ -276,9 +276,13 @@ class Paths:
         return STOPPED if from_ns < now.stopped_ns <= begin_ns else OVERHEAD
 
     def _unreleased(self, job: JobRecord, from_ns: int, end_ns: int) -> Iterator[Piece]:
-        """Yield the pieces of the time before a frame's release, the latest piece first. `job`: first job of the frame.
+        """Yield the pieces of the time before a frame's release, the latest piece first.
 
-        Time in which a unit was down is a piece of kind DOWN, because it explains why no earlier frame was presented.
+        Time in which a unit was down is of kind DOWN, because it explains why no earlier frame was presented. All other
+        time is of kind RELEASE.
+
+        `job`: first job of the frame.
+        `from_ns`, `end_ns`: begin of the time, and its end: the frame's release. Both are ns of the run's clock.
         """
         for down in reversed(self._downs):
             if end_ns <= from_ns or down.end_ns <= from_ns:
@@ -320,7 +324,7 @@ class Paths:
 
 
 def _divided(now: ExplainedJob, from_ns: int, rest: str) -> Iterator[Piece]:
-    """Yield one piece for each cause of the gap from `from_ns` to the begin of a job, the latest piece first.
+    """Yield one piece for each cause of the gap from `from_ns` to the begin of job `now`, the latest piece first.
 
     The true order of the causes is not known. The time without a cause is of kind `rest`, and becomes the latest piece.
     """

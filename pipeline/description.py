@@ -47,7 +47,7 @@ FACTORY = r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"
 
 
 class Model(BaseModel):
-    """Strict base class of data: unknown fields are errors, and values never change."""
+    """Base class of data: unknown fields are errors, and values never change."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -236,7 +236,7 @@ class Pipeline(Described):
     def edges_into(self, stage: str) -> tuple[str, ...]:
         """Return the names of the edges from which the stage takes frames, in the order of its inputs.
 
-        If a bypass ends at the stage of a chain, the edge on which the bypass begins comes last.
+        If a bypass ends at the stage, the edge on which the bypass begins comes last.
         """
         begin, end = self.bypass or ("", "")
         joints, graph = self.joints, self.graph()

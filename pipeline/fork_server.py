@@ -132,7 +132,7 @@ def _call(request: dict[str, Any], fds: Sequence[int], server_pid: int) -> int:
 
 
 def _leave_server() -> None:
-    """In a forked process, restore the default action of signals, except SIGINT, which the parent handles."""
+    """In a forked process, restore the default action of signals. Only SIGINT stays ignored: the parent handles it."""
     for number in {signal.SIGCHLD, *ENDING} - {signal.SIGINT}:
         signal.signal(number, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGCHLD})
@@ -156,7 +156,7 @@ def _die_with(lifeline: int) -> None:
 def die_with_parent(parent_pid: int, number: int = signal.SIGKILL) -> None:
     """Let the kernel send this process the signal `number` when its parent ends.
 
-    If the parent has ended already, end this process now.
+    If the parent has ended already, end this process now. Raises OSError if the kernel refuses.
 
     `parent_pid`: process id of the parent.
     """

@@ -157,7 +157,7 @@ class Lost(NamedTuple):
 def most_preempted_ns(wall_ns: int, cpu_ns: int, cores: int) -> int:
     """Return the longest time in ns for which a unit can have waited for its cores.
 
-    It is `wall_ns` less `cpu_ns` / `cores`, which is the CPU time of each core if all have the same. It is at least 0.
+    It is `wall_ns` less `cpu_ns` / `cores` (the CPU time of each core, if all cores have the same), but at least 0.
 
     `wall_ns`: length of the piece of time.
     `cpu_ns`: CPU time of the unit's threads in it, summed over the threads.
@@ -235,7 +235,7 @@ class JobClock:
         self._end_ns = self._now_ns()
 
     def begin(self, stage: int, dispatch_ns: int) -> None:
-        """Note that a job begins. `stage`: index of its stage in the unit. `dispatch_ns`: time of its dispatch."""
+        """Note that a job begins. `stage`: index of its stage in the unit. `dispatch_ns`: time of its hand-over."""
         self._stage = stage
         begin_ns = self._now_ns()
         is_long = begin_ns - max(dispatch_ns, self._end_ns) > HELD_NS
@@ -385,7 +385,6 @@ class HardwareCounters:
         return figures
 
     def close(self) -> None:
-        """Close all counters."""
         while self._files:
             os.close(self._files.popitem()[1])
 

@@ -126,7 +126,7 @@ _PLACES = {kind: place for place, kind in enumerate(RECORDS)}
 
 
 class JournalWriter:
-    """Context manager that writes records: `add` buffers a record, and `flush` or the end writes all to the file.
+    """Context manager that writes records: `add` buffers a record; `flush` or the context's end writes all.
 
     If the file cannot be written, such as on a full disk, the method that notices this raises an UnwrittenError. After
     that, nothing more is written.
@@ -188,7 +188,7 @@ class JournalWriter:
 class JournalReader:
     """Reads the journal at `path` while the journal grows. If the file is moved, set `path` to its new path.
 
-    Raises BadInputError for a file that is no journal. For a bad record, the error names the record's number, from 1.
+    `new` raises BadInputError for a file that is no journal. The error names the number of a bad record, from 1.
     """
 
     def __init__(self, path: Path) -> None:
@@ -356,9 +356,9 @@ def _has_form_of_a_run(config: Any) -> TypeGuard[Mapping[str, Any]]:
 
 
 def target_period_ns(begun: Begun) -> int:
-    """Return `target_period_ns` of a journal's first record. Raises BadInputError as `config_of` does.
+    """Return `target_period_ns` of a journal's first record, in ns. Raises BadInputError as `config_of` does.
 
-    If the journal lacks it, the result is 0 for frames with a deadline, else the period of the scene's rate.
+    If the journal lacks it, return 0 for frames with a deadline, else the period of the scene's rate or of TARGET_FPS.
     """
     written, settings = begun.facts.get("target_period_ns"), begun.settings
     if type(written) is int and 0 <= written < NEVER:

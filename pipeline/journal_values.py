@@ -166,7 +166,7 @@ class RunValues:
         return value
 
     def account(self, value: Any) -> int:
-        """Return the number of an account of the ledger."""
+        """Return `value`, which must be the number of an account of the ledger."""
         if type(value) is not int or value not in ACCOUNTS:
             known = ", ".join(f"{number} ({name})" for number, name in ACCOUNTS.items())
             raise UnexpectedValue(f"account {shown(value)}", f"one of {known}")

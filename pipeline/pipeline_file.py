@@ -115,7 +115,7 @@ class PipelineFile:
     def periods(self) -> dict[str, int]:
         """The distance, in frames, between the frames that each stage takes, by the stage's name.
 
-        It is the least common multiple of `every` of the stage and of the stages before it.
+        It is the least common multiple of `every` of the stage and of the stages that feed it, except by `latest`.
         """
         found: dict[str, int] = {}
         for name, stage in self.stages.items():
@@ -151,7 +151,7 @@ class PipelineFile:
         return self.run.latency_to or [name for name in self.stages if name not in self.readers][-1]
 
     def changed(self, assignments: Sequence[str]) -> PipelineFile:
-        """Return the file with changed values. Raises BadInputError.
+        """Return a copy with changed values. Raises BadInputError for a bad assignment, or if the copy has a defect.
 
         `assignments`: texts KEY=VALUE, such as `stages.seg.unit=dsp`.
         """
@@ -163,7 +163,7 @@ class PipelineFile:
 
 
 def read_pipeline(path: Path) -> PipelineFile:
-    """Read and check a pipeline file. Raises BadInputError."""
+    """Return the pipeline file at `path`, checked. Raises BadInputError for a file that is missing or has a defect."""
     return checked_tables(tables_of(path), path)
 
 
@@ -201,7 +201,7 @@ def _of_toml(path: Path, message: str) -> BadInputError:
 
 
 def checked_tables(tables: Mapping[str, Any], path: Path) -> PipelineFile:
-    """Check the tables of a file, and return the file. `path`: path of the file. Raises BadInputError."""
+    """Return the checked file with these tables. `path`: path of the file. Raises BadInputError for a defect."""
     for name in tables:
         if name not in TABLES:
             found = f"the unknown key {name!r}"
@@ -330,7 +330,7 @@ def _with_times(stage: StageKeys, where: str, folder: Path) -> StageKeys:
 
 
 def time_of(measurement: Measurement) -> StageTime:
-    """Return a measurement as the time of a stage: its samples, or else its mean and standard deviation."""
+    """Return a measurement as the time of a stage: at most MOST_SAMPLES samples, or else its mean and sd."""
     if measurement.samples_ms:
         return StageTime(samples=measurement.samples_ms[:MOST_SAMPLES])
     mean, sd = measurement.mean_ms or 0.0, measurement.sd_ms or 0.0
@@ -338,7 +338,7 @@ def time_of(measurement: Measurement) -> StageTime:
 
 
 def _inputs(value: object, where: str) -> tuple[PortInput, ...]:
-    """Return the inputs of a stage. `value`: value of its key `in`: a stage, stage.port, or a table of ports."""
+    """Return the inputs of a stage. `value`: its key `in`: a stage, stage.port, or ports. Raises BadInputError."""
     # A table is one input, such as { from = "camera", sync = "latest" }, or a table of ports.
     ports = value if isinstance(value, dict) else {"": value}
     if "from" in ports and ports.keys() <= {*InputKeys.known()}:
@@ -360,7 +360,7 @@ def _inputs(value: object, where: str) -> tuple[PortInput, ...]:
 
 
 def _check_ports(stage: StageKeys, where: str) -> None:
-    """Check that a stage reads through no port that its kind lacks, and through all ports that its kind needs."""
+    """Raise BadInputError if a stage reads through a port that its kind lacks, or not through a port that it needs."""
     known = stage.in_ports
     if known is None:
         return
@@ -404,8 +404,8 @@ def _in_order(stages: Mapping[str, StageKeys], path: Path) -> dict[str, StageKey
 def _check_sources(name: str, stage: StageKeys, stages: Mapping[str, StageKeys], path: Path) -> None:
     """Check the inputs of one stage. Raises BadInputError.
 
-    The stages and ports that it reads must exist, and the stages must write something. It may read at most MOST_INPUTS
-    stages, and must read all ports of a stage with the same `sync` and age.
+    The stages and ports that it reads must exist, and these stages must write something. It may read at most
+    MOST_INPUTS stages. It must read all ports of one stage with the same `sync` and age.
     """
     synced: dict[str, PortInput] = {}
     for each in stage.inputs:
@@ -556,7 +556,7 @@ def assignments(text: str) -> list[str]:
 
 
 def _assigned(tables: Mapping[str, Any], text: str) -> dict[str, Any]:
-    """Return `tables` with one value changed; a value that is no TOML counts as text. Raises BadInputError."""
+    """Return `tables` changed by `text` (KEY=VALUE); a VALUE that is no TOML counts as text. Raises BadInputError."""
     key, equals, value = text.partition("=")
     parts = [part.strip() for part in key.split(".")]
     if not equals or not all(parts) or parts[0] not in TABLES or len(parts) < 2:

@@ -143,6 +143,9 @@ NO_RUN_DELAY = (
 def add_accounts(report: dict[str, Any], pipeline: Pipeline, cpu: CpuTimes, log: RunLog) -> None:
     """Add CPU times to a ledger's report: `cpu_s` and `cpu_in_jobs_s` of units, `cpu_ms` of stages, and `core_shares`.
 
+    If the kernel counts no run delay, the idle share `preempted` of each unit becomes None.
+
+    `report`: report of a ledger, which is changed in place.
     `pipeline`: pipeline that ran.
     `cpu`: CPU time of the pipeline's units and stages.
     `log`: log that gets messages about missing or contradictory figures.

@@ -107,6 +107,8 @@ class _Block(NamedTuple):
 class WhatIf:
     """Takes the jobs of a run in order, and replays a bounded number of the run's frames, spread over the run.
 
+    Only chains are replayed, and only if all places are known. Runs with frame requests or random arrivals are not.
+
     `graph`, `settings`: graph and settings of the run.
     `places`: cores and threads of the run's units; a unit whose place is not known is missing.
     """
@@ -158,7 +160,7 @@ class WhatIf:
         self._presented = []
 
     def close(self) -> ReplayFindings | None:
-        """Return the results of the replays; None for fewer than two blocks, or a run that cannot be replayed."""
+        """Return the results of the replays; None for too few frames, no CPU times, or a run that is not replayed."""
         if len(self._blocks) < 2:
             return None
         # While the first frames fill the pipeline and the last ones empty it, frame times do not count.

@@ -48,7 +48,7 @@ LIMIT_S = 0.5  # seconds after the warm-up after which no further frame begins
 
 
 class Chain:
-    """Sends single frames through the stages of `graph`, which must be a chain.
+    """Sends single frames through the stages of `graph`. Raises UnexpectedValue if it is no chain.
 
     `processes`: for each unit, the `UnitProcesses` with the unit's process, which must be ready and have no job.
     `interrupts`: signals, which end the wait for an answer.
@@ -175,8 +175,8 @@ def rehearse(
 def timed(chain: Chain, frames: Sequence[int]) -> list[dict[str, Done]]:
     """Send `frames` through the chain; return the units' answers by stage, for each frame that counts.
 
-    The first WARM_UP frames do not count. If there are no further frames, the last frame counts. After LIMIT_S no frame
-    begins.
+    The first WARM_UP frames do not count. If there are no further frames, the last frame counts. No frame begins later
+    than LIMIT_S after the warm-up.
     """
     warm_up = min(WARM_UP, len(frames) - 1)
     for frame in frames[:warm_up]:
@@ -219,7 +219,7 @@ Cores = Mapping[str, tuple[int, ...]]
 
 
 class Group(NamedTuple):
-    """Placements with the same numbers of threads. The same processes can be moved from one to another.
+    """Placements with the same numbers of threads. The same processes can do all of them.
 
     `pipeline`: pipeline of these processes; the cores in its settings do not matter.
     `places`: for each placement, the cores of each unit.
@@ -303,6 +303,8 @@ class _Live:
 
         `turn`: index of the placement that begins, modulo the number of placements.
         `first`: number of the first of the SLICE frames that every placement does.
+
+        Raises UnitError if a frame is lost, and KeyboardInterrupt when interrupted.
         """
         count = len(self._group.places)
         order = [(turn + number) % count for number in range(count)]

@@ -201,7 +201,7 @@ class CapReadings(Protocol):
 
 
 class _KeptRun:
-    """The record of a run in memory, which the scheduler's loop fills through `add`; it has no `failure`."""
+    """The record of a run in memory, which the scheduler's loop fills through `add`. `failure` stays None."""
 
     def __init__(self, graph: Graph, settings: Settings) -> None:
         self.recording = Recording(graph, settings)

@@ -178,7 +178,8 @@ class IdleShares(Record):
     """Shares of the run's time in which a unit did not work, by cause.
 
     `starved`: share in which the unit had no input.
-    `blocked`: share in which the unit had input, but no free output slot, or the limit of frames in flight was reached.
+    `blocked`: share in which the unit had input, but no output slot was free, the limit of frames in flight was
+    reached, or late latching delayed the job.
     `throttled`: share in which the unit's duty did not let it work.
     `preempted`: share in which the unit had a job, but no core; null if the kernel does not count it.
     `overhead`: share in which a job was on its way to the unit, the unit slept within a job, or its process was down.
@@ -352,7 +353,7 @@ class PathShares(Record):
 
 
 class FramesBehind(Record):
-    """By how many frames a taken frame was older than the frame of the job that took it: `mean` and `max`."""
+    """Numbers of frames by which a taken frame was older than the frame of the job that took it: `mean` and `max`."""
 
     mean: float
     max: int

@@ -55,7 +55,7 @@ class Stage(Protocol):
         """
 
     def close(self) -> None:
-        """Release the stage's resources. A stage that writes a file completes and renames it here."""
+        """Release the stage's resources, and complete the files that the stage writes."""
 
 
 class JoiningStage(Protocol):
@@ -160,7 +160,7 @@ def payload_bytes(ports: Mapping[str, PortType]) -> int:
 
 
 def views(payload: U8, ports: Mapping[str, PortType]) -> dict[str, NDArray[Any]]:
-    """Return the array of each port, a view of its bytes, by name. Raises ValueError if the payload is too small.
+    """Return an array for each port, a view of the payload, by the port's name. Raises ValueError for a short payload.
 
     `payload`: (bytes,) uint8, payload of a slot.
     """
@@ -269,7 +269,7 @@ class PortedStage:
     def _views(self, place: int, packet: Packet, ports: Mapping[str, PortType]) -> Mapping[str, NDArray[Any] | None]:
         """Return the read-only arrays of a slot, by port. `place`: number of the slot.
 
-        A slot that comes by a bypass may lack a port, or have it with another type. Such a port has no array but None.
+        A slot that comes by a bypass may lack a port, or have it with another type. Such a port gets None.
         """
         passed = self.settings.bypass
         if passed is None or place < passed.behind:

@@ -96,7 +96,7 @@ def beside_units(cores: Sequence[int], pids: Mapping[str, int]) -> Callable[[Map
     """Count the CPU time of other programs on `cores` from now on, and return a function that returns their share.
 
     The function takes the process id of each unit at the end. If a unit's process has changed, the CPU time of the old
-    process is not known, and the function returns None.
+    process is not known, and the function returns None. It returns None too if the kernel's counts cannot be read.
 
     `pids`: process id of each unit now.
     """
@@ -157,7 +157,7 @@ def on_cores(cores: tuple[int, ...]) -> Iterator[None]:
 
 @contextlib.contextmanager
 def prompt_answers() -> Iterator[None]:
-    """Make the scheduler, in this thread, answer at once inside the `with` block.
+    """Make the scheduler, in this thread, answer without delay inside the `with` block.
 
     The scheduler then does not wait for the time slice of a unit on its core, or for a thread that draws a progress
     bar. Garbage collection is off, because a run makes no reference cycles.

@@ -122,7 +122,7 @@ class ExplainedJob(NamedTuple):
 
 
 class Span(NamedTuple):
-    """A time from one step of the run to another."""
+    """A part of the run, from `begin_ns` to `end_ns` of the run's clock."""
 
     begin_ns: int
     end_ns: int

@@ -9,7 +9,7 @@ Every nanosecond from a job's `ready_ns` to its `begin_ns` has one cause, the fi
 - down: the unit's process was down;
 - overhead: the scheduler had not heard yet that the input was there;
 - throttled: the unit's duty did not let it work yet;
-- blocked: no output slot was free, or the limit of frames in flight was reached;
+- blocked: no output slot was free, the limit of frames in flight was reached, or late latching delayed the job;
 - held: the policy or the order of frames held the job;
 - preempted: the job was handed over, but the unit had no core;
 - overhead: the job was handed over and on its way.

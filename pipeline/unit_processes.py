@@ -133,7 +133,6 @@ class UnitProcesses:
 
     @property
     def core_counts(self) -> dict[str, int]:
-        """The number of cores of each unit."""
         return {unit: len(settings.cores) for unit, settings in self._pipeline.units.items()}
 
     @property
@@ -198,7 +197,7 @@ class UnitProcesses:
                     os.sched_setaffinity(int(thread.name), cores)
 
     def listen(self, timeout_ms: int) -> list[UnitMessage]:
-        """Wait for messages for at most `timeout_ms`, and return them. A unit's last messages come before its end."""
+        """Return messages, after at most `timeout_ms`; a unit's end comes last. Raises TrilaneError for bad bytes."""
         messages: list[UnitMessage] = []
         for fd, _ in self._poller.poll(timeout_ms / 1000):
             messages += self._reactions[fd]()
@@ -334,7 +333,7 @@ POLL_MS = 200
 def start_units(processes: UnitProcesses, units: Iterable[str], interrupts: Interrupts) -> dict[str, float]:
     """Start `units`, wait until all are ready, and return the start-up time of each unit in ms.
 
-    Raises UnitError if a unit cannot start, and KeyboardInterrupt if interrupted.
+    Raises TrilaneError or OSError if a unit cannot start, and KeyboardInterrupt when interrupted.
     """
     started_s = {}
     for unit in units:

@@ -116,7 +116,6 @@ class UnitStarter:
             raise
 
     def _launch(self) -> None:
-        """Start a fresh fork server, and make the socket to it."""
         self._has_units = False
         with contextlib.ExitStack() as undo, contextlib.ExitStack() as ended:
             self._socket, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)

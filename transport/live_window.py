@@ -43,7 +43,7 @@ _HEAD: Final = np.dtype(
 class Steering(NamedTuple):
     """How a viewer has turned the camera about its target, and how much nearer to the target the camera is.
 
-    `azimuth_deg`, `elevation_deg`: turns about the target in degrees.
+    `azimuth_deg`, `elevation_deg`: turns of the camera about the target, to the right and upwards, in degrees.
     `zoom`: number by which the camera's distance from the target is divided.
     """
 
@@ -85,9 +85,9 @@ def path_of(fd: int) -> Path:
 
 
 class LiveWindow:
-    """The window behind the descriptor `fd`, which may be closed afterwards.
+    """A window for pictures of `height` x `width` pixels. The descriptor `fd` may be closed after the call.
 
-    Raises ValueError when the region is too small for two pictures.
+    Raises ValueError when the memory behind `fd` is too small for two such pictures.
     """
 
     def __init__(self, fd: int, height: int, width: int) -> None:
@@ -100,7 +100,7 @@ class LiveWindow:
 
     @classmethod
     def opened(cls, path: Path, height: int, width: int) -> LiveWindow:
-        """Return the window at `path` for pictures of `height` x `width` pixels; raises OSError and ValueError."""
+        """Return the window at `path`, as `LiveWindow` does; raises OSError too, if `path` cannot be opened."""
         fd = os.open(path, os.O_RDWR | os.O_CLOEXEC)
         try:
             return cls(fd, height, width)
@@ -114,7 +114,7 @@ class LiveWindow:
         self._head["looked_ns"] = time.monotonic_ns()
 
     def steer(self, steering: Steering) -> None:
-        """Turn and zoom the run's camera by `steering` from the next frame on."""
+        """Turn and zoom the scene's camera by `steering` from the next frame on, in place of any earlier steering."""
         for name, value in zip(Steering._fields, steering, strict=True):
             self._head[name] = value
 

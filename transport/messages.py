@@ -46,7 +46,7 @@ class RunJob(NamedTuple):
     """To a unit: run one of its stages for one frame.
 
     `id`: number of the job; its answer, `Done` or `Failed`, carries the same number.
-    `stage`: place in the unit's list of stages, from 0.
+    `stage`: index in the unit's list of stages, from 0.
     `frame`: number of the frame.
     `slot_in`, `slot_out`: slots of the stage's input edge and output edge; -1 if the stage has no such edge. If a
     bypass ends at the stage, the numbers of the bypass's slots begin after the slots of the input edge. If the stage
@@ -142,6 +142,7 @@ _PACKER = msgpack.Packer()  # shared by all messages: making a packer costs more
 class _Form(NamedTuple):
     """How a kind of message is written as bytes.
 
+    `kind`: class of the message.
     `code`: first byte of the message.
     `integers`: format of the integer fields.
     `rest`: type of the last field if this field is no integer; else None.
@@ -227,7 +228,7 @@ class JobPipeEnd(NamedTuple):
 
 
 def job_pipe_pair() -> tuple[JobPipeEnd, JobPipeEnd]:
-    """Return both ends of a new job pipe, which are alike; raises TrilaneError when no more pipes may be opened."""
+    """Return both ends of a new job pipe, which are alike; raises TrilaneError if the system gives no such pipe."""
     fds: list[int] = []
     try:
         for _ in range(2):
@@ -263,7 +264,7 @@ class JobPipe:
     def send(self, message: Message) -> None:
         """Send `message` without waiting. If the other end is closed or the pipe is full, drop `message`.
 
-        The scheduler learns of a lost or stuck unit from the end of the unit's process or from a missed deadline.
+        The scheduler learns of a lost or stuck unit from its process's end or a missed deadline. Raises as `pack` does.
         """
         try:
             os.write(self._writes, pack(message))
@@ -294,7 +295,7 @@ MAX_PATH = 80  # of the folder's path; the path of a Unix socket inside it may h
 
 
 class SocketFolder:
-    """A folder with mode 0700 for the names of sockets, held by a lock on a file inside it."""
+    """A private folder (mode 0700) for the files of sockets. A lock on a file inside shows that a process uses it."""
 
     def __init__(self) -> None:
         base = tempfile.gettempdir()

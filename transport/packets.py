@@ -38,7 +38,7 @@ def header_dtype(fields: Sequence[tuple[Any, ...]] = ()) -> np.dtype[Any]:
 
 @dataclass(frozen=True)
 class SlotLayout:
-    """The bytes of one slot: the header, then `payload_bytes`, each rounded up to whole pages."""
+    """The layout of one slot: a header, then a payload of `payload_bytes` bytes, each rounded up to whole pages."""
 
     header: np.dtype[Any]
     payload_bytes: int
@@ -77,7 +77,7 @@ F_ADD_SEALS, F_SEAL_SHRINK, F_SEAL_GROW = 1033, 0x2, 0x4
 
 @dataclass(frozen=True)
 class RegionLayout:
-    """The slots of one edge, one after the other."""
+    """The layout of an edge's memory: `slots` slots with the layout `slot`, one after the other."""
 
     slots: int
     slot: SlotLayout

@@ -65,7 +65,8 @@ RULES = {
 }
 #: The rule of an edge unless somebody chooses another.
 DEFAULT_EDGE: Final = "double"
-#: Least number of slots. An orphan edge needs two slots being read, one being written and one waiting.
+#: Least N of each rule that may be written NAME:N. An orphan edge needs two slots being read, one being written and one
+#: waiting.
 COUNTED = {"fifo": 1, "orphan": 4}
 #: The rules in words, for a person.
 EDGE_WORDS: Final = either(f"{name}:N" if name in COUNTED else name for name in RULES)
@@ -90,7 +91,7 @@ def edge_rule(text: str) -> EdgeRule:
     return EdgeRule(name, int(count), rule.mailbox, rule.yields)
 
 
-#: A function of a frame's number: whether the frame must keep its slot.
+#: A function that takes a frame's number, and returns whether the frame must keep its slot.
 Keeps = Callable[[int], bool]
 FIRST_LINE: Final = (0,)
 
@@ -115,7 +116,7 @@ class EdgeSlots:
     """
 
     def __init__(self, rule: EdgeRule, lines: int = 1, newest: int = 0) -> None:
-        """Begin with free slots.
+        """Make all slots free.
 
         `lines`: number of readers that take frame by frame.
         `newest`: number of readers that take the newest frame.
@@ -140,11 +141,15 @@ class EdgeSlots:
         return bool(self.free) or (self.rule.yields and self._evictable(keeps) >= 0)
 
     def claim(self, frame: int, keeps: Keeps = _keeps_none) -> tuple[int, int | None]:
-        """Claim a slot for `frame`; return (slot, waiting frame that was evicted from it, or None).
+        """Claim a slot for `frame`; return (slot, number of the evicted frame; None if no frame was evicted).
 
-        Without `keeps`, the oldest frame of the last line is evicted first: frames on a bypass wait in that line, and
-        no later frame needs them. With `keeps`, the oldest frame of all lines that may be evicted is evicted. Raises
-        SlotError when no slot is free and no frame may be evicted.
+        A waiting frame is evicted only if no slot is free and the edge's rule allows it (`yields`). With `keeps`, it is
+        the oldest frame of all lines that may be evicted. Without `keeps`, frames of the last line are evicted first,
+        the oldest first: frames on a bypass wait in that line, and no later frame needs them.
+
+        `keeps`: function that says which frames must not be evicted; without it, every waiting frame may be evicted.
+
+        Raises SlotError if no slot is free and no frame may be evicted.
         """
         dropped = None
         if not self.free and self.rule.yields and (oldest := self._evictable(keeps)) >= 0:
@@ -158,9 +163,9 @@ class EdgeSlots:
         return slot, dropped
 
     def commit(self, slot: int, to: Sequence[int] = FIRST_LINE, keeps: Keeps = _keeps_none) -> list[int]:
-        """Mark the slot's frame as complete, and return the frames that this frame replaces.
+        """Mark the slot's frame as complete, and return the waiting frames that it replaces (only in a mailbox).
 
-        The slot is free again at once if no reader takes its frame.
+        If no reader takes the frame, the slot is free again.
 
         `to`: indices of the lines in which the slot waits from now on.
         `keeps`: function that says which frames must not be replaced.
@@ -243,7 +248,7 @@ class EdgeSlots:
         return frame
 
     def pass_by(self, frame: int, line: int) -> None:
-        """Take `frame` out of `line`, if it waits there. The frame stays in the other lines."""
+        """Take `frame` out of `line`, if it waits there. Its slot becomes free if no other reader needs the frame."""
         for slot in self.lines[line]:
             if self.frame[slot] == frame:
                 self.lines[line].remove(slot)

@@ -13,7 +13,7 @@ __all__ = ["Prediction", "Run", "RunFailedError", "load_run", "predict", "run"]
 
 
 def __getattr__(name: str) -> Any:
-    """Return the object `name` of the interface, or the version. Both load on first use, because that takes long."""
+    """Return an object of the interface or the version, loaded on first use; raises AttributeError for other names."""
     if name in __all__:
         from importlib import import_module
 

@@ -56,7 +56,7 @@ def shape_buckets(size: str) -> list[Shape]:
 def shapes_within(pixels: int) -> list[Shape]:
     """Return the largest tensor shapes (height, width) of at most `pixels` pixels: none fits inside another.
 
-    Sides are multiples of `BUCKET_STEP`. The longer side is at most `MOST_ASPECT` times as long as the shorter side.
+    Sides are multiples of `BUCKET_STEP`, at most `MAX_SIDE`. A side is at most `MOST_ASPECT` times the other side.
 
     `pixels`: number of pixels, at least `BUCKET_STEP`².
     """
@@ -71,12 +71,12 @@ LEAST_SQUARE = 1e-10
 
 
 def psnr_db(square: float) -> float:
-    """Return the PSNR, dB, at most 100. `square`: mean square difference of values in 0..1."""
+    """Return the PSNR in dB, at most 100. `square`: mean square difference of values in 0..1."""
     return float(-10 * np.log10(max(square, LEAST_SQUARE)))
 
 
 def check_side(side: int, name: str = "side") -> int:
-    """Return `side` unchanged. Raises UnexpectedValue about `name` if a tensor cannot have this side."""
+    """Return `side` unchanged. Raises UnexpectedValue, which calls it `name`, if no tensor can have such a side."""
     if side % BUCKET_STEP or not BUCKET_STEP <= side <= MAX_SIDE:
         raise UnexpectedValue(f"{name} {side}", f"a multiple of {BUCKET_STEP} from {BUCKET_STEP} to {MAX_SIDE}")
     return side

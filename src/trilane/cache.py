@@ -39,7 +39,7 @@ def cache_dir(name: str) -> Path | None:
 def cache_entry(name: str, file: str) -> Path | None:
     """Return the path of `file` in the cache `name`; None if the cache cannot be written.
 
-    Return None too if the path exists but is not a file, such as a pipe, from which a read would wait.
+    Return None too if the path exists but is no file. It may be a pipe, and reading a pipe might wait for ever.
     """
     folder = cache_dir(name)
     if folder is None:

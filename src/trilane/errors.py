@@ -54,7 +54,7 @@ def clone() -> Path | None:
 def pip() -> str:
     """Return the command that runs this Python's pip.
 
-    The command has a relative path if this Python belongs to the clone's .venv, and the working directory is the clone.
+    The path in it is relative if this Python is in the .venv of the source tree, and the working directory is its root.
     """
     root = clone()
     if root is None or Path(sys.prefix).resolve() != root / ".venv":
@@ -88,7 +88,7 @@ def _stands_in(root: Path) -> bool:
 
 
 def _requirements(extra: str) -> Iterator[str]:
-    """Yield what the installed distribution requires for `extra`, or for every run if it is ""; without markers."""
+    """Yield the installed distribution's requirements for `extra`, or for every run if it is ""; without markers."""
     try:
         lines = importlib.metadata.requires("trilane") or []
     except importlib.metadata.PackageNotFoundError:
@@ -100,7 +100,7 @@ def _requirements(extra: str) -> Iterator[str]:
             yield requirement.strip()
 
 
-#: Error numbers that mean that a place takes no more data, and the remedy for them.
+#: Error numbers after which a file takes no more data, and the remedy for them.
 FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS})
 FREE_SPACE = "free space there or choose another --out"
 #: Most characters of `found` that a message shows.
@@ -146,8 +146,8 @@ class TrilaneError(Exception):
 class BadInputError(TrilaneError):
     """Wrong usage or bad input. Exit code 2.
 
-    `where` is the file, with key or line when known; `found`, `expected` and `remedy` are sentence parts. A long
-    `found`, such as a whole line of a file, is shown without its middle.
+    `where`: file, option or setting; for a file, with key or line if known.
+    `found`, `expected`, `remedy`: sentence parts. A long `found` is shown without its middle.
     """
 
     exit_code = 2
@@ -214,7 +214,7 @@ class MissingPartError(TrilaneError):
 
 
 def require(checks: Iterable[Callable[[], object]]) -> None:
-    """Call all `checks`, and raise one MissingPartError for all missing parts, with one command that installs them.
+    """Call all `checks`. If parts are missing, raise one MissingPartError, with one command that installs all of them.
 
     `checks`: functions that raise a MissingPartError with an `extra` if their part is missing.
     """

@@ -132,7 +132,7 @@ _HEADERS = {
 
 
 def require_file(path: Path, expected: str, if_empty: str = "") -> int:
-    """Return the size of the file `path` in bytes. Raises BadInputError if it is no regular file, or is empty.
+    """Return the size of the file `path` in bytes. Raises BadInputError if it is no regular file or is empty.
 
     `if_empty`: remedy for an empty file.
     """
@@ -181,7 +181,7 @@ def read_text(path: Path, expected: str) -> str:
 
 
 def refuse_other(path: Path, expected: str, *groups: str) -> None:
-    """Raise BadInputError for a file of a known format that belongs to none of `groups`."""
+    """Raise BadInputError if the file cannot be read, or has a known format outside `groups` (`Signature.group`)."""
     try:
         signature = signature_of(path)
     except OSError as error:
@@ -191,9 +191,9 @@ def refuse_other(path: Path, expected: str, *groups: str) -> None:
 
 
 def read_npy(path: Path, expected: str) -> NDArray[Any]:
-    """Return the array of a `.npy` file. Raises BadInputError.
+    """Return the array of a `.npy` file. Raises BadInputError for any other file, and for a damaged one.
 
-    The data of a pickled, truncated or huge file are not read.
+    A pickled or truncated array, or one of more than MAX_ARRAY_BYTES, is refused before its data are read.
     """
     size = require_file(path, expected)
     try:
@@ -209,7 +209,7 @@ def read_npy(path: Path, expected: str) -> NDArray[Any]:
 
 
 def read_npz(path: Path, keys: Collection[str], expected: str) -> dict[str, NDArray[Any]]:
-    """Return the arrays that `keys` name in the `.npz` file, by name. Raises BadInputError.
+    """Return the arrays that `keys` name in the `.npz` file, by name. Raises BadInputError for a bad file or array.
 
     A key without an array is left out, and other arrays are not opened. The returned arrays may have at most
     MAX_ARRAY_BYTES bytes together.
@@ -229,7 +229,7 @@ def read_npz(path: Path, keys: Collection[str], expected: str) -> dict[str, NDAr
 
 
 def npz_names(path: Path, expected: str) -> list[str]:
-    """Return the names of the arrays in an `.npz` file, in the file's order. Raises BadInputError."""
+    """Return the names of the arrays in an `.npz` file, in the file's order. Raises BadInputError for a bad file."""
     require_file(path, expected)
     try:
         refuse_other(path, expected, ARRAY, ARCHIVE)
@@ -240,9 +240,9 @@ def npz_names(path: Path, expected: str) -> list[str]:
 
 
 def npz_pickles(path: Path, keys: Collection[str], most: int, expected: str) -> dict[str, bytes]:
-    """Return the bytes of each array of Python objects in an `.npz` file, by the array's name. Raises BadInputError.
+    """Return the bytes of each array of Python objects in an `.npz` file, by the array's name.
 
-    The bytes are the `.npy` header and the pickle, which stays pickled.
+    The bytes are the `.npy` header and the pickle, which stays pickled. Raises BadInputError for bad or too large data.
 
     `keys`: names of arrays in the file; arrays of numbers are left out.
     `most`: most bytes that all returned arrays may have together.
@@ -271,9 +271,9 @@ def _pickle_in(where: str, archive: zipfile.ZipFile, info: zipfile.ZipInfo, most
 
 
 def npy_pickle(path: Path, most: int, expected: str) -> bytes | None:
-    """Return the bytes of a `.npy` file that holds Python objects; None for any other file. Raises BadInputError.
+    """Return the bytes of a `.npy` file that holds Python objects; None for any other file.
 
-    `most`: most bytes that the file may have.
+    Raises BadInputError for a bad file, and for Python objects in a file of more than `most` bytes.
     """
     size = require_file(path, expected)
     try:

@@ -12,8 +12,8 @@ This module also asks the kernel to **wake a thread soon** after a message for i
 speed. Linux makes a woken thread wait until the time slice of the running thread ends, about 3 ms. A thread that has
 asked for a shorter slice need not wait (EEVDF since Linux 6.12; older kernels ignore the request). With another busy
 process on the same core, the request lowered the 99th percentile of the wake-up from 3.4 ms to 0.2 ms. The request
-matters most for ZeroMQ's I/O threads. A unit that has sent a message begins its next job at once. Without the request,
-the thread that carries the message waits on this core for the end of the job's slice: 1.6 ms for two units.
+matters most for ZeroMQ's I/O threads, which carry messages. A unit that has sent a message begins its next job at once.
+Without the request, an I/O thread on the unit's core waits for the end of the job's slice: 1.6 ms with two units.
 """
 
 from __future__ import annotations
@@ -136,7 +136,7 @@ class Machine:
         return next((int(words[1]) for words in lines if words[0] == "oom_kill"), 0)
 
     def open_counter(self, attributes: bytes, flags: int) -> int:
-        """Return the file descriptor of a counter of events of this thread (perf_event_open(2)). Raises OSError.
+        """Return the descriptor of a counter of events of this thread (perf_event_open(2)). Raises OSError if refused.
 
         `attributes`: bytes of a `perf_event_attr`, which names the event. `flags`: flags of the system call.
         """
@@ -151,7 +151,7 @@ class Machine:
         return file
 
     def read_counter(self, file: int, size: int) -> bytes:
-        """Return up to `size` bytes of the present values of a counter. `file`: descriptor from `open_counter`."""
+        """Return up to `size` bytes of present values of the counter `file` (from `open_counter`). Raises OSError."""
         return os.read(file, size)
 
     def system(self) -> str:
@@ -314,7 +314,7 @@ AWAKE = "wait awake"
 def use_slice(slice_ns: int) -> bool:
     """Ask the kernel for a time slice of `slice_ns` for this thread, and for processes and threads that it starts.
 
-    Return whether the kernel accepted the request.
+    USUAL_SLICE stands for the kernel's own slice. Return whether the kernel accepted the request.
     """
     number = SCHED_SETATTR.get(here.architecture())
     if number is None or os.sched_getscheduler(0) != os.SCHED_OTHER:

@@ -146,8 +146,9 @@ class Options(BaseModel):
 
     @classmethod
     def checked(cls, values: Mapping[str, Any], *, as_typed: bool = False) -> Self:
-        """Return the options with `values`, by field name. Raises BadInputError for the first value that is refused.
+        """Return the options with `values`. Raises BadInputError for the first value that is refused.
 
+        `values`: value of each option that is given, by field name.
         `as_typed`: whether the error names the option of the command line in place of the field.
         """
         try:
@@ -166,7 +167,7 @@ class Options(BaseModel):
 
     @classmethod
     def value_of(cls, name: str, word: str) -> Any:
-        """Return the value of field `name` for `word`, the text that the dashboard sent. Raises BadInputError."""
+        """Return the value of field `name` for `word`, a text of the dashboard. Raises BadInputError if it is unfit."""
         field = cls.model_fields[name]
         try:
             return None if word == NOTHING else TypeAdapter(kind_of(field)).validate_python(word)

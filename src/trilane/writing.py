@@ -26,8 +26,8 @@ REMOVED = "it was removed while it was written"
 def write_atomically(path: Path, remedy: str = "") -> Iterator[Path]:
     """Yield a temporary path to write to. If the block ends without an error, that file is renamed to `path`.
 
-    The temporary path is new and has the suffix of `path`. If `path` is a device or a pipe (/dev/stdout), `path` itself
-    is yielded.
+    The temporary file does not exist yet; its path has the suffix of `path`. If `path` is a device or a pipe, such as
+    /dev/stdout, `path` itself is yielded.
 
     Raises BadInputError with `remedy` if the file cannot be written. An OSError about another file is not changed.
     """
@@ -67,7 +67,7 @@ def write_bytes(path: Path, content: bytes, remedy: str = "") -> None:
 def write_folder(folder: Path) -> Iterator[Path]:
     """Yield an empty folder to write files to. If the block ends without an error, the files move into `folder`.
 
-    One after the other, the files replace files of the same names in `folder`; each file there is whole at any moment.
+    The files replace files of the same names in `folder`, one after the other. At any moment each file there is whole.
     Files with other names stay.
 
     Raises BadInputError if a file cannot be written. An OSError about a file elsewhere is not changed.
