@@ -172,7 +172,10 @@ def _memory(file: PipelineFile, name: str, rule: str, ports: Mapping[str, PortTy
 
 
 def is_scene(text: str) -> bool:
-    """Return whether `text` is the name of a bundled scene, or a TOML file without any table of a pipeline file."""
+    """Return whether `text` names a bundled scene, or a TOML file with keys but without any table of a pipeline file.
+
+    Raises BadInputError for a TOML file that is empty, too large or unreadable.
+    """
     from trilane.scene.schema import scene_names
 
     path = Path(text)

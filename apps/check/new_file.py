@@ -107,9 +107,9 @@ def _branch(
 def _free_name(stem: str, endings: Sequence[str], names: set[str]) -> str:
     """Return a free name for the stage of a network, and add the names of its branch to `names`.
 
-    The name is `stem`, with a number if a name of the branch is taken. `stem`: name of the network file without ending.
+    The name is `stem`, cut to fit, with `-` for special characters. If a name of the branch is taken, a number follows.
+    `stem`: name of the network file without ending. `names`: names that are taken.
     `endings`: for each stage of the branch, the text that follows the returned name in the stage's name.
-    `names`: names that are taken.
     """
     head = re.sub(r"[^\w-]", "-", stem, flags=re.ASCII) or "network"
     for number in count(1):
@@ -168,7 +168,7 @@ def _inside(path: Path, folder: Path) -> str:
 def _video(path: Path) -> tuple[int, int, float]:
     """Return the width and height of a video in pixels, and its rate in frames a second (30 if unknown).
 
-    Raises BadInputError for a file that PyAV cannot read.
+    Raises BadInputError for a file that PyAV cannot read, or that has no video.
     """
     require_file(path, A_VIDEO)
     try:

@@ -96,7 +96,8 @@ def _read(file: PipelineFile, name: str, stage: OnnxStage) -> GraphFile:
 def _check_names(file: PipelineFile, name: str, stage: OnnxStage, graph: GraphFile) -> None:
     """Raise BadInputError if an input of the network of stage `name` gets no stream, or if a key names no input.
 
-    The keys are `in` and `shapes`. A stream may also feed an input that stands for a weight. `file`: pipeline file.
+    The keys are `in` and `shapes`. A stream may also feed an input that stands for a weight. Raises BadInputError also
+    as `_check_fixed` does. `file`: pipeline file.
     `stage`: keys of the stage. `graph`: network of the stage.
     """
     where, inputs = f"{file.path}: stages.{name}", [value.name for value in graph.model.graph.input]
@@ -156,7 +157,8 @@ def port_types(file: PipelineFile, networks: Mapping[str, GraphFile]) -> PortTyp
 
     `file`: pipeline file. `networks`: result of `read_networks`.
 
-    Raises BadInputError if a stage cannot read a port of this type, or if a bypass lacks a port that its end reads.
+    Raises BadInputError if a stage cannot read a port because of the port's type. Raises it also if the first stage of
+    the bypass lacks a port that the last stage reads.
     """
     found: PortTypes = {}
     for name, stage in file.stages.items():
@@ -230,7 +232,10 @@ def source_type(each: PortInput, known: PortTypes) -> PortType | None:
 
 
 def value_type(value: onnx.ValueInfoProto) -> PortType | None:
-    """Return the type of a network's input or output; None if no port can carry its kind of numbers."""
+    """Return the type of a network's input or output; None if no port can carry its kind of numbers.
+
+    A size that the network leaves open is 0. A single number has the shape (1,).
+    """
     kind = value.type.tensor_type
     try:
         name = np.dtype(onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type)).name

@@ -121,7 +121,7 @@ class SweepComparison:
 
     @property
     def bound(self) -> str:
-        """For each sweep, how many runs each unit bounded, in words; "" if no run names a bound."""
+        """The bounds in each sweep, and in how many trials the bound changed, in words; "" if no run names a bound."""
         base = [bound for pair in self.pairs for bound in pair.bounds.base]
         other = [bound for pair in self.pairs for bound in pair.bounds.other]
         if not any((*base, *other)):
@@ -163,8 +163,8 @@ def is_sweep(name: str) -> bool:
 def compare_sweeps(base: str, other: str) -> SweepComparison:
     """Compare two sweeps. `base`, `other`: their folders.
 
-    Raises BadInputError if a sweep cannot be read, or if a trial is no run and no prediction. Raises it also if no
-    configuration has a repeat that is done in both sweeps.
+    Raises BadInputError if a sweep or report cannot be read, or if a trial has no command. Raises it also if a compared
+    trial has no frame time, or is no run and no prediction. At least one repeat must be done in both sweeps.
     """
     first, second = (_configurations(Path(name)) for name in (base, other))
     found: list[TrialPair] = []
@@ -203,7 +203,7 @@ def _pair(name: str, base: Side, other: Side) -> GatedPair:
     """Return the two sides of the pair `name` with their figures.
 
     `base`, `other`: runs of one configuration in each sweep.
-    Raises BadInputError if the runs have no frame time.
+    Raises BadInputError if a run has no frame time.
     """
     rows = rows_of(base, other)
     if MEAN not in rows:
@@ -215,7 +215,7 @@ def _configurations(folder: Path) -> dict[str, dict[int, TrialRecord]]:
     """Return the trials of the sweep in `folder`, as {configuration: {number of the repeat: record of the trial}}.
 
     A configuration is the command and the options as JSON text. Records are in the order in which trials first ended.
-    Raises BadInputError for a trial without a command.
+    Raises BadInputError as `read_trials` does, and for a trial without a command.
     """
     found: dict[str, dict[int, TrialRecord]] = {}
     for record in read_trials(folder).values():
@@ -235,7 +235,7 @@ def _trial(sweep: str, record: TrialRecord) -> ComparedRun:
     """Return the run of a trial, from the report in its run folder or, without a report, from the result in its record.
 
     `sweep`: folder of the sweep. `record`: record of the trial.
-    Raises BadInputError if the trial is no run and no prediction.
+    Raises BadInputError if the report cannot be read, or if the trial is no run and no prediction.
     """
     name, folder = record.id, record.folder or ""
     if folder not in ("", "..") and folder == Path(folder).name and _has_report(Path(sweep, folder)):

@@ -1,8 +1,9 @@
 """A comparison of one or more sides with a base, as data and in words.
 
-Rule: table, JSON and page show only the content of a comparison. The verdict is a sentence. It names the change of the
-frame time, then the reasons for the change. Stages that take longer or shorter come first, then units that wait more or
-less, then settings with a known effect.
+Rule: table, JSON and page show only the content of a comparison. The verdict is `no difference`, begins with
+`cannot tell`, or is a sentence. The sentence names the change of the frame time or, without one, of the latency. The
+reasons follow in this order: instructions that differ, stages that take longer or shorter, units that wait more or
+less, losses, drops, errors and bytes. Settings with a known effect come last.
 """
 
 from __future__ import annotations
@@ -88,7 +89,7 @@ class Bounds(NamedTuple):
         return Finding.DIFFERS if len(base) == len(other) == 1 and is_sure else Finding.UNKNOWN
 
     def as_json(self) -> dict[str, Any]:
-        """Return the value of `bound` in an entry of `comparisons` in the JSON or, for two sweeps, of `trials`."""
+        """Return the value of `bound` in an entry of `comparisons` or `trials` of `trilane compare --json`."""
         sides = {name: [bound and bound.as_json() for bound in side] for name, side in self._asdict().items()}
         return {**sides, "outcome": str(self.outcome)}
 
@@ -256,7 +257,7 @@ def verdict(
     changes: Sequence[Change],
     stages: Mapping[str, Sequence[str]],
 ) -> str:
-    """Return the verdict: `no difference`, or a sentence. The sentence begins with `cannot tell` if nothing is certain.
+    """Return the verdict: `no difference`, a text that begins with `cannot tell`, or a sentence on what differs.
 
     `rows`: difference of each figure.
     `named`: figures that decide the verdict.
@@ -282,9 +283,9 @@ def verdict(
 def _not_told(
     rows: Rows, named: Sequence[Figure], changes: Sequence[Change], stages: Mapping[str, Sequence[str]]
 ) -> str:
-    """Return the verdict if no figure surely differs: `no difference` or `cannot tell`.
+    """Return the verdict if no figure surely differs: `no difference`, or a text that begins with `cannot tell`.
 
-    If every stage has counted instructions and no setting changed, only the instructions decide. Otherwise, times
+    If every stage has counted instructions and `changes` is empty, only the instructions decide. Otherwise, times
     decide.
     `rows`, `named`, `changes`, `stages`: as in `verdict`.
     """
@@ -363,8 +364,9 @@ def _works(found: Rows, rows: Rows, changes: Sequence[Change]) -> Iterator[str]:
 def _waits(found: Rows, rows: Rows, stages: Mapping[str, Sequence[str]]) -> Iterator[str]:
     """Yield phrases for units that wait more if frames take longer, or less if frames take less time.
 
-    If the frame time does not differ, both kinds are yielded. Increases come first. Within increases and decreases, the
-    units that were busiest in the base come first. At most `MOST_NAMED` units are named.
+    If the frame time does not differ, both kinds are yielded. Changes below `TELLING_SHARE` are left out. Increases
+    come first. Within increases and decreases, the units that were busiest in the base come first. At most `MOST_NAMED`
+    phrases are yielded.
     `found`: rows that differ.
     `rows`: all rows.
     `stages`: names of the stages of each unit.
@@ -400,8 +402,7 @@ def _plain(figure: Figure, row: Difference) -> str:
 def longer(row: Difference, unit: str) -> str:
     """Return a change of a time in words, such as `5 % longer (4.2 to 5.8)`.
 
-    `row`: difference with the change and its interval.
-    `unit`: unit of the figure.
+    `row`: difference with the change and its interval. `unit`: unit of the figure.
     """
     word = "longer" if row.change > 0 else "shorter"
     sign = 1 if row.change > 0 else -1
@@ -411,8 +412,7 @@ def longer(row: Difference, unit: str) -> str:
 def signed(row: Difference, unit: str) -> str:
     """Return a change with its sign, such as `+48 % (44 to 52)`.
 
-    `row`: difference with the change and its interval.
-    `unit`: unit of the figure.
+    `row`: difference with the change and its interval. `unit`: unit of the figure.
     """
     return f"{_amount(row.change, row, unit, '+')}{_between(row, 1)}"
 
@@ -446,7 +446,6 @@ def _amount(value: float, row: Difference, unit: str, sign: str = "") -> str:
 def _number(value: float, sign: str = "") -> str:
     """Return a number as text with three significant digits; from 1000 on, rounded to an integer, without exponent.
 
-    `value`: the number.
     `sign`: as in `_amount`.
     """
     return f"{value:{sign}.3g}" if abs(value) < WITHOUT_FRACTION else f"{value:{sign}.0f}"
@@ -460,11 +459,7 @@ def name_of(figure: Figure) -> str:
 
 
 def value_of(value: float, unit: str) -> str:
-    """Return a value of a figure as text with its unit; a share is in percent.
-
-    `value`: the value.
-    `unit`: unit of the figure.
-    """
+    """Return `value` of a figure as text with its `unit`; a share is in percent."""
     if unit == BYTES:
         return f"{value:,.0f} {unit}"
     if unit == "" and abs(value) >= IN_THOUSANDS:

@@ -64,7 +64,7 @@ class Series:
     weights: F64
 
     def at(self, places: Ints | slice) -> Series:
-        """Return the part of the series at `places`, which are indices into its arrays."""
+        """Return the part of the series at `places`: indices into its arrays, or a slice."""
         return Series(self.frames[places], self.values[places], self.weights[places])
 
 
@@ -92,7 +92,7 @@ class Difference(NamedTuple):
     the runs show the same frames, it covers only the frames that all runs have. A ratio of several runs compares
     geometric means, so it may differ from `other` / `base` - 1.
     `low`, `high`: ends of the 95 % interval of `change`.
-    `probability`: probability that runs of one kind differ by at least `change`.
+    `probability`: probability that runs of one kind differ, in either direction, by `change` less `explained` or more.
     `is_ratio`: whether `change` is a share of the base.
     `deviation`: standard deviation of the change, or of its logarithm if `is_ratio`.
     `freedom`: degrees of freedom of the deviation.
@@ -203,7 +203,7 @@ def settled(
 
     `values`: figure of each run, as two sequences: base, other side.
     `effects`: the same figures on the scale of `Difference.deviation`: logarithms for a ratio.
-    `within`: variance of the change due to scatter within runs.
+    `within`: variance of the change on this scale, due to scatter within runs.
     `chance`: the `Chance` of the figure.
     `is_ratio`: whether the change is a share of the base.
     """

@@ -5,7 +5,7 @@ A limit is kept if the whole interval lies within the limit, on a quiet machine.
 the gate states how many runs would decide, if more runs can decide.
 
 The limit `slower` judges the frame time without the share of other programs, and the time, CPU time and counted
-instructions of each stage. Counts of instructions repeat to 0.1 %. The counts alone decide this limit if every stage
+instructions of each stage. Counts differ by about 0.1 % between equal runs. They alone decide this limit if every stage
 has counts, no setting changed, and the frame time does not contradict the counts.
 """
 
@@ -107,7 +107,7 @@ class Gate(NamedTuple):
     """A limit: how much worse than the base a run may be in one metric.
 
     `name`: key of METRICS.
-    `limit`: the largest change for the worse, as a share of the base or in dB. For a share of the frames, it is a
+    `limit`: largest permitted change for the worse, as a share of the base or in dB. For a share of the frames, it is a
     difference of shares.
     `text`: the limit as its option writes it, such as `slower=5%`.
     """
@@ -241,7 +241,6 @@ def whole(judged: Sequence[JudgedLimit]) -> LimitOutcome:
 
     The result is BROKEN if any limit is broken. Without a broken limit, it is UNKNOWN if the outcome of any limit is
     unknown, otherwise KEPT.
-    `judged`: judgement of each limit.
     """
     found = [each.outcome for each in judged]
     return next(
@@ -254,7 +253,6 @@ def judge(gates: Sequence[Gate], pairs: Sequence[GatedPair]) -> list[JudgedLimit
 
     The judgements are in the order of `pairs`, and for each pair in the order of `gates`. All figures are tested
     together, so that false alarms are rare.
-    `gates`: the limits.
     """
     asked = [(gate, pair, list(_weighed(gate, pair))) for pair in pairs for gate in gates]
     every = [each for _, _, figures in asked for each in figures if each.row.deviation]
@@ -288,10 +286,10 @@ def _weighed(gate: Gate, pair: GatedPair) -> Iterator[Weighed]:
 def _is_said(figure: Figure, row: Difference, work: Difference | None, metric: GateMetric, is_quiet: bool) -> bool:
     """Return whether `figure` adds nothing to `work`, so that the figure is not judged.
 
-    Service time adds nothing if it did not grow more than `work`. CPU time adds nothing if it is as long as `work`. The
-    mean service time shows if a few jobs take much longer; the typical time does not. On a machine that is not quiet,
-    other programs may be the cause. Therefore service time is not judged there. If the metric does not judge `work`,
-    every figure adds something.
+    Both comparisons allow for `SAME_TIME`. CPU time adds nothing if it is as long as `work`. Service time adds nothing
+    if it did not grow more than `work`. The mean service time shows if a few jobs take much longer; the typical time
+    does not. On a machine that is not quiet, other programs may be the cause, so service time is not judged there. If
+    the metric does not judge `work`, every figure adds something.
     `row`: difference of the figure.
     `work`: difference of the stage's typical time on its core; None if it is unknown.
     `metric`: metric with the limit.
@@ -378,10 +376,7 @@ def _judged(gate: Gate, pair: GatedPair, figures: tuple[Weighed, ...]) -> tuple[
 
 
 def _missing(pair: GatedPair) -> list[str]:
-    """Return the names of the stages that are in some runs of `pair`, but not in all.
-
-    For such a stage, the change between the sides is unknown.
-    """
+    """Return the names of the stages that are in some runs of `pair`, but not in all. Their change is unknown."""
     first, *rest = ({*run.figures.stages} for run in _runs(pair))
     return sorted(first.union(*rest) - first.intersection(*rest))
 
@@ -425,8 +420,5 @@ def _list(figures: Sequence[Weighed]) -> str:
 
 
 def as_json(judged: Sequence[JudgedLimit]) -> Mapping[str, Any]:
-    """Return the keys that gates add to the output of `trilane compare --json`: `outcome` and `gates`.
-
-    `judged`: judgements of all limits.
-    """
+    """Return the keys that gates add to the output of `trilane compare --json`: `outcome` and `gates`."""
     return {"outcome": str(whole(judged)), "gates": [each.as_json() for each in judged]}

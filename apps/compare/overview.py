@@ -60,7 +60,7 @@ def read_entries(places: Sequence[Path]) -> list[Entry]:
     """Read the entries of all `places`, in order.
 
     If several entries have the same name, the name of the folder around each of them is added in front. In a folder of
-    runs and sweeps, a run that cannot be read becomes an entry with a `failure`.
+    runs and sweeps, a run or sweep that cannot be read becomes an entry with a `failure`.
     `places`: run folders, folders of sweeps, saved predictions, or folders of runs and sweeps.
     Raises BadInputError for a place that cannot be read or has no entries, and for more than `MOST` entries.
     """
@@ -361,7 +361,7 @@ def _error(document: Mapping[str, Any]) -> tuple[float | None, str, str]:
 
 
 def _settings(config: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield (dotted key, value as text) for each value in the nested mapping `config`, without `NOT_SETTINGS`.
+    """Yield (dotted key, value as text) for each value in the nested mapping `config`, without None and `NOT_SETTINGS`.
 
     `prefix`: start of the dotted keys.
     """
@@ -420,7 +420,7 @@ def _time(value: Any) -> float | None:
 
 
 def varied(entries: Sequence[Entry]) -> list[str]:
-    """Return the keys of the settings in which `entries` differ, in the order of their first appearance."""
+    """Return the keys of settings that differ between the `entries` with such a key, in the order of appearance."""
     keys = dict.fromkeys(key for entry in entries for key in entry.settings)
     return [key for key in keys if len({entry.settings[key] for entry in entries if key in entry.settings}) > 1]
 
@@ -476,7 +476,7 @@ def table_rows(entries: Sequence[Entry]) -> list[dict[str, Any]]:
 
 
 def write_csv(target: Path, entries: Sequence[Entry]) -> None:
-    """Write the table of `entries` as CSV into the file `target`.
+    """Write the table of `entries`, one or more, as CSV into the file `target`.
 
     Raises BadInputError if `target` cannot be written.
     """

@@ -66,11 +66,7 @@ BAR_WIDTH, BAR_HEIGHT, BAR_MARGIN = 160, 18, 6  # of the drawing of a change, pi
 
 
 def overview_page(title: str, entries: Sequence[Entry]) -> str:
-    """Return the HTML document of an overview.
-
-    `title`: title of the page.
-    `entries`: entries of the table, one or more.
-    """
+    """Return the HTML document of an overview of `entries`, one or more. `title`: title of the page."""
     script = _beside("overview_page.js")
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'sha256-{digest}'"
@@ -388,10 +384,7 @@ def still(video: Path) -> bytes | None:
 
 
 def comparison_page(comparisons: Sequence[Comparison]) -> str:
-    """Return the HTML document of a comparison.
-
-    `comparisons`: one or more, with the same base.
-    """
+    """Return the HTML document of `comparisons`, one or more, with the same base."""
     title = f"Compared with {comparisons[0].base.name}"
     parts = "\n".join(part for comparison in comparisons for part in _section(comparison))
     body = f'{parts}\n<p class="note">{escape(METHOD)}</p>'

@@ -279,7 +279,7 @@ def _of_counts(base: Side, other: Side, noise: Noise) -> Iterator[tuple[Figure, 
 
 
 def _of_errors(base: Side, other: Side) -> Iterator[tuple[Figure, Difference]]:
-    """Yield the figures of the avatars' accuracy with their differences.
+    """Yield the figures of the avatars' accuracy in the first run of each side, with their differences.
 
     The accuracy was measured once and does not scatter, so every change counts.
     """
@@ -403,10 +403,10 @@ def noise_between(base: Runs, other: Runs, effects: Mapping[str, float]) -> Nois
 
 
 def relief_of(base: Side, other: Side) -> float:
-    """Return by how much, at most, the ratio of times, `other` to `base`, would change without other programs.
+    """Return the largest change of the ratio of times `other` / `base` if no other programs had run, as a logarithm.
 
-    The result is a logarithm. It is negative if other programs had more of the cores in `other`: frames would take less
-    time there without these programs. It is 0 if a side has no run on the host clock.
+    The result is negative if other programs had more of the cores in `other`, because frames would take less time there
+    without them. It is 0 if a side has no run on the host clock.
     `base`, `other`: runs of each side.
     """
     sides = [[told for told in side.runs if told.figures.clock == HOST_CLOCK] for side in (base, other)]
@@ -422,10 +422,7 @@ def _wall(base: Sequence[float], other: Sequence[float]) -> float:
 
 
 def _left(others: float) -> float:
-    """Return the logarithm of the share of the cores that was left to a run.
-
-    `others`: share of the cores that other programs had.
-    """
+    """Return the logarithm of the share of the cores left to a run. `others`: share that other programs had."""
     return log1p(-min(others, 1 - LEAST_LEFT))
 
 

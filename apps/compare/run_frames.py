@@ -229,10 +229,7 @@ def _within(pieces: Sequence[tuple[int, int, Mapping[str, int]]], state: str, ed
 
 
 def _figures(figures: Mapping[Key, Sequence[tuple[int, float]]]) -> dict[Key, Series]:
-    """Return the metrics of stages as series, by subject.
-
-    `figures`: (frame, value) of each job, by subject.
-    """
+    """Return the metrics of stages as series, by subject. `figures`: (frame, value) of each job, by subject."""
     return {
         key: Series(
             np.array([frame for frame, _ in rows], np.int64), np.array([v for _, v in rows]), np.ones(len(rows))

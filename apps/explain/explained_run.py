@@ -72,8 +72,8 @@ def open_journal(folder: Path) -> tuple[Begun, Iterator[Record]]:
 class CoreTime(NamedTuple):
     """The use of a run's cores.
 
-    `numbers`: numbers of the cores. `cpu_ms`: CPU time of all jobs, for a mean frame. `had_ms`: mean frame time, times
-    the number of cores.
+    `numbers`: numbers of the cores. `cpu_ms`: mean CPU time of a frame's jobs. `had_ms`: mean frame time, times the
+    number of cores.
     """
 
     numbers: list[int]
@@ -84,8 +84,8 @@ class CoreTime(NamedTuple):
 class ExplainedRun:
     """Where the time of the run in `folder` went.
 
-    `begun`, `records`: first record, and other records, of the run's journal. `report`: report of the run; None while
-    the run goes on. `most`: number of slowest frames to describe.
+    `begun`, `records`: first record, and other records, of the run's journal. `report`: report of the run; None for
+    a run that goes on or was killed. `most`: number of slowest frames to describe.
 
     `remark`: sentence on a journal that ends before the run; empty for a whole journal.
     `messages`: messages of the run. `frames`: number of presented frames.
@@ -157,12 +157,12 @@ class ExplainedRun:
         return CoreTime(numbers, efficiency * had_ms, had_ms)
 
     def waits(self, stage: str) -> tuple[float, dict[str, float]]:
-        """Return the mean wait of a stage's jobs in ms, and its parts by cause, the longest first."""
+        """Return (mean wait of a stage's jobs, its parts by cause, the longest first), in ms."""
         waits_ns, per_job = self._waits_ns[stage], max(self.jobs[stage], 1) * NS_PER_MS
         return sum(waits_ns.values()) / per_job, _causes_ms(waits_ns, per_job)
 
     def shared(self, unit: str, other: str) -> list[int]:
-        """Return the cores that `unit` shares with the unit of the stage `other`."""
+        """Return the numbers of the cores that `unit` shares with the unit of the stage `other`, ascending."""
         own = self._places[unit].cores if unit in self._places else ()
         return sorted(set(own) & set(self._places[self.unit_of[other]].cores))
 
@@ -241,7 +241,11 @@ def explain_run(folder: Path, slowest: int = 10) -> ExplainedRun:
 
 
 class FrameJob(NamedTuple):
-    """A job of an explained frame. Its begin counts from the frame's release."""
+    """A job of an explained frame. Its begin counts from the frame's release.
+
+    `took_ms`: service time. `wait_ms`: time from when the job was ready until its begin. `causes_ms`: parts of this
+    wait by cause, the longest first.
+    """
 
     stage: str
     unit: str
@@ -351,7 +355,7 @@ def figure_names(folder: Path) -> list[str]:
 def job_rows(folder: Path, figures: Sequence[str]) -> Iterator[tuple[Any, ...]]:
     """Yield a row for each job of the run in `folder`, in the order of the jobs' ends.
 
-    A row has the values of COLUMNS, then the values of `figures`. If the job's stage lacks a metric, its value is None.
+    A row has the values of COLUMNS, then the values of `figures`. If a job lacks a metric, the value is None.
 
     `figures`: names of metrics, as from `figure_names`. Raises BadInputError as `open_journal` does.
     """
@@ -417,8 +421,8 @@ MOST_ENDS: Final = 1024  # frames whose ends are kept for each stage; far more t
 class JoinInput(NamedTuple):
     """An input of a stage with several inputs.
 
-    `last`: number of jobs in which this input came last. `after_ms`: in these jobs, the mean time by which it came
-    after the input before it.
+    `last`: number of jobs in which this input came last. `after_ms`: mean time in these jobs from the previous input to
+    this one; 0 without such a job.
     """
 
     last: int

@@ -74,7 +74,7 @@ class Usual(NamedTuple):
 class BudgetRow(NamedTuple):
     """A part of a run's critical path.
 
-    `what`: kind of the part. `why`: the kind in words. `ms`: time for a frame. `share`: share of the path.
+    `what`: kind of the part. `why`: the kind in words. `ms`: mean time in a frame. `share`: share of the path.
     """
 
     stage: str
@@ -185,7 +185,7 @@ def _median(values: Sequence[int]) -> float:
 
 
 def reasons(shown: ShownFrame, usual: Usual) -> list[Reason]:
-    """Return why a frame took longer than the median, the most important reason first.
+    """Return why a frame took longer than the median: at most `MOST_REASONS` reasons, the largest `longer_ms` first.
 
     If the frame hardly took longer, return no reason. `shown`: the frame. `usual`: medians over the run.
     """

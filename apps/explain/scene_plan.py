@@ -106,10 +106,11 @@ class ScenePlan:
         return self._places(self._exact(frame, avatar), frame)
 
     def measured_px(self, frame: int, avatar: int) -> float:
-        """Return the largest distance by which the plan moves a vertex of an avatar in the picture, in pixels.
+        """Return the largest distance in the picture between the planned and the exact place of a vertex, in pixels.
 
-        Call it after `decide(frame)`. Vertices that the level of the mesh leaves out do not count. If the GPU unit
-        skins, or if all vertices are outside of the picture, return 0. `frame`, `avatar`: numbers.
+        The exact place is from the whole body in float64. Vertices that the level of the mesh leaves out do not count.
+        If the GPU unit skins, or if all vertices are outside of the picture, return 0. Call this after `decide(frame)`.
+        `frame`, `avatar`: numbers.
         """
         if not self._drawn:
             return 0.0
@@ -236,8 +237,8 @@ ALWAYS = ("pose", "composite", "present")
 class ModelledAvatar(NamedTuple):
     """A visible avatar of a phase.
 
-    `avatar`, `name`: its number and name. `modelled`: its level of detail. `mesh`: level of its mesh, number of
-    triangles, and number `of` all triangles. `left_out`: parts of the body that are not modelled.
+    `avatar`, `name`: its number and name. `modelled`: its level of detail. `mesh`: `level` of its mesh, number of
+    `triangles` in this level, and number `of` triangles in the whole mesh. `left_out`: parts that are not modelled.
     `bound_px`: largest bound of the error in the phase. `measured_px`: error in the first frame; None if not measured.
     """
 
@@ -276,7 +277,7 @@ class ScenePhase:
 
     @property
     def saved(self) -> dict[str, float]:
-        """The pixels, gmac and work_ms that a frame saves."""
+        """What the plan saves in the first frame: `pixels`, `gmac` and `work_ms` of `fixed` minus `cost`."""
         keys = ("pixels", "gmac", "work_ms")
         return {key: getattr(self.fixed, key) - getattr(self.cost, key) for key in keys}
 
@@ -315,10 +316,10 @@ class PlanExplanation:
     units.
 
     `plan`: plan that decided the frames. `skinned_on`, `detail`: unit that skins, and how levels of detail are chosen.
-    `planned`, `fixed`: cost of all frames, by the plan and with tensors of the shape `FIXED`. Its `frame_ms` is a mean;
-    its other fields are sums. `placement`: as `CostModel.placement` returns it.
+    `planned`, `fixed`: costs of all frames, by the plan and with tensors of the shape `FIXED`. In both, `frame_ms` is a
+    mean; the other fields are sums. `placement`: as `CostModel.placement` returns it.
 
-    Raises BadInputError for an unknown profile, and for cores that were chosen for another chip than this machine.
+    Raises BadInputError as `CostModel` does, and for cores that were chosen for another chip than this machine.
     """
 
     def __init__(self, checked: Checked, profile: str, performance_profile: str) -> None:
@@ -475,9 +476,9 @@ def _why(group: Sequence[PlannedFrame], config: RunConfig, is_limited: bool) -> 
 
 
 def _usual(frames: Sequence[PlannedFrame], costs: CostModel) -> tuple[Shape | None, int, Networks]:
-    """Return (tensor shape, number of avatars in view, numbers of their networks) that most frames with all work have.
+    """Return the most frequent (tensor shape, number of avatars in view, numbers of their networks).
 
-    If no frame has all work, return (None, 0, FIRST).
+    Only frames with all work count. If there are none, return (None, 0, FIRST).
     """
     full = [one.plan for one in frames if one.plan.work is FrameWork.FULL]
     kinds = Counter((plan.shape, *costs.in_view(plan)) for plan in full)
@@ -498,10 +499,10 @@ class FrameCost(NamedTuple):
 
 
 def least_frame_ms(chip: Profile, times: Mapping[tuple[str, UnitName], float]) -> float:
-    """Return the least frame time of pipelined frames in ms: the time of the busiest core, or of the display if longer.
+    """Return the least frame time of pipelined frames in ms: the time of the busiest core for a frame.
 
-    A unit without a core counts as a core. `chip`: hardware profile. `times`: time of each stage's job, in ms, by
-    (stage, unit).
+    If the display's shortest interval between frames is longer, return this interval. A unit without a core counts as a
+    core. `chip`: hardware profile. `times`: time of each stage's job, in ms, by (stage, unit).
     """
     worker = workers_of(chip)
     busy = (sum(ms for (_, unit), ms in times.items() if worker[unit] == one) for one in set(worker.values()))
@@ -522,7 +523,9 @@ class CostModel:
         performance_profile: str,
         painters: Callable[[Iterable[int]], Networks] = lambda _avatars: FIRST,
     ) -> None:
-        """Load the hardware profile. Raises BadInputError for an unknown profile, or for one without a chip.
+        """Load the hardware profile.
+
+        Raises BadInputError for an unknown profile or performance profile, and for a template, which describes no chip.
 
         `painters`: function from the numbers of avatars to the numbers of the networks that paint them. Other
         parameters: see `CostModel`.

@@ -351,7 +351,7 @@ class Tiles(Generic[Item]):
     """Puts the slices of one track in order, without overlap.
 
     A unit always has a job or is idle. Therefore a slice can be written when earlier slices fill the time up to its
-    begin. A slice that begins within the written time is cut at its begin.
+    begin. A slice that begins before the end of the written time is cut at that end, or left out if it ends earlier.
     """
 
     def __init__(self) -> None:

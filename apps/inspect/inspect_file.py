@@ -1,4 +1,4 @@
-"""Says what a file or folder is, and lets the reader of this kind describe it.
+"""Says what a file or folder is, and calls the reader for its kind, which describes it.
 
 Rule: content identifies a file. If the content is ambiguous, the ending of the name decides. To identify a file, this
 module reads only its head, the names in an archive, or a whole text. Only the reader of the file's kind reads more.
@@ -112,7 +112,7 @@ AS_BVH = "export the motion as BVH, such as in Blender: File > Import, then File
 
 
 def inspect_file(path: Path) -> Inspection:
-    """Return the inspection of the file or folder `path`, which need not be usable.
+    """Return the inspection of the file or folder `path`. If it is not usable, the inspection says why.
 
     Raises BadInputError only if `path` is no readable file or folder.
     """

@@ -42,7 +42,8 @@ def predict_asked_file(options: PredictOptions, path: Path, say: Callable[[str],
 
     `options`: options of the prediction. `say`: function that gets a message before an action that takes seconds.
 
-    Raises BadInputError for an unknown chip, a file or change that cannot be used, or a stage without a time.
+    Raises BadInputError for an unknown chip, a file, change or measured run that cannot be used, or a stage without a
+    time.
     """
     chips = _Chips(options, say)
     measured, of_run = MeasuredStages({}, "", chips.name), None
@@ -138,7 +139,7 @@ class _Chips:
 
 
 def _measured(folder: Path, chip: str) -> MeasuredStages:
-    """Return the times of a run's jobs by stage, to predict a run on a chip.
+    """Return the times of a run's jobs by stage, the first `MOST_SAMPLES` of each, to predict a run on a chip.
 
     On this machine, a job's time counts from the moment when the unit gets the job. If the core is busy with other
     work, the unit begins later, and this delay counts too. On a chip, other programs of this machine take no core.

@@ -131,10 +131,7 @@ def _tenant(each: AskedPipeline, name: str, variant: Variant, precision: str | N
 
 
 def _names(stems: Sequence[str]) -> list[str]:
-    """Return a name for each pipeline, in order. Equal stems get numbers.
-
-    `stems`: file names of the pipelines without the suffix.
-    """
+    """Return a name for each pipeline, in order. Equal stems get numbers. `stems`: file names without the suffix."""
     return [
         stem if stems.count(stem) == 1 else f"{stem} ({stems[: place + 1].count(stem)})"
         for place, stem in enumerate(stems)

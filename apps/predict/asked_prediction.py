@@ -106,8 +106,8 @@ def _network_of(chip: Profile, options: PredictOptions, say: Callable[[str], Non
 def _is_measured(chip: Profile, options: PredictOptions, unit: UnitName) -> bool:
     """Return whether the network is to be measured on this machine.
 
-    It is measured if the chip is this machine, `unit` is the unit for networks, and `options` request no precision.
-    Otherwise, a run would use the network in another way.
+    It is measured if the chip is this machine, `unit` is the unit for networks, and `options` request no precision. A
+    run on this machine uses a network in no other way.
     """
     return chip.name == HOST and unit == INFER[1] and options.precision is None
 

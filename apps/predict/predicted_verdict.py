@@ -148,7 +148,7 @@ def _trust_in(low: float | None, high: float | None, target: float, *, is_held: 
 
 
 def _bound(stages: Mapping[str, tuple[str, float]], frame_ms: float, *, is_held: bool = False) -> NamedBound | None:
-    """Return the bound: the unit whose stages take most of a frame's time; None if no stage takes time.
+    """Return the bound: the unit whose stages take most of a frame's time; None if all times are 0.
 
     `stages`: (unit, time in ms) of each stage that counts, by name; at least one. `frame_ms`: time of a frame.
     `is_held`: whether the display limits the rate. In this case, the display is the bound.

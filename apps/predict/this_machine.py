@@ -43,7 +43,8 @@ def with_avatar(chip: Profile, avatar: str, say: Say) -> tuple[Profile, Network]
     `chip`: profile `host`. `avatar`: name or folder.
     `say`: function that gets a message before a measurement, and after a measurement that failed.
 
-    Raises BadInputError if `avatar` is no avatar.
+    If the measurement fails, `chip` is returned unchanged. Raises BadInputError if `avatar` is no avatar, and
+    MissingPartError if a part that a run needs is not installed.
     """
     measured, network = _with_run(chip, RunOptions(avatar=avatar), say)
     return measured, network._replace(facts={"avatar": avatar})
@@ -53,9 +54,10 @@ def _with_run(chip: Profile, request: RunOptions, say: Say) -> tuple[Profile, Ne
     """Return (`chip` with measured times of the run that `request` describes, its network at the usual tensor shape).
 
     The times come from the rehearsal that also chooses the run's placement. The avatars of the run share one tensor,
-    and each avatar gets an equal share of the time for poses. `chip`, `say`: as in `with_avatar`.
+    and each avatar gets an equal share of the time for poses. `chip`, `say`, and a failed measurement: as in
+    `with_avatar`.
 
-    Raises BadInputError for options that no run can have.
+    Raises BadInputError for options that no run can have, MissingPartError as `with_avatar` does.
     """
     checked = configure(request, Path.cwd())
     network = painting(networks_of(checked.assets), one_shape(checked.config), {"scene": request.scene})
@@ -72,12 +74,13 @@ def _with_run(chip: Profile, request: RunOptions, say: Say) -> tuple[Profile, Ne
 
 
 def with_first(chip: Profile, text: str, say: Say) -> Profile:
-    """Return `chip` with measurements of the first pipeline that shares it: a scene, a network or a pipeline file.
+    """Return `chip` with measurements of the first pipeline that shares it: a scene or a network.
 
-    A pipeline file is not measured here. `text`: pipeline as typed on the command line. `chip`, `say`: as in
-    `with_avatar`.
+    If the measurement fails, or for a pipeline file, `chip` is returned unchanged. `text`: pipeline as typed on the
+    command line. `chip`, `say`: as in `with_avatar`.
 
-    Raises BadInputError for a text that describes no pipeline, and a scene or network that cannot be used.
+    Raises BadInputError for a text that describes no pipeline, and for a scene or network that cannot be used. Raises
+    MissingPartError as `with_avatar` does.
     """
     first = asked(text)
     if first.what.endswith(NETWORK_ENDING):

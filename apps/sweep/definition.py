@@ -78,8 +78,8 @@ def trials_of(definition: Definition, words: Callable[[Options], Sequence[str]])
 
     `definition`: the sweep. `words`: function that returns options as the words of a command line.
 
-    Raises BadInputError for axes that do not fit each other, a `count` out of range, more than `MOST_TRIALS` trials,
-    and a trial given twice.
+    Raises BadInputError for an axis without values or with the name of a fixed option, and for axes of unequal length
+    in a LIST. Raises it also for a `count` out of range, more than `MOST_TRIALS` trials, and a trial given twice.
     """
     configurations = [*_configurations(definition)]
     made = [

@@ -143,9 +143,10 @@ def latest(records: Sequence[TrialRecord]) -> dict[str, TrialRecord]:
 
 
 def read_trials(folder: Path) -> dict[str, TrialRecord]:
-    """Return the `latest` records of the sweep in `folder`.
+    """Return the `latest` records of the sweep in `folder`, without an incomplete end of its `trials.jsonl`.
 
-    Raises BadInputError if the folder has no `trials.jsonl`, or if a line of this file is broken.
+    Text after the last line feed is left out, and so is a last line that is no JSON object. Raises BadInputError if the
+    file is absent, unreadable or too large, or if any other line is no record.
     """
     path = folder / TRIALS
     try:

@@ -131,7 +131,8 @@ class Aim:
 def figures_of(record: TrialRecord, names: Sequence[str] = ()) -> dict[str, float]:
     """Return the figures of a trial, by name: the `METRICS` that its result has, and the dotted keys among `names`.
 
-    Return an empty mapping for a trial that is not done.
+    If the result has several pipelines, the first one counts. Times that are not above 0 are left out. Return an empty
+    mapping for a trial that is not done.
     """
     if record.status != "done" or record.result is None:
         return {}
@@ -301,6 +302,7 @@ class Search:
         """Return whether the result of a short run ends `trial`. If so, count the trial as tried and pruned.
 
         The short run ends the trial if its first goal is worse than the median of the short runs of completed trials.
+        At least `RUNS_BEFORE_PRUNING` trials must be completed. Without this goal in `record`, return False.
 
         `asked`: Optuna's trial. `record`: record of the short run. `frames`: number of its frames.
         """
@@ -342,7 +344,8 @@ def tune(search: Search, do: Do, budget: int, together: int = 1, short: int | No
     `search`: search without results. `do`: function that does trials. `together`: number of configurations that are
     proposed and done at once. `short`: number of frames of a short run before each full run; None for no short runs.
 
-    Raises BadInputError if the first results all lack the same figure of a goal or limit.
+    Raises BadInputError if `MOST_WITHOUT_FIGURE` or more trials are done, and all lack the same figure of a goal or
+    limit.
     """
     records: dict[str, TrialRecord] = {}
     while len(search.tried) < budget and search.left:
