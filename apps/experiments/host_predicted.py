@@ -57,8 +57,8 @@ def measure(
     """
     if frames < MIN_FRAMES:
         raise BadInputError("--frames", str(frames), f"at least {MIN_FRAMES}")
-    for asked in width:
-        RunOptions.checked({"width": asked})
+    for each in width:
+        RunOptions.checked({"width": each})
     rows: list[dict[str, Any]] = []
     with TemporaryDirectory(prefix="trilane-predict-") as folder:
         for asked in (None, *width):
