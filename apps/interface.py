@@ -359,12 +359,14 @@ def _bound(function: Callable[..., Any], first: str | Path, options: Mapping[str
     Raises TypeError for an unknown name, with the most similar option.
     """
     command, signature = function.__name__, inspect.signature(function)
-    warned = partial(warnings.warn, category=DeprecationWarning, stacklevel=5)  # at the caller of `run` or `predict`
-    named = {in_new_name(command, name, value, warned): value for name, value in options.items()}
-    for name in named:
+    warned = partial(warnings.warn, category=DeprecationWarning, stacklevel=4)  # at the caller of `run` or `predict`
+    named = {}
+    for given, value in options.items():
+        name = in_new_name(command, given, value, warned)  # no comprehension, which is a level before Python 3.12
         if name not in signature.parameters:
             meant = "".join(f"; {text}" for text in [did_you_mean(name, signature.parameters)] if text)
             raise TypeError(f"{command}() got an unexpected keyword argument {name!r}{meant}")
+        named[name] = value
     return signature.bind(first, **named).arguments
 
 

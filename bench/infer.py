@@ -23,21 +23,22 @@ from trilane.avatars.bundle import load_bundle
 from trilane.avatars.network_file import read_network
 from trilane.bench import roofline
 from trilane.bench.lib.interleaved_processes import ProcessVariant, runners
-from trilane.bench.lib.networks import NetworkFixture, fixture_of_file, untrained, untrained_float
+from trilane.bench.lib.networks import ENCODER, NORM, WIDTH, NetworkFixture, fixture_of_file, untrained, untrained_float
 from trilane.errors import BadInputError
 from trilane.stages.dsp.runtime import resolve
 from trilane.unexpected_value import UnexpectedValue
 
 FP32 = "ort fp32"
+SIZE = "256x256"
 CACHE = "XDG_CACHE_HOME"
 
 
 def measure(
     network: str = "",
-    encoder: tuple[str, ...] = ("resnet18",),
-    norm: tuple[str, ...] = ("batch",),
-    width: int = 64,
-    size: tuple[str, ...] = ("256x256",),
+    encoder: tuple[str, ...] = (ENCODER,),
+    norm: tuple[str, ...] = (NORM,),
+    width: int = WIDTH,
+    size: tuple[str, ...] = (SIZE,),
     batch: tuple[int, ...] = (1,),
     runtime: tuple[str, ...] = ("ort", "openvino"),
     threads: int = 0,
@@ -74,6 +75,8 @@ def measure(
     threads = threads or len(machine.here.cores())
     if not 0 < period <= seconds:
         raise BadInputError("--period", f"{period:g}", f"more than 0, at most --seconds {seconds:g}")
+    if network and ([*encoder], [*norm], width, [*size]) != ([ENCODER], [NORM], WIDTH, [SIZE]):
+        raise BadInputError("--network", network, "no --encoder, --norm, --width or --size with it")
     names = [resolve(name) for name in runtime]
     peak = roofline.measure(threads)
     rows: list[dict[str, Any]] = []

@@ -118,6 +118,7 @@ def measure(
     cores = tuple(count or len(usable_cores()) for count in cores)
     _check(policy, edge, cores)
     if beside:
+        _check_single({"--avatar": avatar, "--size": size, "--edge": edge, "--cores": cores, "--policy": policy})
         one, other = (avatar[0], size[0]), (beside, beside_size)
         return _measure_two([one, other], edge[0], cores[0], frames, rounds, runtime, video=video)
     rows: list[dict[str, Any]] = []
@@ -171,6 +172,15 @@ def _check(policies: Sequence[str], edges: Sequence[str], cores: Sequence[int]) 
     have = len(usable_cores())
     if not all(1 <= count <= have for count in cores):
         raise BadInputError("--cores", str(list(cores)), f"numbers from 1 to the {have} that this process may use")
+
+
+def _check_single(options: Mapping[str, Sequence[Any]]) -> None:
+    """Raise BadInputError for an option that the runs with `beside` would ignore. `options`: values by option."""
+    for option, values in options.items():
+        if len(values) > 1:
+            raise BadInputError(option, f"{len(values)} values with --beside", "one")
+    if options["--policy"][0] != PIPELINED:
+        raise BadInputError("--policy", f"{options['--policy'][0]} with --beside", PIPELINED)
 
 
 def _pairs(policies: Sequence[str], edges: Sequence[str]) -> list[tuple[str, str]]:
@@ -494,6 +504,8 @@ def overlapping_ms(runs: Sequence[Sequence[JobRecord]]) -> list[float]:
     `runs`: jobs of each run. Raises TrilaneError if a run presented fewer than three frames in this time.
     """
     ends = [sorted(job.end_ns for job in jobs if job.stage == LAST) for jobs in runs]
+    if not all(ends):
+        raise TrilaneError("one of the two runs presented no frame")
     first, last = max(each[0] for each in ends), min(each[-1] for each in ends)
     kept = [[end for end in each if first <= end <= last] for each in ends]
     if min(map(len, kept)) < 3:

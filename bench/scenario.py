@@ -330,13 +330,16 @@ def _poisson(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
 
 
 def _all_at_once(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
-    """Ask as many queries at once as the pipeline answers in `load.seconds`. A few earlier queries show its rate."""
+    """Ask as many queries at once as the pipeline answers in `load.seconds`, but no more than a run has frames.
+
+    A few earlier queries show its rate.
+    """
     few = queries_needed(load.percentile)
     queries.ask(requests, few)
     queries.wait()
     rate = few / (queries.answered_s[-1] - queries.asked_s[0])
     queries.restart()
-    queries.ask(requests, max(few, math.ceil(1.1 * rate * load.seconds)))
+    queries.ask(requests, min(MAX_FRAMES - WARM_UP - few, max(few, math.ceil(1.1 * rate * load.seconds))))
 
 
 PATTERNS: dict[str, Callable[[Load, FrameRequestQueue, Queries], None]] = {

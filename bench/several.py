@@ -31,7 +31,7 @@ from trilane.units import MEASURED
 
 BOUND_DB = 0.5
 OUTPUT = (480, 640)
-MOST_AVATARS = 8
+MOST_AVATARS = 7  # more are never in view together
 MOST_MARGIN = 128
 #: Distance between neighbours, and how far every second avatar stands back, metres.
 STEP_M, BACK_M = 0.8, 0.7
@@ -73,14 +73,19 @@ def measure(
     `sources`: source of the rows.
     `config`: settings of the bench.
 
-    Raises BadInputError for an option out of range, MissingPartError if a library is not installed.
+    Raises BadInputError for an option out of range, and if no moment has all avatars in view. Raises MissingPartError
+    if a library is not installed.
     """
     _check(avatars, views, size, margins)
     fixture = _CrowdFixture()
     rows = []
     for margin in margins:
         seen = _views(fixture, avatars, views, size, margin)
-        figures = np.array([row for view in seen for row in fixture.compare(view)])
+        found = [row for view in seen for row in fixture.compare(view)]
+        if not found:
+            where = f"--avatars {avatars}, --views {views}"
+            raise BadInputError(where, "no moment with all avatars in view", "at least one", "try more --views")
+        figures = np.array(found)
         together, isolated, mean, most, height = figures.T
         loss = isolated - together
         rows.append(

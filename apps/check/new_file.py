@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import count
 from json import dumps
 from pathlib import Path
@@ -27,6 +28,9 @@ from trilane.writing import write_bytes
 A_VIDEO = "a video that PyAV reads"
 LONGEST_ENDING = len("-video")  # longest text that is added to a network's name in the name of a stage
 ON_A_CHIP = "on a chip, each block but discard needs time_ms = MS, or scale = { CHIP = FACTOR } and --measured RUN"
+
+#: Function that returns a text in TOML's quotes. TOML has no surrogate pairs, which JSON writes for rare characters.
+_quoted = partial(dumps, ensure_ascii=False)
 
 
 def write_new_file(
@@ -89,17 +93,17 @@ def _branch(
     prepared = [name + ending for ending in endings]
     lines = []
     for stage, port in zip(prepared, inputs, strict=True):
-        of = f", port = {dumps(port)}" if len(inputs) > 1 else ""
+        of = f", port = {_quoted(port)}" if len(inputs) > 1 else ""
         lines.append(f'{stage} = {{ block = "prepare", unit = "cpu", in = "camera", like = "{name}"{of} }}')
     reads = f'"{prepared[0]}"'
     if len(inputs) > 1:
-        reads = "{ " + ", ".join(f'{dumps(p)} = "{s}"' for s, p in zip(prepared, inputs, strict=True)) + " }"
+        reads = "{ " + ", ".join(f'{_quoted(p)} = "{s}"' for s, p in zip(prepared, inputs, strict=True)) + " }"
     open_sizes = {port: "x".join(map(str, shapes[port])) for port in inputs if port in shapes}
-    known = ", ".join(f"{dumps(port)} = {dumps(sizes)}" for port, sizes in open_sizes.items())
+    known = ", ".join(f"{_quoted(port)} = {_quoted(sizes)}" for port, sizes in open_sizes.items())
     given = f", shapes = {{ {known} }}" if known else ""
     lines.append(f'{name} = {{ onnx = {_inside(network, folder)}, unit = "{unit}", in = {reads}{given} }}')
     first = graph.model.graph.output[0]
-    found = dumps(f"{name}.{first.name}")
+    found = _quoted(f"{name}.{first.name}")
     lines.append(f'{name}-out = {{ block = "discard", unit = "cpu", in = {found} }}')
     return lines + [f"# {line}" for line in _video_of(name, found, value_type(first))]
 
@@ -162,7 +166,7 @@ def _inside(path: Path, folder: Path) -> str:
     if not absolute.is_relative_to(folder):
         remedy = f"write the file into {absolute.parent}, or put a link to {path.name} into {folder}"
         raise BadInputError(path, f"a file outside of {folder}", "one in the folder of the pipeline file", remedy)
-    return dumps(absolute.relative_to(folder).as_posix(), ensure_ascii=False)
+    return _quoted(absolute.relative_to(folder).as_posix())
 
 
 def _video(path: Path) -> tuple[int, int, float]:

@@ -290,7 +290,7 @@ def _not_told(
     `rows`, `named`, `changes`, `stages`: as in `verdict`.
     """
     counted = [figure for figure in named if figure.measure == INSTRUCTIONS]
-    is_counted = len(counted) == sum(map(len, stages.values())) and not changes
+    is_counted = len(counted) == sum(map(len, stages.values())) > 0 and not changes
     rested_on = counted if is_counted else [figure for figure in named if figure.measure in (FRAME_TIME, WORK, SERVICE)]
     if all(rows[figure].probability is None for figure in rested_on):
         return TOO_FEW
@@ -317,7 +317,7 @@ def _programs(found: Rows) -> Iterator[str]:
         if figure.measure == INSTRUCTIONS:
             sign = 1 if row.change > 0 else -1
             more = f"{_amount(sign * row.change, row, figure.unit)} {'more' if sign > 0 else 'fewer'} instructions"
-            yield f"{figure.of} executes {more}{_between(row, sign)}"
+            yield f"{figure.of} executes {more}{_between(row, sign, figure.unit)}"
     for figure, row in found.items():
         if figure.measure == INSTRUCTION_TIME:
             yield f"an instruction of {figure.of} takes {longer(row, figure.unit)}, as the machine lets it"
@@ -406,7 +406,7 @@ def longer(row: Difference, unit: str) -> str:
     """
     word = "longer" if row.change > 0 else "shorter"
     sign = 1 if row.change > 0 else -1
-    return f"{_amount(sign * row.change, row, unit)} {word}{_between(row, sign)}"
+    return f"{_amount(sign * row.change, row, unit)} {word}{_between(row, sign, unit)}"
 
 
 def signed(row: Difference, unit: str) -> str:
@@ -414,18 +414,19 @@ def signed(row: Difference, unit: str) -> str:
 
     `row`: difference with the change and its interval. `unit`: unit of the figure.
     """
-    return f"{_amount(row.change, row, unit, '+')}{_between(row, 1)}"
+    return f"{_amount(row.change, row, unit, '+')}{_between(row, 1, unit)}"
 
 
-def _between(row: Difference, sign: int) -> str:
+def _between(row: Difference, sign: int, unit: str) -> str:
     """Return the interval of a change, such as ` (44 to 52)`; "" if it is unknown or rounds to a single number.
 
     `row`: difference with the interval.
     `sign`: 1, or -1 to show the interval of the opposite change.
+    `unit`: unit of the figure.
     """
     if row.low is None or row.high is None:
         return ""
-    scale = 100 if row.is_ratio else 1
+    scale = 100 if row.is_ratio or unit == SHARE else 1
     low, high = map(_number, sorted((sign * row.low * scale, sign * row.high * scale)))
     return f" ({low} to {high})" if low != high else ""
 

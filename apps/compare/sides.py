@@ -32,7 +32,7 @@ from trilane.errors import BadInputError
 from trilane.files import require_file
 from trilane.pipeline.file_keys import LONGEST_MS
 from trilane.pipeline.journal import NAME as JOURNAL
-from trilane.pipeline.journal import read_journal
+from trilane.pipeline.journal import config_of, read_journal
 from trilane.pipeline.reckoning import places_of, reckoned
 from trilane.pipeline.run_metrics import Bound, Record, metrics_in
 from trilane.units import HOST_CLOCK
@@ -306,7 +306,7 @@ def _journal_document(frames: RunFrames, path: Path) -> tuple[dict[str, Any], tu
             }
             for stage in frames.begun.graph.stages
         },
-        "units": {unit: _unit(frames, unit, facts.get("config", {})) for unit in frames.begun.graph.units},
+        "units": {unit: _unit(frames, unit, config_of(frames.begun)) for unit in frames.begun.graph.units},
         **{name: facts[name] for name in ("made",) if name in facts},
         **_at_the_end(frames, path),
     }

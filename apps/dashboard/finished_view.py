@@ -237,9 +237,10 @@ class _RunPictures:
         self._lock = threading.Lock()
         self._fps = fps
         self._container: Any = None
-        with suppress(OSError, av.error.FFmpegError):  # the run was not recorded
-            self._container = av.open(str(path))
-            self._stream: Any = self._container.streams.video[0]
+        with suppress(OSError, av.error.FFmpegError, IndexError):  # the run was not recorded, or has no pictures
+            container = av.open(str(path))
+            self._stream: Any = container.streams.video[0]
+            self._container = container
 
     @property
     def is_missing(self) -> bool:
@@ -248,19 +249,20 @@ class _RunPictures:
     def jpeg(self, frame: int) -> bytes | None:
         """Return the picture that was shown at the time of the frame number `frame`, as a JPEG.
 
-        None is returned if the video is missing or has no such picture.
+        None is returned if the video is missing, has no such picture, or is damaged there.
         """
         if self._container is None:
             return None
         one = 1 / Fraction(self._fps).limit_denominator(1001) / self._stream.time_base
         pts, newest = int(frame * one), None
-        with self._lock:
+        with self._lock, suppress(av.error.FFmpegError):
             self._container.seek(pts, stream=self._stream, backward=True)
             for picture in self._container.decode(self._stream):
                 if newest is not None and picture.pts > pts + one / 2:
                     break
                 newest = picture
             return None if newest is None else jpeg_of(newest.to_image())
+        return None
 
     def close(self) -> None:
         """Close the video."""

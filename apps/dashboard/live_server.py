@@ -238,8 +238,8 @@ class LiveView:
         if seen is None:
             return None
         self._picture_s = time.monotonic() + PICTURE_S
-        if seen.frame != self._jpeg[0]:
-            self._jpeg = seen.frame, await asyncio.to_thread(_jpeg, seen)
+        if seen.sampled_ns != self._jpeg[0]:  # a later run has the same frame numbers
+            self._jpeg = seen.sampled_ns, await asyncio.to_thread(_jpeg, seen)
         client.had_frame = seen.frame
         age_ms = (time.monotonic_ns() - seen.sampled_ns) * MS
         return shown(seen.frame, 1e3 * seen.media_s, age_ms, self._jpeg[1])

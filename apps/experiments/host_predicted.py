@@ -47,15 +47,18 @@ def measure(
 
     `run`, `network`: summaries of the rows of that kind. `inside`: number of rows in their interval, out of `of` rows.
     `median_error`: median of the absolute errors. `leave_one_out_error`: root mean square of log(predicted / measured).
-    `inside_left_out`: number of rows in the 80 % interval that follows from the errors of all other rows.
+    `inside_left_out`: number of rows in the 80 % interval that follows from the errors of all other rows;
+    null for a single row.
 
     `config`: values of the options.
 
-    Raises BadInputError for fewer than 100 frames or an avatar that cannot be read, MissingPartError without PyTorch,
-    and TrilaneError if a run fails.
+    Raises BadInputError for fewer than 100 frames, a width out of range, or an avatar that cannot be read. Raises
+    MissingPartError without PyTorch, and TrilaneError if a run fails.
     """
     if frames < MIN_FRAMES:
         raise BadInputError("--frames", str(frames), f"at least {MIN_FRAMES}")
+    for each in width:
+        RunOptions.checked({"width": each})
     rows: list[dict[str, Any]] = []
     with TemporaryDirectory(prefix="trilane-predict-") as folder:
         for asked in (None, *width):
@@ -118,16 +121,16 @@ def _row(name: str, what: str, predicted: FrameInterval, measured_ms: float, oth
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Return the summary of the rows of one kind.
 
-    `rows`: two or more `rows` of `measure`, which also describes the keys.
+    `rows`: `rows` of `measure`, which also describes the keys.
     """
-    squares = [math.log1p(row["error"]) ** 2 for row in rows]
-    left_out = [(sum(squares) - one) / (len(squares) - 1) for one in squares]
+    squares, others = [math.log1p(row["error"]) ** 2 for row in rows], len(rows) - 1
+    inside_left_out = sum(others * one <= SIGMAS**2 * (sum(squares) - one) for one in squares)
     return {
         "inside": sum(row["inside"] for row in rows),
         "of": len(rows),
         "median_error": median(abs(row["error"]) for row in rows),
         "leave_one_out_error": math.sqrt(sum(squares) / len(squares)),
-        "inside_left_out": sum(one <= SIGMAS**2 * other for one, other in zip(squares, left_out, strict=True)),
+        "inside_left_out": inside_left_out if others else None,
     }
 
 

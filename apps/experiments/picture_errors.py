@@ -62,7 +62,7 @@ class ErrorFigures:
     `ssim`, `ms_ssim`: similarity, 1 without an error; None if the picture is too small.
     `flip`: mean FLIP, 0 without an error.
     `dice`, `iou`: agreement of the masks, 1 if they are equal; None without masks.
-    `lpips`: LPIPS, 0 without an error; None without weights, or if the pictures differ and are too small.
+    `lpips`: LPIPS, 0 without an error; None without weights, or if the pictures are too small.
     """
 
     mae: float
@@ -122,7 +122,7 @@ def _no_error(side: int, masks: tuple[Mask, Mask] | None, lpips: Perceived | Non
         flip=0.0,
         dice=None if masks is None else dice(*masks),
         iou=None if masks is None else iou(*masks),
-        lpips=None if lpips is None else 0.0,
+        lpips=None if lpips is None or side < LEAST_LPIPS_PX else 0.0,
     )
 
 

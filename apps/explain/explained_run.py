@@ -139,8 +139,8 @@ class ExplainedRun:
             BudgetRow(stage, self.unit_of[stage], what, WHATS[what], ns / intervals / NS_PER_MS, ns / total_ns)
             for (what, stage), ns in sorted(budget.items(), key=lambda row: -row[1])
         ]
-        allowed = begun.facts.get("machine", {}).get("cpu", {}).get("cores_allowed", ())
-        self.advice = advice(self.budget, settings.policy, len(allowed) - len(graph.units), "pipeline" in config)
+        spare = _cores_allowed(begun) - len(graph.units)
+        self.advice = advice(self.budget, settings.policy, spare, "pipeline" in config)
         self.accuracy: Mapping[str, Mapping[str, Any]] = begun.facts.get("accuracy", {})
         self.source = MEASURED if self.clock == HOST_CLOCK else COMPUTED
         self.scene: str | None = config.get("scene", {}).get("name")
@@ -227,6 +227,14 @@ class ExplainedRun:
             "shared": {other: self.shared(taken.unit, other) for other in taken.of},
             "others_ms": taken.other_ns / per_job,
         }
+
+
+def _cores_allowed(begun: Begun) -> int:
+    """Return how many cores the run could use; 0 if the journal does not say."""
+    match begun.facts.get("machine"):
+        case {"cpu": {"cores_allowed": [*cores]}}:
+            return len(cores)
+    return 0
 
 
 def explain_run(folder: Path, slowest: int = 10) -> ExplainedRun:

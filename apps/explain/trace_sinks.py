@@ -154,7 +154,7 @@ class PacketSink:
         packet = self._counted
         event = packet.track_event
         packet.timestamp, event.track_uuid = at_ns, track
-        if value == int(value):
+        if -LONGEST_INT <= value < LONGEST_INT and value == int(value):
             event.counter_value = int(value)
         else:
             event.double_counter_value = value  # setting one of the two fields unsets the other

@@ -176,10 +176,10 @@ def kind_of(path: Path) -> tuple[str, Signature | None]:
     The signature is given for a file that Trilane does not read: a foreign format, an archive, or a format with a
     remedy. Raises BadInputError if `path` is no readable file or folder.
     """
-    if path.is_dir():
-        return _folder(path), None
-    require_file(path, EXPECTED)
     try:
+        if path.is_dir():
+            return _folder(path), None
+        require_file(path, EXPECTED)
         signature = signature_of(path)
     except OSError as error:
         raise BadInputError.of_os_error(path, error, EXPECTED) from None

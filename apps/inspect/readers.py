@@ -22,7 +22,6 @@ from PIL import ExifTags, Image, ImageDraw
 
 from trilane.apps.avatar_files import bundle_facts
 from trilane.apps.compare.overview import read_entries
-from trilane.apps.explain.trace import NAME as TRACE_NAME
 from trilane.apps.inspect.inspection import Inspection, Length, drawn_cameras, drawn_points, drawn_skeletons, used
 from trilane.apps.run.report import read_report
 from trilane.apps.run.run_files import SHEET
@@ -188,7 +187,8 @@ def inspect_report(path: Path) -> Inspection:
     presented = report.frames.presented
     seconds = report.duration_s
     facts = {"clock": report.clock, "fps": report.fps, "presented": presented, "failure": report.failure}
-    rate = "one frame" if report.fps is None else f"{presented} frames at {report.fps:.4g}/s"
+    few = "one frame" if presented else "no frame"
+    rate = few if report.fps is None else f"{presented} frames at {report.fps:.4g}/s"
     what = f"the report of {rate} on the {report.clock} clock"
     advice = f"trilane explain {path if path.is_dir() else path.parent}"
     length = Length(presented, float(seconds), report.fps)
@@ -220,9 +220,10 @@ def inspect_trace(path: Path) -> Inspection:
 
 
 def _trace_events(path: Path) -> int:
-    if path.suffix == Path(TRACE_NAME).suffix:
+    try:
+        document: Any = json.loads(read_text(path, "a trace in Chrome's format"))
+    except (BadInputError, ValueError, RecursionError):
         return _packets(path)
-    document: Any = json.loads(read_text(path, "a trace in Chrome's format"))
     events = document.get("traceEvents") if isinstance(document, dict) else None
     if not isinstance(events, list):
         raise BadInputError(f"{path}: traceEvents", type(events).__name__, "a list of events")
@@ -456,7 +457,10 @@ def _seconds(container: Any, stream: Any) -> float:
 
 
 def _film(path: Path, seconds: float) -> Image.Image:
-    """Return a contact sheet of frames of the video `path`, at evenly spread times. `seconds`: length of the video."""
+    """Return a contact sheet of frames of the video `path`, at evenly spread times. `seconds`: length of the video.
+
+    Raises BadInputError if no frame can be decoded.
+    """
     background = open_background(path, THUMB, FOLDER_FPS)
     pictures, captions = [], []
     try:
@@ -467,6 +471,8 @@ def _film(path: Path, seconds: float) -> Image.Image:
                 captions.append(f"{time_s:.2f} s")
     finally:
         background.close()
+    if not pictures:
+        raise BadInputError(path, "no frame that can be decoded", "a video that FFmpeg can decode")
     return _sheet(pictures, captions)
 
 

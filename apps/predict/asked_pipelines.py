@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -131,11 +132,16 @@ def _tenant(each: AskedPipeline, name: str, variant: Variant, precision: str | N
 
 
 def _names(stems: Sequence[str]) -> list[str]:
-    """Return a name for each pipeline, in order. Equal stems get numbers. `stems`: file names without the suffix."""
-    return [
-        stem if stems.count(stem) == 1 else f"{stem} ({stems[: place + 1].count(stem)})"
-        for place, stem in enumerate(stems)
-    ]
+    """Return a name for each pipeline, in order. Equal stems get numbers; no two names are equal.
+
+    `stems`: file names of the pipelines without the suffix.
+    """
+    names: list[str] = []
+    for stem in stems:
+        numbered = (f"{stem} ({number})" for number in count(1))
+        is_own = stems.count(stem) == 1
+        names.append(stem if is_own else next(name for name in numbered if name not in (*stems, *names)))
+    return names
 
 
 def _bare(each: AskedPipeline, name: str, precision: str | None) -> Tenant:

@@ -143,9 +143,10 @@ def perform(trial: Trial, place: TrialPlace, children: Children) -> TrialRecord:
     began_at, start = machine.here.now().isoformat(timespec="milliseconds"), time.monotonic()
     with tempfile.TemporaryDirectory(prefix="trilane-trial-") as scratch:
         own = (place.folder or Path(scratch)) / trial.id
+        kept = own.with_name(f"{own.name}.kept")
+        shutil.rmtree(kept, ignore_errors=True)  # of a sweep that was killed during a repeat
         ended, repeated = _once(trial, own, place, children), 0
         while repeated < REPEATS and not trust_in(ended).trusted:
-            kept = own.with_name(f"{own.name}.kept")
             if own.is_dir():
                 own.rename(kept)
             again, repeated = _once(trial, own, place, children), repeated + 1

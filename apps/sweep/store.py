@@ -309,7 +309,8 @@ class Store:
 def input_digests(trials: Sequence[Trial]) -> dict[str, str]:
     """Return the SHA-256 of each file that an option of a trial names, in hexadecimal, by the path in the option."""
     values = (each for trial in trials for value in trial.options.values() for each in _flat(value))
-    files = sorted({each for each in values if isinstance(each, str) and Path(each).is_file()})
+    # `Path.is_file` raises for a text that is too long for a path.
+    files = sorted({each for each in values if isinstance(each, str) and os.path.isfile(each)})  # noqa: PTH113
     return {name: hashlib.sha256(Path(name).read_bytes()).hexdigest() for name in files}
 
 

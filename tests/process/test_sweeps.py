@@ -118,6 +118,7 @@ def test_a_disturbed_run_is_done_again_and_the_least_disturbed_is_kept(
     tmp_path: Path, log: Path, shares: str, kept: float, calls: int
 ) -> None:
     trial = Trial(("run",), {"n": 1}, ("--others", shares))
+    (tmp_path / "s" / f"{trial.id}.kept" / "of").mkdir(parents=True)  # of a sweep that was killed during a repeat
     record = swept(tmp_path / "s", [trial])[trial.id]
     assert record.result is not None
     assert (record.result["other_programs"], record.repeated, record.tries) == (kept, calls - 1, 1)

@@ -298,3 +298,9 @@ def test_the_layers_are_convolutions_between_bytes() -> None:
         out = np.einsum("nhwcyx,ocyx->nhwo", windows, weights["w"] * 0.05 / 12)
         real = np.clip(np.rint(out / 0.05), 0, 255) * 0.05
     assert np.abs(found - np.rint(real / 0.05)).max() <= 1, "halves may round to either side in float32"
+
+
+@pytest.mark.parametrize("ignored", [{"encoder": ("mit_b0",)}, {"norm": ("none",)}, {"width": 8}, {"size": ("64x64",)}])
+def test_a_network_of_a_file_takes_no_settings_of_another(network: Path, ignored: dict[str, Any]) -> None:
+    with pytest.raises(BadInputError, match="no --encoder, --norm, --width or --size with it"):
+        infer.measure(str(network), **ignored)

@@ -87,6 +87,12 @@ def test_all_at_once_asks_a_tenth_more_than_the_time_takes(clock: Clock) -> None
     assert len(queries.asked_s) == 177
 
 
+def test_all_at_once_asks_for_no_more_frames_than_a_run_has(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scenario, "MAX_FRAMES", 100)
+    asked, _ = played(clock, Load("offline", seconds=201.0))
+    assert asked == [8, 64, 28]
+
+
 def test_a_server_is_asked_at_the_moments_of_its_seed(clock: Clock, held: Held) -> None:
     """Until there are enough queries, or the run is over."""
     begin, queries = clock.now, Queries()

@@ -70,8 +70,8 @@ def test_the_standing_body_is_held(held: Held) -> None:
         (filters.measure, {"sizes": (2080,)}, "--sizes: found 2080, expected a multiple of 32 up to 2048"),
         (filters.measure, {"sizes": (0,)}, "--sizes: found 0, expected a multiple of 32 up to 2048"),
         (filters.measure, {"repeats": 0}, "--repeats: found 0, expected at least 1"),
-        (several.measure, {"avatars": 0}, "--avatars: found 0, expected 1 to 8"),
-        (several.measure, {"avatars": 9}, "--avatars: found 9, expected 1 to 8"),
+        (several.measure, {"avatars": 0}, "--avatars: found 0, expected 1 to 7"),
+        (several.measure, {"avatars": 8}, "--avatars: found 8, expected 1 to 7"),
         (several.measure, {"views": 0}, "--views: found 0, expected 1 to 10000"),
         (several.measure, {"views": 10_001}, "--views: found 10001, expected 1 to 10000"),
         (several.measure, {"margins": (4, 129, -1)}, "--margins: found 129, expected 0 to 128"),
@@ -97,6 +97,13 @@ def test_a_row_for_each_margin(monkeypatch: pytest.MonkeyPatch) -> None:
     }
     assert result["rows"] == [{"margin": 4, **row}, {"margin": 0, **row}]
     assert result["config"] == {"avatars": 2, "views": 5, "size": "64", "output": [480, 640]}
+
+
+def test_a_crowd_that_is_never_in_view_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    shaped = load_bundle("default").shaped_body()
+    monkeypatch.setattr(several, "_CrowdFixture", lambda: SimpleNamespace(shaped=shaped))
+    with pytest.raises(BadInputError, match=r"^--avatars 7, --views 2: found no moment with all avatars in view"):
+        several.measure(avatars=7, views=2)
 
 
 def test_the_moments_of_a_crowd_are_held(held: Held) -> None:

@@ -149,6 +149,9 @@ def test_every_avatar_size_and_number_of_cores_is_measured(
         ({"policy": ("best",)}, "--policy"),
         ({"edge": ("quadruple",)}, "--edge"),
         ({"size": ("63x64",)}, "size: found side 63"),
+        ({"beside": "hiker", "avatar": ("default", "dancer")}, "--avatar: found 2 values with --beside, expected one"),
+        ({"beside": "hiker", "edge": ("single", "double")}, "--edge: found 2 values"),
+        ({"beside": "hiker", "policy": ("latest",)}, "--policy: found latest with --beside, expected pipelined"),
     ],
 )
 def test_what_cannot_be_measured_is_refused(asked: dict[str, Any], words: str) -> None:
@@ -308,6 +311,8 @@ def test_only_the_time_in_which_both_ran_counts() -> None:
     assert pipeline.overlapping_ms([run_of(10).jobs, run_of(20, begin_ms=40).jobs]) == [10, 20]
     with pytest.raises(TrilaneError, match="met for 1 frames"):
         pipeline.overlapping_ms([run_of(10).jobs, run_of(10, begin_ms=100).jobs])
+    with pytest.raises(TrilaneError, match="presented no frame"):
+        pipeline.overlapping_ms([run_of(10).jobs, ()])
 
 
 def test_the_command_asks_for_both_avatars(monkeypatch: pytest.MonkeyPatch) -> None:

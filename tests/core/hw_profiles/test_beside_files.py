@@ -145,6 +145,19 @@ def test_two_files_take_turns_on_the_unit_that_both_mean(asked: Asked) -> None:
     assert needed(CHIP, two, 0, CORNERS, "round-robin").ms == pytest.approx(6 / 0.8, rel=0.01)
 
 
+@pytest.mark.parametrize(
+    ("stems", "names"),
+    [
+        (["a", "b"], ["a", "b"]),
+        (["a", "b", "a"], ["a (1)", "b", "a (2)"]),
+        (["a", "a", "a (1)"], ["a (2)", "a (3)", "a (1)"]),
+        (["a", "a", "a (1)", "a (1)"], ["a (2)", "a (3)", "a (1) (1)", "a (1) (2)"]),
+    ],
+)
+def test_no_two_pipelines_have_one_name(stems: list[str], names: list[str]) -> None:
+    assert sources._names(stems) == names
+
+
 def test_a_file_beside_a_scene_has_the_gpu_before_it(asked: Asked) -> None:
     """The file has the GPU from the release on, for 6 ms. The avatar's raster waits for it from the end of pose on."""
     one = avatar()

@@ -62,6 +62,17 @@ def test_the_file_has_the_sizes_and_the_rate_of_the_files(folder: Path) -> None:
     assert {stage.unit for name, stage in file.stages.items() if name in ("det-net", "add")} == {"gpu"}
 
 
+def test_names_beyond_the_basic_plane_are_written(folder: Path) -> None:
+    name = "x\N{GRINNING FACE}"
+    values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 3, "h", "w"])]
+    values.append(helper.make_tensor_value_info("y", TensorProto.FLOAT, [1, 3, "h", "w"]))
+    graph = helper.make_graph([helper.make_node("Relu", [name], ["y"])], "g", values[:1], values[1:])
+    onnx.save(helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), folder / "net.onnx")
+    shapes = {name: (1, 3, 8, 8)}
+    text = write_new_file(folder / "new.toml", [folder / "net.onnx"], folder / "clip.mp4", shapes=shapes)
+    assert tomllib.loads(text)["stages"]["net"]["shapes"] == {name: "1x3x8x8"}
+
+
 def test_one_network_twice_has_two_names(folder: Path) -> None:
     write_new_file(folder / "new.toml", [folder / "det net.onnx"] * 2, folder / "clip.mp4")
     assert {"det-net", "det-net-2"} <= read_pipeline(folder / "new.toml").stages.keys()

@@ -16,11 +16,11 @@ from support.compared_runs import simulated, write_run
 from support.run_folders import locked
 from support.run_report import make_report
 from trilane.apps.compare import run_frames
-from trilane.apps.compare.comparison import NO_DIFFERENCE, TOO_FEW, Comparison, compare, document
-from trilane.apps.compare.difference import Chance, Finding
+from trilane.apps.compare.comparison import NO_DIFFERENCE, TOO_FEW, Comparison, compare, document, signed
+from trilane.apps.compare.difference import Chance, Difference, Finding
 from trilane.apps.compare.gate import GatedPair, LimitOutcome, judge, read_gate, whole
 from trilane.apps.compare.pages import comparison_page
-from trilane.apps.compare.rows import Figure, noise_between, remarks
+from trilane.apps.compare.rows import SHARE, Figure, noise_between, remarks
 from trilane.apps.compare.run_frames import Key, frames_of
 from trilane.apps.compare.sides import Change, ComparedRun, RunKind, Side, changes, compared_run, read_side, read_told
 from trilane.errors import BadInputError
@@ -328,6 +328,21 @@ def test_a_report_without_a_journal_has_summaries(make: Make) -> None:
     assert found.rows[Figure("frame time", "", "", "p99", "ms")].probability is None
 
 
+def test_imported_wall_times_alone_are_compared_by_the_frame_time(tmp_path: Path) -> None:
+    sides = []
+    for mean_ms in (10.0, 10.2):
+        path = tmp_path / f"{mean_ms}.json"
+        row = {"name": "frame", "kind": "wall", "count": 1000, "mean_ms": mean_ms, "sd_ms": 0.01}
+        path.write_text(json.dumps({"measurements": [row]}), encoding="utf-8")
+        sides.append(read_side(str(path)))
+    assert compare(*sides).verdict.startswith("cannot tell: frame time +2 % (")
+
+
+def test_the_interval_of_a_share_is_in_points_as_the_share_is() -> None:
+    row = Difference(0.10, 0.14, 0.04, 0.0204, 0.0596, 0.01, is_ratio=False)
+    assert signed(row, SHARE) == "+4 points (2.04 to 5.96)"
+
+
 def test_predictions_of_one_chip_share_the_models_error(tmp_path: Path) -> None:
     def prediction(name: str, mean: float, chip: str) -> ComparedRun:
         times = {"mean": mean, "p50": mean, "p90": mean, "p99": mean, "low": mean * 0.9, "high": mean * 1.1}
@@ -506,6 +521,8 @@ def test_what_a_journal_says_of_a_run_is_what_its_report_says(tmp_path: Path) ->
     broken = killed(tmp_path / "b", run, {"config": [1]})
     with pytest.raises(BadInputError, match=r"config: found \[1\], expected names and their values"):
         read_side(str(broken))
+    with pytest.raises(BadInputError, match="a configuration of another form"):
+        read_side(str(killed(tmp_path / "c", run, {"config": {"units": []}})))
 
 
 @pytest.mark.parametrize("name", ["report.json", NAME])

@@ -11,6 +11,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
 from PIL import Image
@@ -18,7 +19,15 @@ from PIL import Image
 pytest.importorskip("prometheus_client", reason="the extra dashboard is not installed")
 
 from support.run_report import make_report
-from trilane.apps.dashboard.finished_view import CUT_OFF, MOST_JOBS, NO_VIDEO, PIECE_ROWS, FinishedView, TimeTable
+from trilane.apps.dashboard.finished_view import (
+    CUT_OFF,
+    MOST_JOBS,
+    NO_VIDEO,
+    PIECE_ROWS,
+    FinishedView,
+    TimeTable,
+    _RunPictures,
+)
 from trilane.apps.dashboard.run_facts import facts_of_report
 from trilane.apps.dashboard.view import Client, ControlSaid, Seek
 from trilane.apps.run.report import Report
@@ -165,3 +174,24 @@ def test_rows_of_a_time_are_found_among_many() -> None:
     assert last is not None and int(last["number"]) == 8191 and early is None
     table.close()
     assert MOST_JOBS > PIECE_ROWS
+
+
+def test_a_damaged_or_silent_video_has_no_pictures(tmp_path: Path) -> None:
+    segment = Segment(tmp_path / "whole.mp4", FPS, 64, 64)
+    noise = np.random.default_rng(1)
+    for frame in range(FRAMES):
+        segment.add(frame, noise.integers(0, 255, (64, 64, 3), np.uint8))
+    segment.close()
+    content = (tmp_path / "whole.mp4").read_bytes()
+    (tmp_path / "damaged.mp4").write_bytes(content[: len(content) // 2])
+    damaged = _RunPictures(tmp_path / "damaged.mp4", FPS)
+    assert damaged.jpeg(0) is not None or damaged.is_missing
+    assert damaged.jpeg(FRAMES - 1) is None
+    damaged.close()
+    with av.open(str(tmp_path / "sound.mp4"), "w") as container:
+        stream = container.add_stream("aac", rate=48000)
+        sound = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), "fltp", "mono")
+        sound.rate = 48000
+        container.mux(stream.encode(sound))
+        container.mux(stream.encode(None))
+    assert _RunPictures(tmp_path / "sound.mp4", FPS).is_missing

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import io
 import os
-from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 pytest.importorskip("prometheus_client", reason="the extra dashboard is not installed")
 
@@ -19,6 +21,7 @@ from trilane.apps.dashboard.app import DashboardApp
 from trilane.apps.dashboard.channel import RunBegins, StateIs
 from trilane.apps.dashboard.live_server import RECORDS_AT_ONCE, LiveView
 from trilane.apps.dashboard.run_facts import RunFacts
+from trilane.apps.dashboard.view import Client
 from trilane.pipeline.journal import NAME, JournalWriter, journal_of
 from trilane.scheduler.events import Settings, chain
 from trilane.scheduler.virtual import simulate
@@ -28,11 +31,16 @@ GRAPH = chain([("pose", "cpu"), ("raster", "gpu")], "double", "raster")
 
 
 @pytest.fixture
-def view() -> Iterator[LiveView]:
+def window() -> LiveWindow:
     fd = create_window(8, 8)
     window = LiveWindow(fd, 8, 8)
     os.close(fd)
-    yield LiveView(window, lambda _asked: True)
+    return window
+
+
+@pytest.fixture
+def view(window: LiveWindow) -> LiveView:
+    return LiveView(window, lambda _asked: True)
 
 
 def begin(folder: Path, frames: int = 3) -> RunBegins:
@@ -77,6 +85,18 @@ def test_a_run_that_was_over_before_anybody_looked_is_shown(view: LiveView, tmp_
         return names([message for _ in range(2) for message in await view.news(is_watched=True)])
 
     assert asyncio.run(watched()) == ["short.1.partial"]
+
+
+def test_a_frame_of_a_new_run_is_not_the_old_runs_picture(view: LiveView, window: LiveWindow) -> None:
+    def shade(of: int, sampled_ns: int) -> float:
+        window.show(0, 0.0, sampled_ns, np.full((8, 8, 3), of, np.uint8))
+        view._picture_s = 0.0
+        data = asyncio.run(view.picture(Client(None, lambda: None)))  # type: ignore[arg-type]
+        assert data is not None
+        return float(np.asarray(Image.open(io.BytesIO(data[21:]))).mean())
+
+    assert shade(40, 1) == pytest.approx(40, abs=1)
+    assert shade(200, 2) == pytest.approx(200, abs=1)
 
 
 def test_a_server_that_cannot_tell_the_news_ends_and_says_why(

@@ -65,3 +65,14 @@ def test_runs_and_calls_stand_beside_their_predictions(monkeypatch: pytest.Monke
     ]
     assert found["run"]["of"] == found["network"]["of"] == 2
     assert found["run"]["median_error"] == pytest.approx(1 / 6)
+
+
+def test_a_single_row_has_no_other_rows() -> None:
+    found = summary([row(0.1, True)])
+    assert (found["of"], found["inside"], found["inside_left_out"]) == (1, 1, None)
+
+
+@pytest.mark.parametrize("width", [0, 257])
+def test_a_width_that_no_network_has_is_refused(width: int) -> None:
+    with pytest.raises(BadInputError, match=f"width: found {width}"):
+        measure(width=(8, width))

@@ -192,7 +192,9 @@ def test_all_figures_of_a_picture() -> None:
         "iou": 0.0,
         "lpips": None,
     }
-    assert figures(grey(0.5), grey(0.5), lpips=lambda *_: 7.0).lpips == 0
+    for side, lpips in ((LEAST_LPIPS_PX - 1, None), (LEAST_LPIPS_PX, 0.0)):
+        equal = np.full((side, 80, 3), 0.5)
+        assert figures(equal, equal, lpips=lambda *_: 7.0).lpips == lpips
     assert figures(grey(0.5), nearly, lpips=lambda a, b: float(b[0, 0, 0] - a[0, 0, 0])).lpips == pytest.approx(1e-12)
     plain = figures(grey(0.5), grey(0.5))
     assert plain.dice is None and plain.iou is None

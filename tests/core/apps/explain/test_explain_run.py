@@ -19,6 +19,7 @@ from trilane.apps.explain.explained_run import (
     ExplainedRun,
     JoinInput,
     Joins,
+    _cores_allowed,
     explain_frame,
     explain_run,
     join_text,
@@ -304,6 +305,16 @@ def test_a_journal_that_contradicts_itself_is_refused(
         if record is not None:
             journal.add(record)
     assert found in command("explain", folder, code=2)[1]
+
+
+@pytest.mark.parametrize("of_machine", [5, {"cpu": 5}, {"cpu": {"cores_allowed": 5}}])
+def test_a_machine_of_another_form_is_as_one_that_is_not_known(tmp_path: Path, of_machine: object) -> None:
+    begun = Begun(1, application_graph(), Settings(3), {"machine": of_machine})
+    with JournalWriter(tmp_path / NAME) as journal:
+        journal.add(begun)
+    assert explain_run(tmp_path).frames == 0
+    assert _cores_allowed(begun) == 0
+    assert _cores_allowed(begun._replace(facts={"machine": {"cpu": {"cores_allowed": [0, 2, 5]}}})) == 3
 
 
 def test_a_folder_without_a_journal_is_refused(folder: Path, tmp_path: Path, command: Command) -> None:

@@ -280,6 +280,15 @@ def test_a_killed_run_ends_where_its_journal_does() -> None:
     assert trace.of("clock/run")[0].end_ns == 10 * MS + 5
 
 
+@pytest.mark.parametrize("value", [1e300, -1e300, float(1 << 63)])
+def test_a_counter_beyond_64_bits_is_written_as_a_real_number(value: float) -> None:
+    large = [
+        one._replace(figures={"bytes_read": value}) if isinstance(one, Worked) and one.job.frame == 0 else one
+        for one in BY_HAND
+    ]
+    assert trace_of(iter(large)).counts["trilane, virtual clock/u/a/bytes read"][0] == (7, value)
+
+
 def test_chrome_json_has_the_same_slices_and_counters() -> None:
     for name in ("pipelined", "latest", "deaths"):
         trace, text = trace_of(records_of(run_named(name))), io.StringIO()

@@ -9,6 +9,8 @@ import shutil
 import zlib
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import av
 import numpy as np
@@ -19,7 +21,7 @@ from PIL import Image
 from support.run_report import make_report
 from support.small_inputs import bvh_text, nerf_text, picture, write_small_inputs
 from trilane.apps.cli.inspect import lines
-from trilane.apps.inspect import inspection
+from trilane.apps.inspect import inspection, readers
 from trilane.apps.inspect.inspect_file import inspect_file, kind_of
 from trilane.apps.inspect.inspection import Length, drawn_cameras, drawn_skeletons
 from trilane.avatars.bundle import bundle_folder
@@ -132,6 +134,15 @@ def test_a_film_whose_tags_are_no_text_is_read(inputs: dict[str, Path], tmp_path
     assert inspect_file(tmp_path / "a.mkv").usable
 
 
+def test_a_film_without_a_frame_to_draw_says_so(inputs: dict[str, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    none = SimpleNamespace(at=lambda _time_s: None, close=lambda: None)
+    monkeypatch.setattr(readers, "open_background", lambda *_: none)
+    draw = inspect_file(inputs["film.mkv"]).draw
+    assert draw is not None
+    with pytest.raises(BadInputError, match=r"film.mkv: found no frame that can be decoded"):
+        draw()
+
+
 def test_lengths() -> None:
     assert Length.of(np.array([0.0])) == Length(1, 0.0, None)
     assert Length.of(np.array([1.0, 1.5, 2.0, 4.0])) == Length(4, 3.0, 2.0)
@@ -146,6 +157,7 @@ REFUSED: dict[str, tuple[bytes, str, str, str]] = {
     "a cut BVH": (bvh_text().encode()[:300], "a.bvh", "a motion", ""),
     "a cut NeRF": (nerf_text().encode()[:300], "a.json", "a broken JSON file", "again"),
     "a table of four columns": (b"1 2 3 4\n2 3 4 5\n", "a.txt", "a camera, by its content", ""),
+    "a text as a trace": (b"Dear reader,\n", "t.perfetto-trace", "a trace", ""),
     "a picture that ends early": (b"\x89PNG\r\n\x1a\n", "a.png", "a picture", ""),
 }
 
@@ -200,17 +212,35 @@ def test_runs_and_reports(tmp_path: Path) -> None:
     assert inspect_file(tmp_path / "trace.json").facts == {"events": 2}
 
 
+def test_a_run_that_presented_nothing_is_of_no_frame(tmp_path: Path) -> None:
+    report = make_report(fps=None)
+    for presented, words in ((0, "no frame"), (1, "one frame")):
+        report["frames"] |= {"requested": presented + 2, "presented": presented}
+        (tmp_path / "report.json").write_text(json.dumps(report))
+        assert inspect_file(tmp_path / "report.json").what == f"the report of {words} on the host clock"
+
+
 def test_the_packets_of_a_trace_count_also_in_compressed_blocks(tmp_path: Path) -> None:
     plain = Trace(packet=[TracePacket(timestamp=at) for at in range(1, 4)]).SerializeToString()
     block = Trace(packet=[TracePacket(compressed_packets=zlib.compress(plain))]).SerializeToString()
-    path = tmp_path / "trace.pftrace"
-    path.write_bytes(plain + block + block)
-    found = inspect_file(path)
-    assert (found.what, found.facts) == ("a trace of 9 events", {"events": 9})
+    for name in ("trace.perfetto-trace", "trace.PFTRACE"):
+        path = tmp_path / name
+        path.write_bytes(plain + block + block)
+        found = inspect_file(path)
+        assert (found.what, found.facts) == ("a trace of 9 events", {"events": 9})
     path.write_bytes(plain + Trace(packet=[TracePacket(compressed_packets=b"no zlib")]).SerializeToString())
     damaged = inspect_file(path)
     assert not damaged.usable
     assert "bytes that do not parse" in damaged.problem
+
+
+def test_a_folder_that_cannot_be_read_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(path: Path) -> Any:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "iterdir", refused)
+    with pytest.raises(BadInputError, match=f"{tmp_path}: found permission denied"):
+        inspect_file(tmp_path)
 
 
 @pytest.mark.parametrize("make", ["missing", "fifo", "loop"])

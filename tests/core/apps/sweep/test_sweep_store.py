@@ -207,3 +207,8 @@ def test_a_sweep_of_a_file_with_other_contents_is_another_sweep(tmp_path: Path) 
     chip.write_text("a = 2", encoding="utf-8")
     with pytest.raises(BadInputError, match=r"read .*chip.toml with other contents.*choose another --out"):
         opened(tmp_path / "s", trials).__enter__()
+
+
+@pytest.mark.parametrize("text", ["x" * 300, "a\0b"])
+def test_a_value_that_cannot_be_a_path_is_no_file(text: str) -> None:
+    assert module.input_digests([Trial(("run",), {"scene": text}, ())]) == {}
