@@ -40,7 +40,7 @@ CLOTHES_STANDOFF_M = 0.045
 
 @dataclass(frozen=True)
 class Bundle:
-    """A bundle whose manifest is valid, and whose files exist inside `folder`."""
+    """A bundle with a valid manifest. All files that the manifest names exist inside `folder`."""
 
     folder: Path
     manifest: Manifest
@@ -85,7 +85,7 @@ class Bundle:
         return read_texture(self.texture_path, self.manifest.network.channels)
 
     def read_levels(self) -> NDArray[np.float32] | None:
-        """Return the smaller levels of the neural texture, packed as by `pack_levels`; None if the bundle has none.
+        """Return the smaller levels of the neural texture, packed by `pack_levels`, float32; None if there are none.
 
         Raises BadInputError.
         """
@@ -127,12 +127,12 @@ def _texture_arrays(path: Path, channels: int) -> dict[str, NDArray[Any]]:
 
 
 def bundle_folder(name: str | Path) -> Path:
-    """Return the folder of a bundle. `name`: a name of `AVATARS`, for a folder of the package, or else a path."""
+    """Return the folder of a bundle. `name`: one of `AVATARS`, which have folders in the package, or else a path."""
     return Path(__file__).parent / name if str(name) in AVATARS else Path(name)
 
 
 def load_bundle(name: str | Path) -> Bundle:
-    """Return a bundle. `name`: as for `bundle_folder`. Raises BadInputError, which names file and key."""
+    """Return the bundle `name`, as for `bundle_folder`. Raises BadInputError, which names the folder, file or key."""
     folder = bundle_folder(name)
     path = folder / MANIFEST
     if not folder.exists():
@@ -173,20 +173,20 @@ def write_bundle(
 ) -> None:
     """Write a bundle to a temporary folder, read it back as a check, then move its files into `folder`.
 
-    If the validation in `manifest` was made with other files than these, it is left out.
+    The validation in `manifest` is left out if its digests do not match these files and numbers.
 
     `folder`: folder of the bundle; made when it does not exist.
-    `manifest`: manifest to write; this function adds the file names of `offsets` and `mesh_levels`.
+    `manifest`: manifest to write; this function sets the file names of `offsets` and `mesh_levels`, or None.
     `body`: .npz file of the body, which is copied.
     `texture`: (H, W, C) float16, or int8 with `scale`.
     `network`: network to write.
     `scale`: scale of each channel of an int8 texture, (C,) float32; None for a float16 texture.
     `offsets`: offsets of the body's vertices at rest, (V,3) metres; None for a body that is drawn bare.
-    `levels`: smaller levels of the texture, packed by `pack_levels`, with the dtype of the texture; None: there are
-    none.
+    `levels`: smaller levels of the texture, packed by `pack_levels`, with the texture's dtype; None without levels.
     `mesh_levels`: coarser levels of the mesh, made for this body with these `offsets` and the manifest's shape.
 
-    Raises BadInputError if the parts do not fit together; then nothing is written.
+    Raises BadInputError if the parts do not fit together, with `folder` unchanged, or if a file cannot be written.
+    Raises OSError if `body` cannot be read.
     """
     with write_folder(folder) as draft:
         shutil.copyfile(body, draft / manifest.body)
@@ -214,7 +214,7 @@ def write_bundle(
 
 
 def add_mesh_levels(bundle: Bundle, levels: Sequence[MeshLevel]) -> None:
-    """Write `levels` of the mesh into the folder of `bundle`, and replace any levels there. Raises BadInputError."""
+    """Write `levels` of the mesh into `bundle`, in place of any levels there. Raises BadInputError."""
     shaped = bundle.shaped_body()
     with write_atomically(bundle.folder / MESH_LEVELS) as draft, draft.open("wb") as file:
         save_mesh_levels(file, shaped, levels)
@@ -315,7 +315,9 @@ def split_levels(packed: NDArray[Any] | None, width: int) -> list[NDArray[Any]]:
 
 
 def check_levels(packed: NDArray[Any], texture: NDArray[Any], where: object) -> None:
-    """Raise BadInputError if `packed` cannot hold the levels of `texture` (H,W,C): wrong shape, or another dtype.
+    """Raise BadInputError unless `packed` has a shape for levels of `texture` (H,W,C), and the same dtype.
+
+    H and W must be multiples of 2 ** MOST_TEXTURE_LEVELS.
 
     `packed`: array from `pack_levels`.
     `where`: file that the error names.

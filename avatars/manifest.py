@@ -1,6 +1,7 @@
 """The manifest of an avatar: name, files, scale and zero point of the network's bytes, training and validation.
 
-Rule: every number has a range and every key is known, so the read values need no further check.
+Rule: every number that a run uses has a range, so it needs no further check. Unknown keys are refused, except further
+figures of the image error.
 """
 
 from __future__ import annotations
@@ -131,7 +132,8 @@ class AccuracyFigures(_Figures):
 
     `psnr_db_by_band`: mean PSNR in dB, by band, in front of random backgrounds, in the bounding box of the true mask.
     `see_through`: share of the pixels inside the person whose alpha is less than 0.9.
-    `iou`, `ssim`: means over the views, of the masks and of the pictures.
+    `iou`: intersection over union of the masks. `ssim`: structural similarity of the pictures. Both are means over the
+    views.
 
     All further keys come from `summary` in `training/image_error.py`. A key that was not measured is None and not
     written. If `psnr_db_by_background` is None, an older Trilane measured the figures in front of a single grey.
@@ -187,7 +189,7 @@ Side = Annotated[int, Field(ge=8, le=MAX_SIDE)]
 
 
 class BySize(_Figures):
-    """Image error by size of the tensor, at the density of the picture: the planner's table.
+    """Image error by the sizes of body and tensor, from which the planner takes its curve.
 
     `date`: date in UTC. `runtime`: runtime that ran the network. `seed`, `per_band`, `held_out`: choice of the views.
     `psnr_db_by_picture`: mean PSNR in dB inside the bounding box of the true mask, by two sides, in pixels. The first
@@ -228,12 +230,13 @@ class Validation(AccuracyFigures):
     The first four keys are None in a manifest that an older Trilane wrote.
 
     `date`: day of the validation in UTC.
-    `digests`: digests of the validated files.
+    `digests`: digests of the validated files and numbers.
     `figures_digest`: digest of all other keys here, by the function `figures_digest`.
     `made_with`: software that measured the figures.
     `runtime`: runtime of the figures in `integer`. The keys of `AT_THE_TOP` repeat these figures.
     `size`: tensor size, as `trilane run --size` takes it.
     `texture_filter`: filter of the neural texture.
+    `other_runtimes`: figures on other runtimes, by runtime.
     `by_size`: image error by tensor size; None if it was not measured.
     More keys: `per_band`, number of views of each band and seed; `held_out`, origin of each motion, by name; `float`,
     figures of the network before it was quantised; `psnr_loss_db`, loss of PSNR by quantising, by band.
@@ -345,7 +348,7 @@ def figures_digest(validation: Validation) -> str:
 
 
 def with_figures_digest(validation: Validation) -> Validation:
-    """Return `validation`, newly measured, with its digest of figures as `figures_digest`."""
+    """Return a newly measured `validation` with its key `figures_digest` set."""
     return validation.model_copy(update={"figures_digest": figures_digest(validation)})
 
 

@@ -106,7 +106,7 @@ def constants_of(model: onnx.ModelProto) -> Mapping[str, TensorProto]:
 
 
 def check_integer_layers(network: IntegerNetwork) -> None:
-    """Raise BadInputError if a layer that `float_layers` does not list has inputs that are not dequantised integers."""
+    """Raise BadInputError if a layer (LAYERS) that `float_layers` does not list has float data or float weights."""
     makers = {out: node for node in network.model.graph.node for out in node.output}
     float_layers = []
     for node in network.model.graph.node:
@@ -180,7 +180,7 @@ def check_network(model: onnx.ModelProto, where: str) -> NetworkFile:
 
 
 def _check_order(graph: onnx.GraphProto, where: str) -> None:
-    """Raise BadInputError unless each node has inputs and outputs, and makes tensors once, before they are read."""
+    """Raise BadInputError unless tensors are made once, before they are read, and nodes have inputs and outputs."""
     seen: set[str] = set()
     for node in graph.node:
         if not node.output or not (node.input or node.op_type == "Constant"):
@@ -319,7 +319,7 @@ def reshaped(network: NetworkFile, height: int, width: int, batch: int = 1) -> N
 
     `height`, `width`: size of the input in pixels, multiples of BUCKET_STEP.
     `batch`: number of frames that are inferred together.
-    Raises BadInputError if the graph cannot run at this shape.
+    Raises BadInputError for sizes that are no such multiples, and if the graph cannot run at this shape.
     """
     if height % BUCKET_STEP or width % BUCKET_STEP or min(height, width, batch) < 1:
         raise BadInputError(network.where, f"shape {batch}x{height}x{width}", f"sides in multiples of {BUCKET_STEP}")
@@ -365,7 +365,7 @@ def parse_network(path: Path) -> onnx.ModelProto:
 
 
 def network_files(path: Path) -> list[Path]:
-    """Return a list of the ONNX file `path` and the files of its external data, sorted. Raises BadInputError."""
+    """Return the ONNX file `path`, then the files of its external data, sorted. Raises BadInputError."""
     kept = {_external_file(tensor, path) for tensor in _external_tensors(_parse(path))}
     return [path, *sorted(kept)]
 

@@ -42,7 +42,7 @@ class Cut:
 
     @property
     def bytes(self) -> int:
-        """Number of bytes that cross the cut for one frame."""
+        """Number of bytes that cross the cut each time the network runs."""
         return sum(math.prod(shape) for shape in self.crossing.values())
 
 
@@ -76,7 +76,7 @@ def split(network: NetworkFile, at: Sequence[str]) -> list[NetworkPart]:
     """Return the parts of `network` between the cuts `at`, in order.
 
     `at`: names of cuts, in the order of the network's nodes.
-    Raises BadInputError for an unknown cut, and for cuts in another order.
+    Raises BadInputError for an unknown cut, and for cuts that are repeated or in another order.
     """
     known = {cut.at: cut for cut in cuts(network)} if at else {}
     for name in at:

@@ -172,10 +172,10 @@ def name_of(folder: Path) -> str:
 WHOLE = 1000  # pixels of a tensor of the full size, in thousandths
 DIGITS = 2
 #: A tensor is large enough for a body if it loses at most this much of the PSNR at the best measured size, in dB: for
-#: an avatar with a network of its own, and for avatars that share a network. These share a tensor too. Each adds to the
-#: background between them, so that a tenth of a dB costs more pixels.
+#: an avatar with a network of its own, and for avatars that share a network. These share a tensor too. Background
+#: between them also takes pixels, so that a tenth of a dB costs more.
 TOLERANCE_DB, SHARED_TOLERANCE_DB = 0.04, 0.3
-#: Work of the smaller tensors whose loss is told: 3/4 and 1/2 of the sides.
+#: Pixels of the smaller tensors whose loss is stated, in thousandths of the full size: sides of 3/4 and of 1/2.
 WORKS = (563, 250)
 
 
@@ -185,8 +185,8 @@ class SizeLoss:
 
     `source`: source of the figures; without figures, why there are none and which command measures them.
     `by_work`: loss of PSNR in dB, by the tensor's pixels in thousandths of the full size; empty without figures.
-    `curve`: full size, in pixels of the tensor by pixels of the picture that the body covers, see `curve_of`. If it is
-    empty, the full size is the network's own.
+    `curve`: pairs (pixels of the picture that the body covers, pixels of the full-size tensor for such a body), from
+    `curve_of`. If it is empty, the full size is the network's own.
     """
 
     source: str
@@ -196,8 +196,8 @@ class SizeLoss:
     def at(self, work: int) -> float | None:
         """Return the loss in dB of a tensor with `work` thousandths of the full size's pixels.
 
-        The loss is 0 at the full size. For another size, it is the loss at the next smaller size that was measured;
-        None if no smaller size was measured. Without figures, the result is None.
+        The loss is 0 at the full size. For a smaller tensor, it is the loss at the largest measured size up to `work`.
+        The result is None if no such size was measured, and without figures.
         """
         if work >= WHOLE and self.by_work:
             return 0.0
@@ -252,7 +252,10 @@ def curve_of(table: Mapping[int, Mapping[int, float]], tolerance: float) -> tupl
 
 
 def psnr_at(row: Mapping[int, float], pixels: float) -> float | None:
-    """Return the PSNR in dB of a tensor of `pixels`, interpolated in their logarithm; None if outside `row`."""
+    """Return the PSNR in dB of a tensor of `pixels`, interpolated in their logarithm; None outside the measured sizes.
+
+    `row`: measured PSNR in dB, by side of a square tensor in pixels.
+    """
     sides = sorted(row)
     if not sides[0] ** 2 <= pixels <= sides[-1] ** 2:
         return None
@@ -260,9 +263,9 @@ def psnr_at(row: Mapping[int, float], pixels: float) -> float | None:
 
 
 def _losses(table: Mapping[int, Mapping[int, float]], curve: Sequence[tuple[int, int]]) -> dict[int, float]:
-    """Return the mean loss over the bodies of `table`, by work; a work that was not measured for any body is left out.
+    """Return the mean loss of PSNR in dB over the bodies of `table`, by size of the tensor, one of WORKS.
 
-    A smaller tensor never counts as better.
+    A size that was measured for no body is left out. A smaller tensor never counts as better. `curve`: from `curve_of`.
     """
     losses = {}
     for work in WORKS:

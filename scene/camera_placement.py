@@ -136,9 +136,9 @@ def steered(view: F64, pivot: F64, azimuth_deg: float, elevation_deg: float, zoo
     """Return `view` after the camera is turned about `pivot` (3,) and moved towards it.
 
     `view` and the result: transform (4, 4) from world to camera.
-    `azimuth_deg`: turn of the camera to the right about the vertical, degrees.
-    `elevation_deg`: turn of the camera upwards, degrees.
-    `zoom`: factor by which the camera comes nearer, above 0.
+    `azimuth_deg`: angle by which the camera moves to its right round the pivot, degrees.
+    `elevation_deg`: angle by which the camera moves up, degrees; limited as in `_turn`.
+    `zoom`: factor by which the distance to the pivot is divided, above 0.
     """
     if azimuth_deg == 0.0 and elevation_deg == 0.0 and zoom == 1.0:
         return view
@@ -182,9 +182,10 @@ LEAST_GAIN = 0.02
 
 
 def place_camera(path: CameraPath, scene: Scene, movers: Sequence[Mover], bodies: Sequence[ShapedBody]) -> PlacedCamera:
-    """Return the camera of `scene` at its place. A recorded camera films the avatars; a built-in camera goes along.
+    """Return the camera of `scene`, in its place. A recorded camera is set down where it films the avatars.
 
-    A camera stays where it is if `scene.camera.place` is `none`.
+    A built-in camera goes along with the avatars if they would leave its picture otherwise. If `scene.camera.place` is
+    `none`, the camera stays where it is.
     `path`: path of the camera.
     `scene`: its background, picture size and camera keys are used.
     `movers`: avatars of the scene. `bodies`: their bodies, in the same order.

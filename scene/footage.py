@@ -263,7 +263,7 @@ def _with_photos(
 ) -> tuple[tuple[CameraPath, tuple[Stored, ...]] | None, tuple[str, ...]]:
     """Match the poses of `path` to photos of `footage` by name.
 
-    Return ((path, photos), notes), with the path without the poses whose photo is missing. If no photo matches, None
+    Return ((path, photos), notes). Poses whose photo is missing are removed from the path. If no photo matches, None
     takes the place of (path, photos).
     """
     if not path.pictures or not footage.files:
@@ -297,8 +297,8 @@ def _by_clock(
 ) -> tuple[tuple[CameraPath, tuple[Stored, ...]], tuple[str, ...]] | None:
     """Match the pictures of `footage` to times of `path` by their clocks.
 
-    Return ((path, pictures), notes), with the path sampled at the times of the pictures that were taken during it. The
-    result is None if there are no such pictures.
+    Return ((path, pictures), notes): the pictures that were taken during the camera's recording, and the path sampled
+    at their times. The result is None if there are no such pictures, or if the camera's file states no clock.
     """
     if path.began_s is None:
         return None

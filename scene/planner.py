@@ -270,7 +270,8 @@ def foreseen_changes(
     `networks`: number of the network of each avatar of the scene; empty if one network paints all.
 
     The result is the sequence of good shapes that costs least: the pixels of all frames, plus the cost of the changes.
-    If a shape is not good in an examined frame, the next shape begins right after the examined frame before.
+    Usually a new shape begins at an examined frame. It begins right after the previous examined frame if nobody was
+    visible there, or if the old shape is no longer good.
     """
     order = sorted(shapes, key=lambda shape: (area(shape), shape))
     costs, origins, needed = dict.fromkeys(order, 0.0), [], []
@@ -299,8 +300,9 @@ def _cheapest_way(
 ) -> tuple[float, Shape]:
     """Return the least cost, in pixels, of a sequence of shapes that ends with `shape`, and the shape before it.
 
-    Pixels from this examined frame on do not count yet. `costs`: least cost up to the examined frame before, by shape.
-    `fits`: layout of each shape with room for the avatars. `price`: least cost of a change of shape, in pixels.
+    Pixels from this examined frame on do not count yet.
+    `costs`: least cost by shape, up to the previous examined frame. `fits`: layout of each shape with room for the
+    avatars. `price`: least cost of a change of shape, in pixels.
     """
 
     def change(origin: Shape) -> float:

@@ -242,7 +242,7 @@ class CameraSpec(Table):
 
     @model_validator(mode="after")
     def _is_of_a_file(self) -> Self:
-        """Refuse keys that say how a file is read if the camera is built in."""
+        """Raise UnexpectedValue if a built-in camera has a key that says how a camera file is read."""
         for key in FILE_KEYS if self.source.startswith(BUILT_IN_PREFIX) else ():
             value = getattr(self, key)
             if value != type(self).model_fields[key].default:
@@ -367,7 +367,7 @@ class Scene(Table):
     @field_validator("avatars")
     @classmethod
     def _avatars_named(cls, avatars: tuple[AvatarSpec, ...]) -> tuple[AvatarSpec, ...]:
-        """Give each avatar without a name the name `avatarN`, and refuse equal names."""
+        """Give each avatar without a name the name `avatarN`. Raises UnexpectedValue for equal names."""
         places: dict[str, int] = {}
         for place, avatar in enumerate(avatars):
             name = avatar.name or f"avatar{place + 1}"
@@ -470,7 +470,10 @@ def scene_names() -> list[str]:
 
 
 def find_scene(name: str) -> Path:
-    """Return the file of a scene. `name`: path of a `.toml` file, or name of a bundled scene. Raises BadInputError."""
+    """Return the file of a bundled scene `name`, or `name` as the path of a `.toml` file, which need not exist.
+
+    Raises BadInputError for any other name.
+    """
     if name in scene_names():
         return SCENES / f"{name}{ENDING}"
     path = Path(name)

@@ -38,7 +38,7 @@ from trilane.scene.visibility import seen_at, seen_notes
 
 @dataclass(frozen=True)
 class Staged:
-    """A staged scene.
+    """The movers and the camera of a scene, in their places.
 
     `movers`: one per avatar of the scene, in order. `camera`: camera at its place. `notes`: what was decided about
     motions, places, floor and camera, for people.
@@ -217,8 +217,8 @@ def require_person(
     """Raise BadInputError if the recorded camera of `staged` does not show the person; the remedy names a key.
 
     Half of the examined frames must show the whole bodies if the camera was placed, or a part of a body otherwise.
-    `staged`: result of `stage_scene` for the other parameters. `say`: function that is called with each note and then
-    with a message, before other values are tried, which takes up to a minute.
+    `staged`: result of `stage_scene` for the other parameters. `say`: function that is called with each note and with a
+    message. After that, other values are tried for up to a minute.
     """
     if not staged.camera.path.recorded:
         return
@@ -240,7 +240,8 @@ def _shares(
 ) -> tuple[float, float]:
     """Return (share of the frames in which `camera` shows the bodies, mean height of the bodies).
 
-    The height is a share of the picture's height.
+    Only whole bodies count if the camera is placed; otherwise any part of a body counts. The height is a share of the
+    picture's height.
     """
     times = np.linspace(0.0, (scene.frames - 1) / scene.fps, min(MOST_JUDGED, scene.frames))
     seen = seen_at(times, camera, movers, bodies, (scene.output.height, scene.output.width))

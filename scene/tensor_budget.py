@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from trilane.arrays import BUCKET_STEP, Shape
 from trilane.scene.crop import Rect, covered, tight_shape
 
-#: Pixels of the tensor by pixels of the picture that a body covers: (picture, tensor), ascending, at least one.
+#: Pairs (pixels of the picture that a body covers, pixels of the tensor for such a body), ascending, at least one.
 Curve = tuple[tuple[int, int], ...]
 #: Largest density, tensor pixels per picture pixel along a side: with more, the picture is no nearer to the truth.
 MOST_DENSITY = 2.25

@@ -224,9 +224,10 @@ def _spread(count: int) -> F64:
 class Filming:
     """The recorded camera and the bodies at the F moments at which places are scored.
 
-    `eyes` (F, 3), `turns` (F, 3, 3): positions of the camera, and its axes as columns, in the world of the recording.
-    `lenses` (F, 2, 2): for x and y, a factor and an addend: ndc = factor * x / depth + addend.
-    `points` (F, P, 3): outermost points of the bodies in the scene.
+    `eyes` (F, 3): positions of the camera in the world of the recording, metres.
+    `turns` (F, 3, 3): the camera's axes (x right, y up, z back) in that world, as columns.
+    `lenses` (F, 2, 2): for x and for y, (factor, addend): ndc = factor * x / depth + addend, in the camera's axes.
+    `points` (F, P, 3): outermost points of the bodies in the scene, metres.
     `nearest_m`: least depth at which a body is seen, metres.
     """
 
@@ -249,7 +250,7 @@ def filming(path: CameraPath, mount: F64, times_s: F64, output: Shape, points: F
     `times_s` (F,): the moments, in seconds of the path.
     `output`: (height, width) of the picture.
     `points` (F, P, 3): outermost points of the bodies at the moments, in the scene.
-    `near_m`: distance of the near clip plane, metres. A body is seen from the larger of this depth and NEAREST_M on.
+    `near_m`: distance of the near clip plane, metres. Bodies nearer than that or than NEAREST_M are not seen.
     """
     poses = [path.pose(float(t_s)) for t_s in times_s]
     clips = np.stack([path.projection(float(t_s), output) for t_s in times_s])
@@ -348,10 +349,7 @@ def _reaches(film: Filming, rows: F64) -> tuple[F32, F32]:
 
 
 def facing(film: Filming, places: F64) -> F64:
-    """Return the angle (S,), radians, by which the scene is turned about +Y at each of `places` (S, 3).
-
-    At this angle the scene's +Z points to the first eye.
-    """
+    """Return the angles (S,), radians about +Y, at which +Z of a scene at `places` (S, 3) points to the first eye."""
     towards = film.eyes[0] - places
     return np.asarray(np.arctan2(towards[:, 0], towards[:, 2]))
 

@@ -2,8 +2,8 @@
 
 Poses are world to camera with optical axes (x right, y down, looks along +Z). Views are in the order of their photos'
 names. The map has no unit, no vertical axis and no times. Distortion is left out and noted. Format:
-https://colmap.github.io/format.html, https://colmap.github.io/cameras.html. The numbers of camera models are those in
-COLMAP's `sensor/models.h`.
+https://colmap.github.io/format.html, https://colmap.github.io/cameras.html. Camera models have the numbers of COLMAP's
+`sensor/models.h`.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class ColmapCamera:
         return Lens(self.width_px, self.height_px, fx, fy, v["cx"], v["cy"])
 
     def bent(self) -> Bent:
-        """Return the lens with its distortion."""
+        """Return the lens with its distortion by the parameters k and p; other distortion is left out."""
         parameters = {key: value for key, value in self.values.items() if key[0] in "kp"}
         return Bent(self.lens(), parameters, BY_NAME[self.model].is_fisheye)
 
@@ -96,7 +96,7 @@ def checked_camera(
 ) -> ColmapCamera:
     """Return a camera of `model` with the parameters `values`. `size`: (width, height) in pixels.
 
-    Raises BadInputError about `where`, the place in the file, when the numbers are not plausible.
+    Raises BadInputError when the numbers are not plausible. `where`: file, and line or camera in it, for the message.
     """
     if len(values) != len(model.parameters):
         raise BadInputError(where, f"{len(values)} parameters", f"{len(model.parameters)} of {model.name}")
@@ -312,7 +312,10 @@ def _read(folder: Path, ending: str) -> tuple[dict[int, ColmapCamera], list[Colm
 def _lenses(
     where: Path, views: Sequence[ColmapImage], cameras: Mapping[int, ColmapCamera]
 ) -> tuple[tuple[Lens, ...], tuple[str, ...]]:
-    """Return (one lens for all views or one for each, without distortion; notes on the distortion)."""
+    """Return (one lens for all views or one for each, without distortion; notes on the distortion).
+
+    Raises BadInputError about `where` if a view has an unknown camera.
+    """
     for image in views:
         if image.camera not in cameras:
             raise BadInputError(f"{where}: {image.name}", f"camera {image.camera}", "a camera of the model")

@@ -141,7 +141,7 @@ OF_FILES = (
 
 
 def detect(path: Path, up_axis: str = AUTO, axes: str = AUTO) -> Guess:
-    """Return the format of `path`. Raises BadInputError for an unknown format, or when two formats fit.
+    """Return the format of `path`, and the reason. Raises BadInputError if the format is unknown, or if two fit.
 
     `up_axis`, `axes`: keys of the scene's camera: the axis that is up, and the directions of x, y and z of a pose.
     """
@@ -242,10 +242,12 @@ def _unevenness(column: F64) -> float:
 
 
 def _of_matrices(path: Path, numbers: F64, up_axis: str, axes: str) -> Guess:
-    """Return the format of a table of 3x4 matrices, KITTI or ARKit. `numbers`: (N, 12), or (N, 13) with times.
+    """Return the format of a table of 3x4 matrices, KITTI or ARKit.
 
-    Cameras of KITTI and ARKit look along opposite axes. Therefore poses that fit both formats raise BadInputError,
-    unless the scene states `axes`.
+    `numbers`: (N, 12); (N, 13) if a time or a frame's number comes first.
+
+    Cameras of KITTI and ARKit look along opposite axes. Therefore, unless the scene states `axes`, poses that may
+    belong to the other format raise BadInputError. Transposed or inexact matrices, and misplaced times, raise it too.
     """
     matrices = numbers[:, -MATRIX:].reshape(-1, 3, 4)
     rows = numbers[sound := are_rotations(matrices[:, :, :3])]
@@ -370,7 +372,10 @@ def _signs(matrices: F64, up_axis: str, times: F64 | None) -> dict[str, tuple[st
 
 
 def _along(turns: F64, places: F64) -> float:
-    """Return the mean cosine, weighted by length, of steps of `places` (N, 3) with Z of `turns`; 0 without movement."""
+    """Return the mean cosine between steps of `places` (N, 3) and Z of `turns` (N, 3, 3), weighted by step length.
+
+    The result is 0 without movement, and for fewer than LEAST_ROWS poses.
+    """
     steps = np.diff(places, axis=0)
     length = float(np.linalg.norm(steps, axis=1).sum())
     return float((steps * turns[:-1, :, 2]).sum()) / length if length > 0 and len(turns) >= LEAST_ROWS else 0.0
@@ -379,7 +384,7 @@ def _along(turns: F64, places: F64) -> float:
 def _missed(turns: F64, places: F64) -> float:
     """Return by how much lines of sight miss the point that the cameras go round, as a share of its distance.
 
-    The result is infinite if there is no such point. Axes are OpenGL's.
+    The result is infinite if there is no such point, or if it is nearer than LEAST_AWAY. Axes are OpenGL's.
     """
     point = meeting_point(turns, places) if len(turns) >= LEAST_ROWS else None
     if point is None:
@@ -495,7 +500,10 @@ def _read(kind: str, path: Path, spec: CameraSpec) -> RawCamera:
 
 
 def _axes(kind: str, stated: str) -> F64:
-    """Return the directions of the camera's OpenGL axes, as columns (3, 3), in the coordinates of a pose."""
+    """Return the directions of the camera's OpenGL axes, as columns (3, 3), in the coordinates of a pose.
+
+    `kind`: format of the file. `stated`: `axes` of the scene's camera, or AUTO for the usual axes of the format.
+    """
     axes = axes_of(stated)
     if axes is None:
         return np.eye(3) if kind in OPENGL_KINDS else OPENGL_FROM_OPTICAL

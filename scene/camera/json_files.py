@@ -63,11 +63,11 @@ NO_LENS_REMEDY = "cut the pictures into perspective ones first (ns-process-data 
 
 
 def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
-    """Read a NeRF `transforms.json`, or its folder: `frames[].transform_matrix`, 4x4, usually Z up, no times.
+    """Read a NeRF `transforms.json`; `path` is the file or its folder. Each frame has a 4x4 `transform_matrix`.
 
-    A frame may have its own lens; otherwise the lens of the file holds. A lens is an angle, or `fl_x`, `fl_y`, `cx`,
-    `cy` in pixels of `w` x `h`. Distortion is left out and noted. nerfstudio makes such files from the exports of
-    Polycam and Record3D.
+    Usually Z is up. There are no times. A frame may have its own lens; otherwise the lens of the file holds. A lens is
+    an angle, or `fl_x`, `fl_y`, `cx`, `cy` in pixels of `w` x `h`. Distortion is left out and noted. nerfstudio makes
+    such files from the exports of Polycam and Record3D.
     `rate_hz`: frames a second by the scene; None if the scene does not say. Raises BadInputError that names the key.
     Format: https://docs.nerf.studio/quickstart/data_conventions.html.
     """
@@ -103,7 +103,10 @@ def load_nerf(path: Path, rate_hz: float | None = None) -> RawCamera:
 
 
 def _nerf_lenses(path: Path, content: Mapping[str, Any], frames: Sequence[Any]) -> tuple[tuple[Lens, ...], str]:
-    """Return (one lens for all views, or one for each if any view has its own keys; source of the lenses in words)."""
+    """Return (one lens for all views, or one for each if any view has its own keys; source of the lenses in words).
+
+    `content`: object of the file. `frames`: views in it. Raises BadInputError if a camera is no perspective camera.
+    """
     for keys in (content, *frames):
         model = str(keys.get("camera_model", ""))
         if any(word in model.upper() for word in NO_LENS):
@@ -119,7 +122,12 @@ def _nerf_lenses(path: Path, content: Mapping[str, Any], frames: Sequence[Any]) 
 def _distortion(
     path: Path, content: Mapping[str, Any], frames: Sequence[Any], lenses: Sequence[Lens]
 ) -> tuple[str, ...]:
-    """Return a note on the largest distortion of `lenses`, which is not drawn; () below LEAST_BEND_PX pixels."""
+    """Return a note on the largest distortion of `lenses`, which is not drawn; () below LEAST_BEND_PX pixels.
+
+    `content`: object of the file, with the distortion of all views. `frames`: views, whose own keys come first.
+    `lenses`: one lens for all views, which has the first view's distortion, or one for each. Raises BadInputError if a
+    parameter of the distortion is no finite number.
+    """
     bent = []
     for lens, frame in zip(lenses, frames, strict=False):  # a single lens stands for all frames
         keys = {**content, **frame}
@@ -181,7 +189,8 @@ def _is_singular(matrix: NDArray[np.float64]) -> bool:
 def _nerf_lens(path: Path, content: Mapping[str, Any], of: str) -> tuple[Lens, str]:
     """Return (lens of a view or of the file, its source in words).
 
-    `of`: prefix of keys in messages, such as `frames[3].`
+    `content`: keys of the file, with the view's own keys in place of the file's. `of`: prefix of keys in messages, such
+    as `frames[3].`; "" for the file's lens. Raises BadInputError if a number or the lens is not plausible.
     """
     lens, source = _measured(path, content, of)
     return checked_lens(f"{path}: {of.rstrip('.')}" if of else path, lens), source
@@ -244,7 +253,7 @@ RECORD3D = "Record3D's metadata: `poses`, `K`, `w` and `h`"
 
 
 def load_record3d(path: Path, rate_hz: float | None = None) -> RawCamera:
-    """Read Record3D's `metadata.json`, or its folder: a pose `qx qy qz qw tx ty tz`, a time and a lens per frame.
+    """Read Record3D's `metadata.json`; `path` is the file or its folder. A pose is `qx qy qz qw tx ty tz`.
 
     The world is ARKit's: levelled, Y up, metres. The lens is `perFrameIntrinsicCoeffs` (fx, fy, cx, cy), or else `K`,
     column by column, in pixels of `w` x `h`. Times are `frameTimestamps`, or else follow from `fps`.
@@ -279,7 +288,7 @@ def _array(path: Path, content: Mapping[str, Any], key: str, columns: int) -> F6
 def _times(path: Path, content: Mapping[str, Any], count: int, rate_hz: float | None) -> tuple[F64, str]:
     """Return (times of the poses (N,), seconds; their source in words). `count`: number N of poses.
 
-    Raises BadInputError for another number of times, and for a rate that cannot be.
+    Raises BadInputError if there are not N times, or if `fps` is not a number from LEAST_HZ to MOST_HZ.
     """
     if rate_hz is None and content.get("frameTimestamps"):
         values = content["frameTimestamps"]

@@ -81,8 +81,8 @@ class Optics:
     `near_m`, `far_m`: distances of the clip planes, metres.
     `filmed`: (height, width) of the background that the camera filmed, as it is shown; one for all samples or one for
     each. The tuple is empty if the camera did not film the background.
-    `turned`: number of quarter turns clockwise by which the background's pixels are shown; one for all samples or one
-    for each. The tuple is empty if each picture is shown as its file prescribes.
+    `turned`: number of quarter turns clockwise applied to the background's pixels before they are shown; one for all
+    samples or one for each. The tuple is empty if each picture is turned as its own file prescribes.
     """
 
     lenses: tuple[Lens, ...]
@@ -129,7 +129,7 @@ class CameraPath:
     `recorded`: whether the path comes from a recording, which has to be placed in the scene.
     `detected`: facts about the camera's file.
     `pictures`: name of the photo of each sample; empty if the file names none.
-    `quarter`: number of quarter turns clockwise of the camera's picture.
+    `quarter`: number of quarter turns clockwise that were applied to the camera's picture.
     `is_held`: whether each sample holds until halfway to its neighbours, as its photo does.
     `repeat_s`: time after which the path starts again, as its background does; 0 if only `wrap` counts.
     `began_s`: time 0 in seconds since 1970; None if the file does not state it.
@@ -218,8 +218,8 @@ HEAD_AND_SHOULDERS = "head and shoulders"
 class Orbit:
     """A camera that swings by `swing_deg` to either side around `target`, and moves from `far_m` to `near_m` and back.
 
-    `what`: description for people. `target`: point (x, y, z), metres. `height_m`: height of the camera.
-    `far_m`, `near_m`: horizontal distances from the target. `period_s`: duration of a cycle.
+    `what`: description for people. `target`: point (x, y, z) on the Y axis, metres. `height_m`: height of the camera.
+    `far_m`, `near_m`: horizontal distances from the Y axis. `period_s`: duration of a cycle.
     """
 
     what: str

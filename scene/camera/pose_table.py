@@ -146,7 +146,7 @@ def head_of(path: Path, columns: int, expected: str) -> NDArray[np.float64]:
 def layout_of(path: Path, expected: str) -> TableLayout:
     """Return the layout of the table `path`; it has 0 columns if the file has no line of numbers.
 
-    `expected`: expected content in words. Raises BadInputError when column names contradict each other.
+    `expected`: content in words. Raises BadInputError for column names that are contradictory or have unknown units.
     """
     named: tuple[ColumnName, ...] = ()
     first: list[str] = []
@@ -233,9 +233,10 @@ def _plain(name: str) -> str:
 def _unit_of(
     path: Path, columns: tuple[ColumnName, ...], holding: tuple[str, ...], units: Mapping[str, float], key: str
 ) -> str:
-    """Return the unit, a key of `units`, that the names of columns with a content in `holding` state; "" if none.
+    """Return the unit that column names state, a key of `units`; "" if they state none.
 
-    `key`: key of the scene that states the unit, for messages. Raises BadInputError for unknown or different units.
+    `holding`: contents of the columns that count. `key`: key of the scene that states the unit, for messages.
+    Raises BadInputError for unknown or different units.
     """
     of = [column for column in columns if column.holds in holding]
     found = [SPELLINGS.get(column.unit.lower(), column.unit) for column in of]
@@ -407,7 +408,7 @@ class PoseTable:
     `turns` (N, 3, 3), `places` (N, 3): rotations and positions, with the file's axes and unit.
     `order`: source of the order of columns, in words.
     `names`: content of each column of `table`.
-    `began_s`: time 0 in seconds since 1970; None if no clock gave the file's times.
+    `began_s`: time 0 in seconds since 1970; None if the file's times are no plausible dates.
     `lengths`: unit of the positions by the column names; "" if they state no unit.
     """
 
@@ -456,7 +457,7 @@ def read_pose_table(
 class MatrixTable(NamedTuple):
     """The poses of a table with matrices.
 
-    `times`: times of the poses; None if the table has no times.
+    `times`: times of the poses; None if the table has neither times nor frame numbers.
     `turns` (N, 3, 3), `places` (N, 3): rotations and positions, with the file's axes and unit.
     `lengths`: unit of the positions by the column names; "" if they state no unit.
     """
@@ -471,8 +472,7 @@ class MatrixTable(NamedTuple):
 def read_matrix_table(path: Path, clock: TableClock, expected: str) -> MatrixTable:
     """Return the poses of `path`: a 3x4 matrix per line, row by row, perhaps after a time or a frame number.
 
-    `clock`: what the scene says about the times. `expected`: expected content in words. Raises BadInputError with the
-    line.
+    `clock`: what the scene says about the times. `expected`: content in words. Raises BadInputError with the line.
     """
     layout = layout_of(path, expected)
     columns = MATRIX if layout.columns == MATRIX else MATRIX + 1
@@ -521,7 +521,10 @@ def _steps_off(column: F64, share: float) -> int:
 
 
 def _began(times: F64, unit: str) -> float | None:
-    """Return the first finite time of `times` in seconds since 1970; None if no clock gave the times."""
+    """Return the first finite time of `times` (N,), in `unit`, as seconds since 1970.
+
+    The result is None if no time is finite, or if the first finite time is no plausible date.
+    """
     finite = times[np.isfinite(times)]
     if unit not in TIME_UNITS or not len(finite) or not _since_1970(float(finite[0]), unit):
         return None

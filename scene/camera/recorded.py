@@ -329,7 +329,10 @@ def _price(turns: F64, up: F64, quarter: int) -> float | None:
 
 
 def _between(turns: F64, dearer: float) -> list[_Guess]:
-    """Return the guess at the direction most nearly perpendicular to all right axes; [] if it is not believed."""
+    """Return the guess that the direction most nearly perpendicular to all right axes is up; [] if it is not believed.
+
+    `dearer`: cost to add to the guess.
+    """
     ups, rights = _ups_and_rights(turns, 0)
     spread, directions = np.linalg.eigh(rights.T @ rights / len(rights))
     direction = directions[:, 0] if (ups @ directions[:, 0]).mean() >= 0 else -directions[:, 0]

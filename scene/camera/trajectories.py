@@ -112,7 +112,7 @@ def _kitti_times(path: Path, read: MatrixTable, clock: TableClock) -> tuple[F64,
 
 
 def _counted(path: Path, clock: TableClock) -> TableClock:
-    """Return the clock of poses without times, which counts frames."""
+    """Return the clock of poses without times, which counts frames. Raises BadInputError if `clock` has a time unit."""
     if clock.unit not in (AUTO, FRAMES):
         found = f'camera.time_unit = "{clock.unit}" with poses without times'
         raise BadInputError(path, found, "times in the file", "remove it, or set camera.rate_hz")
@@ -203,7 +203,7 @@ def load_euroc(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
 
 
 def _sensor(path: Path) -> dict[str, F64]:
-    """Return the numbers of a `sensor.yaml` by key of SENSOR_KEYS. In the file, each value is a list in brackets."""
+    """Return the numbers of a `sensor.yaml` by key of SENSOR_KEYS. Raises BadInputError."""
     text = "\n".join(line.split("#", 1)[0] for line in read_text(path, "a EuRoC sensor.yaml").splitlines())
     numbers = {}
     for key, count in SENSOR_KEYS.items():

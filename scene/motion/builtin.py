@@ -206,7 +206,7 @@ def solve_leg(build: Build, side: int, hip: F64, pelvis: F64, foot: FootTrack) -
 def _knee_angle(thigh: F64, shin: F64, distance: F64) -> F64:
     """Return the flexion (T,), radians about +X, at which hip and ankle are `distance` (T,) apart.
 
-    It solves |thigh + R shin| = distance, which has the form a cos + b sin = c.
+    This angle of the rotation R solves |thigh + R shin| = distance, which has the form a cos + b sin = c.
     """
     a, b = thigh[1] * shin[1] + thigh[2] * shin[2], thigh[2] * shin[1] - thigh[1] * shin[2]
     c = (distance**2 - thigh @ thigh - shin @ shin) / 2 - thigh[0] * shin[0]
@@ -480,10 +480,7 @@ def _height_within_reach(side: int, foot: FootTrack, place: F64, pelvis: F64) ->
 
 
 def _trunk(poses: F64, times: F64, pelvis_yaw: F64, weight: F64, pace: F64) -> None:
-    """Set spine, neck and head in `poses`.
-
-    The shoulders turn against the hips; the body leans with the pace and breathes.
-    """
+    """Set spine, neck and head in `poses`: shoulders turn against hips; the body leans with the pace and breathes."""
     breath = np.sin(2 * np.pi * times / (times[-1] + times[1]) * round(times[-1] / 3.6))
     for name, share in (("spine1", 0.25), ("spine2", 0.35), ("spine3", 0.4)):
         joint = poses[:, JOINT_INDEX[name]]

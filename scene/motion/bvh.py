@@ -307,7 +307,7 @@ def load_retargeted(path: Path, units: str, joint_map: Mapping[str, str] = NO_MA
     `units`: a key of UNITS_M, or `auto`.
     `joint_map`: as in `match_names`.
     `rest` (55, 3): rest joints of the avatar, metres.
-    Raises BadInputError when the file is no BVH, or when its joint names belong to no known skeleton.
+    Raises BadInputError when the file is no BVH, its skeleton is unknown or without length, or no frame is sound.
     """
     bvh = load_bvh(path)
     dialect, index_of, of_roots = _person(path, bvh.joints, joint_map)
@@ -400,8 +400,8 @@ def tracks_of(bvh: Bvh, index_of: dict[str, int]) -> tuple[Tracks, NDArray[np.bo
 def _tip(bvh: Bvh, index: int, turns: F64, places: F64, least: float) -> F64 | None:
     """Return the positions (T, 3) at which the bone of joint `index` ends.
 
-    The end is the end site, or the farthest joint directly below. A joint at the same place counts as the joint itself;
-    thumbs do not count. The result is None if nothing below is farther than `least`, in the file's unit.
+    The end is the end site or a joint directly below, whichever is farthest. A joint at the same position counts as the
+    joint itself; thumbs do not count. The result is None if no end is farther than `least`, in the file's unit.
     """
     here, found, reach = {index}, None, max(least, LEAST_LENGTH)
     for k, joint in enumerate(bvh.joints):

@@ -74,10 +74,7 @@ def places_in(array: NDArray[Any]) -> F64 | None:
 
 
 def _sound(places: F64) -> NDArray[np.bool_]:
-    """Return a mask (T,) of the frames of `places` (T, 22, 3) that show a person.
-
-    The bones have a person's lengths, nearly equal in all frames.
-    """
+    """Return a mask (T,) of the frames of `places` (T, 22, 3) that show a person, by the module docstring's rules."""
     with np.errstate(all="ignore"):
         bones = _bones(places)
         usual = np.nanmedian(bones, axis=0) if np.isfinite(bones).any(axis=0).all() else np.zeros(len(_ENDS))

@@ -127,10 +127,7 @@ def values_of(data: bytes) -> Any:
 
 
 def _run(data: bytes) -> Any:
-    """Return the value that the operations of `data` make.
-
-    Raises UnexpectedValue, and the errors that Python raises for unfit values.
-    """
+    """Return the value that the operations of `data` make. Raises UnexpectedValue, and Python's own errors."""
     reader = _Reader()
     for count, (operation, value, _) in enumerate(pickletools.genops(data)):
         if operation.name == "STOP":

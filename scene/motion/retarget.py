@@ -317,10 +317,7 @@ def _hand(work: Retarget, side: str) -> None:
 
 
 def _palm(work: Retarget, side: str) -> list[Evidence]:
-    """Return evidence for a hand's rotation about its length.
-
-    The evidence is the vector from the little finger to the index finger, else from the wrist to the thumb.
-    """
+    """Return evidence for a hand's twist: the vector from little finger to index finger, else from wrist to thumb."""
     for start, end in (("pinky1", "index1"), ("wrist", "thumb1")):
         names = f"{side}_{start}", f"{side}_{end}"
         if work.tracks.has(*names):

@@ -214,8 +214,7 @@ OTHERS: dict[tuple[int, ...], str] = {
 def motion_of_array(where: str, source: str, array: NDArray[Any]) -> RawMotion:
     """Return the motion of `array`, (T, W) or (T, W / 3, 3), where W is a key of WHOLE.
 
-    `where`: path of the file, for messages. `source`: suffix of the file, for people. Raises BadInputError for any
-    other array.
+    `where`: path of the file. `source`: suffix of the file, for people. Raises BadInputError for any other array.
     """
     if array.shape[1:] in OTHERS:
         raise BadInputError(where, f"shape {array.shape}", f"{shapes(WHOLE)}, axis-angle", OTHERS[array.shape[1:]])
@@ -313,7 +312,7 @@ def _frame_numbers(found: list[FoundTable]) -> tuple[NDArray[np.int64], str]:
 
 
 def _rows_of_person(found: list[FoundTable]) -> tuple[list[int], str]:
-    """Return (row of the chosen person in each frame, -1 in a frame without the person; a note on the person)."""
+    """Return (row of one person in each frame, -1 if absent; a note). Raises BadInputError if no frame has anybody."""
     counts = [len(_rows_in(frame, ROMP_POSES)) for frame in found]
     if all(frame.has(ROMP_PERSONS) for frame in found):
         tracks = [_tracks_in(frame)[:count] for frame, count in zip(found, counts, strict=True)]
@@ -375,7 +374,7 @@ def motion_of(where: str, source: str, values: Any, there: str = "") -> RawMotio
     `where`: path of the file, for messages.
     `source`: suffix of the file, for people.
     `there`: content of the file, for messages, when `values` are only a part of it.
-    Raises BadInputError when no layout fits.
+    Raises BadInputError when no layout fits, or when an array is unusable.
     """
     tables = [
         FoundTable(f"{where}[{printable(name)}]" if name else where, name, table) for name, table in tables_in(values)

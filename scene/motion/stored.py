@@ -36,10 +36,7 @@ MOST_NAMED = 12
 
 
 def npy_values(path: Path, expected: str) -> Any:
-    """Return the array of a `.npy` file, or the object that it holds. Raises BadInputError.
-
-    `expected`: expected content in words, for messages.
-    """
+    """Return the array or object in a `.npy` file. `expected`: content in words. Raises BadInputError."""
     pickled = npy_pickle(path, MAX_BYTES, expected)
     return read_npy(path, expected) if pickled is None else _values(path, pickled)
 
@@ -56,10 +53,7 @@ def npz_values(path: Path, keys: Collection[str], expected: str) -> dict[str, An
 
 
 def pickle_values(path: Path, expected: str) -> Any:
-    """Return the content of a pickle as plain values. Raises BadInputError.
-
-    `expected`: expected content in words, for messages.
-    """
+    """Return the content of a pickle as plain values. `expected`: content in words. Raises BadInputError."""
     data = read_bytes(path, MAX_BYTES, expected)
     refuse_other(path, expected, PICKLE)
     return _values(path, data)
@@ -83,7 +77,7 @@ def plain(value: Any) -> Any:
 
 
 def tables_in(value: Any) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Yield (path, dict) for each dict in `value` once, from the outermost inwards.
+    """Yield (path, dict) for each dict in `value` once, from the outermost inwards, at most DEEPEST levels deep.
 
     The path consists of the keys and list indices that lead to the dict, joined by `.`.
     """

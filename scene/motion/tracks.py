@@ -46,7 +46,6 @@ class Tracks:
 
     @property
     def frames(self) -> int:
-        """Number of frames."""
         return len(self.places["left_hip"])
 
     def has(self, *names: str) -> bool:
