@@ -415,11 +415,11 @@ def _on_core(core: int, kernel: Kernel, together: threading.Barrier) -> tuple[fl
 
     The call binds the calling thread to the core. Therefore the thread must end afterwards.
     """
+    together.wait()  # before anything that may fail, so that no other thread waits for ever
     os.sched_setaffinity(0, {core})
     turns = BURST_CYCLES // kernel.cycles
     chain = turns * len(kernel.body.split()) * kernel.imuls * IMUL_CYCLES
     with _Code(rate_loop(kernel)) as issue, _Code(clock_loop(kernel)) as tell_clock:
-        together.wait()
         rates, clocks = [], []
         for _ in range(BURSTS):
             rates.append(turns * kernel.sequences / issue.ns(turns))

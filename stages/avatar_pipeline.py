@@ -84,7 +84,8 @@ def run_avatar(
     pipeline = avatar_pipeline(config, assets, edge)
     if len(config.works) > 1 and not config.pace_ns:
         options |= {"works": config.works, "follow": config.infer_names}
-    return run_pipeline(pipeline, frames or config.scene.frames, fps=config.scene.fps, assets=assets, **options)
+    count = config.scene.frames if frames is None else frames
+    return run_pipeline(pipeline, count, fps=config.scene.fps, assets=assets, **options)
 
 
 FRAMES = 12  # frames of a rehearsal, spread evenly over the scene; the first two warm up

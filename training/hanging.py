@@ -55,7 +55,7 @@ class _Sheet:
 def dressed_body(body: Path, look: str, folder: Path) -> Path:
     """Return the file of the body in `look`: `body` itself, or a file in `folder` with the garments that hang.
 
-    The file is written if it is not there yet. Raises BadInputError.
+    A file that is there is replaced, because it may be of another body or look. Raises BadInputError.
 
     `body`: file of the body without garments. `look`: name of a look.
     """
@@ -63,10 +63,9 @@ def dressed_body(body: Path, look: str, folder: Path) -> Path:
     path = folder / BODY
     if not hanging:
         return body
-    if not path.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        with write_atomically(path) as draft, draft.open("wb") as file:
-            np.savez_compressed(file, allow_pickle=False, **_dressed(body, look_named(look), hanging))
+    folder.mkdir(parents=True, exist_ok=True)
+    with write_atomically(path) as draft, draft.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **_dressed(body, look_named(look), hanging))
     return path
 
 

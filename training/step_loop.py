@@ -12,7 +12,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -151,12 +151,11 @@ def step_seconds(
 ) -> float:
     """Return the mean duration of a step in seconds, measured on a copy of `avatar`.
 
-    Steps with half-size samples and steps with all samples are weighted by their shares of the training.
+    Steps with half-size samples cost less, and steps that round to bytes cost more. The parts of the training with each
+    kind of step are weighted by their shares.
     """
-    share = settings.small_until
-    of_small = _measured(avatar, groups, settings, vgg, 1.0) if share > 0 else 0.0
-    of_all = _measured(avatar, groups, settings, vgg, 0.0) if share < 1 else 0.0
-    return share * of_small + (1 - share) * of_all
+    bounds = sorted({0.0, settings.small_until, settings.bytes_from, 1.0})
+    return sum((end - begin) * _measured(avatar, groups, settings, vgg, begin) for begin, end in pairwise(bounds))
 
 
 def _measured(
@@ -164,15 +163,15 @@ def _measured(
     groups: list[ShapeGroup],
     settings: TrainingSettings,
     vgg: Vgg16 | None,
-    small_until: float,
+    begin: float,
 ) -> float:
-    """Return the mean duration in seconds of a step with this `small_until`, measured after a warm-up step."""
-    going = steps(
-        first_state(copy.deepcopy(avatar), settings, vgg),
-        groups,
-        settings.model_copy(update={"small_until": small_until, "bytes_from": 1.0}),
-        1 + MEASURED,
-    )
+    """Return the mean duration in seconds of a step as after the share `begin` of a training, after a warm-up step."""
+    kind = {
+        "small_until": float(begin < settings.small_until),
+        "bytes_from": 1.0 if begin < settings.bytes_from else -1.0,  # below 0: the warm-up step rounds too
+    }
+    state = first_state(copy.deepcopy(avatar), settings, vgg)
+    going = steps(state, groups, settings.model_copy(update=kind), 1 + MEASURED)
     next(going)
     start = time.monotonic()
     for _ in going:

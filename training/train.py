@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import shlex
+import shutil
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -75,7 +76,7 @@ from trilane.training.trainable_avatar import (
 from trilane.training.training_settings import NAME, TrainingSettings, read_settings, settings_text
 from trilane.training.validate import integer_painter, side_by_side
 from trilane.units import AVATARS
-from trilane.writing import write_atomically, write_bytes
+from trilane.writing import PREFIX, write_atomically, write_bytes
 
 CHANNELS = 16
 DEFAULT_NETWORK = Path(__file__).with_name("default-network.npz")
@@ -147,6 +148,7 @@ def train_avatar(places: TrainingPlaces, asked: TrainingSettings, listener: List
     people = []
     for subject, own in _subjects(places, settings, listener):
         own.work.mkdir(parents=True, exist_ok=True)
+        _require_own_work(subject, own, settings)
         raised = _raised(subject, own, settings, listener)
         _draw_samples(raised, own, settings, listener)
         people.append(Trained(raised, own))
@@ -159,7 +161,7 @@ def train_avatar(places: TrainingPlaces, asked: TrainingSettings, listener: List
     before = places.work / LOSS_BEFORE
     if not (places.work / STATE).exists():  # a resumed training has the file
         write_bytes(before, json.dumps(probe_loss(state, groups)).encode())
-    losses = {"before": float(json.loads(read_text(before, "the loss before this training")))}
+    losses = {"before": float(_read_json(before))}
     _train(state, people, groups, places, settings, listener)
     state.average.cpu()
     if settings.bytes_from < 1 and not settings.keep_network:
@@ -264,20 +266,34 @@ def resumed_settings(path: Path, asked: TrainingSettings) -> TrainingSettings:
     return begun
 
 
-def _draw_samples(subject: Subject, places: TrainingPlaces, settings: TrainingSettings, listener: Listener) -> None:
-    """Render the samples into the work folder, if they are not there yet.
+def _read_json(path: Path) -> Any:
+    """Return the content of a file that `train_avatar` wrote into the work folder. Raises BadInputError."""
+    expected = "a JSON file of this training"
+    try:
+        return json.loads(read_text(path, expected))
+    except ValueError as error:
+        raise BadInputError(path, f"no valid JSON ({error})", expected, ANOTHER_WORK) from None
 
-    Raises BadInputError if the folder has samples of other settings.
-    """
+
+def _require_own_work(subject: Subject, places: TrainingPlaces, settings: TrainingSettings) -> None:
+    """Note in the work folder which samples and offsets it will have. Raises BadInputError if it has others."""
     facts = places.work / SAMPLE_FACTS
     decides = ("samples", "seed", "stand_off")
     who = {"look": subject.facts[KEY]} if places.capture is None else {"capture": str(places.capture.resolve())}
     body = {"body": sha256_of([subject.person.body])}
     wanted = who | body | {key: getattr(settings, key) for key in decides}
-    if facts.exists():
-        present = json.loads(facts.read_text(encoding="utf-8"))
-        if present != wanted:
-            raise BadInputError(facts, str(present), str(wanted), ANOTHER_WORK)
+    if not facts.exists():
+        if (there := places.work / SAMPLES).exists():
+            raise BadInputError(there, f"samples without {SAMPLE_FACTS}", "samples with it", ANOTHER_WORK)
+        write_bytes(facts, json.dumps(wanted).encode())
+    elif (present := _read_json(facts)) != wanted:
+        raise BadInputError(facts, str(present), str(wanted), ANOTHER_WORK)
+
+
+def _draw_samples(subject: Subject, places: TrainingPlaces, settings: TrainingSettings, listener: Listener) -> None:
+    """Render the samples into the work folder, if they are not there yet. The folder of samples is whole or absent."""
+    folder, processes = places.work / SAMPLES, settings.threads
+    if folder.exists():
         return
     samples = plan_training(
         subject.renderer,
@@ -286,11 +302,12 @@ def _draw_samples(subject: Subject, places: TrainingPlaces, settings: TrainingSe
         lambda all_: listener.track("choosing views", all_, len(all_)),
     )
     listener.say(_sample_cost(subject, samples, settings))
-    folder, processes = places.work / SAMPLES, settings.threads
+    draft = folder.with_name(f"{PREFIX}{SAMPLES}")
+    shutil.rmtree(draft, ignore_errors=True)
     write_dataset(
-        subject.source, samples, folder, processes, lambda parts: listener.track("drawing views", parts, len(parts))
+        subject.source, samples, draft, processes, lambda parts: listener.track("drawing views", parts, len(parts))
     )
-    write_bytes(facts, json.dumps(wanted).encode())
+    draft.rename(folder)
 
 
 def _sample_cost(subject: Subject, samples: list[Planned], settings: TrainingSettings) -> str:

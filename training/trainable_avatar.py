@@ -24,6 +24,7 @@ from trilane.arrays import F32, U8
 from trilane.avatars.bundle import Bundle, split_levels
 from trilane.avatars.network_file import constants_of
 from trilane.errors import BadInputError, reason
+from trilane.files import DAMAGED
 from trilane.training.dataset import U16, ShapeGroup, batches
 from trilane.training.network import INPUT, UNet
 from trilane.training.quantising.calibration import WEIGHT_TOP
@@ -231,9 +232,9 @@ SAVED_WEIGHTS = "weights that this network's training saved"
 def load_network(network: UNet, path: Path) -> UNet:
     """Load the weights that `save_network` wrote to `path` into `network`; return `network`. Raises BadInputError."""
     try:
-        with np.load(path, allow_pickle=False) as arrays:
+        with path.open("rb") as source, np.load(source, allow_pickle=False) as arrays:
             saved = {name: torch.from_numpy(arrays[name]) for name in arrays.files}
-    except (OSError, ValueError, KeyError) as error:
+    except (*DAMAGED, TypeError) as error:  # NumPy raises TypeError for a lone array
         raise BadInputError(path, reason(error).splitlines()[0], SAVED_WEIGHTS) from error
     prefix = "network."
     weights = {k.removeprefix(prefix): v.float() for k, v in saved.items() if k.startswith(prefix)}

@@ -18,11 +18,11 @@ import av
 
 from trilane.apps.check.port_types import NETWORK_CHANNELS, port_types, read_networks, require_weights, value_type
 from trilane.errors import BadInputError, TrilaneError
-from trilane.files import require_file
 from trilane.hw_profiles.graph_file import fed_inputs, read_graph
 from trilane.pipeline.description import LONGEST_NAME
 from trilane.pipeline.file_keys import PortType
 from trilane.pipeline.pipeline_file import read_pipeline
+from trilane.stages.gpu.video_reader import require_video
 from trilane.writing import write_bytes
 
 A_VIDEO = "a video that PyAV reads"
@@ -174,7 +174,7 @@ def _video(path: Path) -> tuple[int, int, float]:
 
     Raises BadInputError for a file that PyAV cannot read, or that has no video.
     """
-    require_file(path, A_VIDEO)
+    require_video(path)
     try:
         with av.open(str(path), metadata_errors="replace") as container:
             stream = container.streams.video[0]

@@ -271,7 +271,7 @@ def _check_inputs(
             raise BadInputError(where, f"{found} from {each.stage}", "a picture, such as u8 480x640x3", remedy)
         if isinstance(stage, PrepareBlock) and (wanted := _written(stage, known, None, networks)):
             keys = stage.model_dump(include=set(PrepareBlock.model_fields) - set(BlockStage.model_fields))
-            Preparation(found, next(iter(wanted.values())), keys, f"{file.path}: stages.{name}")
+            Preparation(next(iter(wanted.values())), keys, f"{file.path}: stages.{name}")
         if name in networks:
             _check_network(where, found, each, networks[name])
 
@@ -289,7 +289,7 @@ def _check_network(where: str, found: PortType, each: PortInput, network: GraphF
     if wanted is None or (found.dtype == wanted.dtype and math.prod(found.shape) == math.prod(wanted.shape)):
         return
     if is_picture(found) and len(wanted.shape) == 4 and {wanted.shape[1], wanted.shape[3]} & set(NETWORK_CHANNELS):
-        Preparation(found, wanted, {}, where)
+        Preparation(wanted, {}, where)
         return
     prepared = 'a block = "prepare" before it' if is_picture(found) else f"a stage that writes {wanted}"
     remedy = f"add {prepared}"

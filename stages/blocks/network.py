@@ -197,7 +197,7 @@ class NetworkStage(PortedStage):
         name = port or next(iter(wanted))
         own = np.zeros(wanted[name].shape, TYPES[wanted[name].dtype])
         is_same = found.dtype == wanted[name].dtype and math.prod(found.shape) == math.prod(wanted[name].shape)
-        preparation = None if is_same else Preparation(found, wanted[name], {}, self.settings.where)
+        preparation = None if is_same else Preparation(wanted[name], {}, self.settings.where)
         return _Fed(name, wanted[name], own, preparation)
 
     def ready(self) -> None:

@@ -48,7 +48,7 @@ class OwnCode(PortedStage):
         super().__init__(settings)
         name, _, factory = self.settings.keys["python"].partition(":")
         where = f"{self.settings.where}.python"
-        self._module = self._imported(name, where)
+        self._module: ModuleType = self._guarded(_imported, name, where)
         made = getattr(self._module, factory, None)
         if not callable(made):
             known = [one for one, value in vars(self._module).items() if callable(value) and not one.startswith("_")]
@@ -95,29 +95,26 @@ class OwnCode(PortedStage):
                 said = f"{_shown(array)}{port}, expected {_shown(target)}"
                 raise TrilaneError(f"{self.settings.where}: its code returned {said}")
 
-    def _imported(self, name: str, where: str) -> ModuleType:
-        try:
-            found: ModuleType = self._guarded(import_module, name)
-        except ModuleNotFoundError as error:
-            missing = f"no module {error.name!r}"
-            remedy = f"put {name}.py beside the pipeline file, or install it"
-            raise BadInputError(where, missing, "a module of the file's folder or an installed one", remedy) from None
-        return found
-
     def _guarded(self, call: Callable[..., Any], *args: Any, **named: Any) -> Any:
-        """Return the result of `call`, the user's code.
-
-        An error becomes a TrilaneError with stage, file and line. A ModuleNotFoundError stays as it is.
-        """
+        """Return the result of `call`, the user's code. An error becomes a TrilaneError with stage, file and line."""
         try:
             return call(*args, **named)
-        except (TrilaneError, ModuleNotFoundError):
+        except TrilaneError:
             raise
         except Exception as error:
             traceback.print_exception(error)
             own = [each for each in traceback.extract_tb(error.__traceback__) if _is_own(each.filename)]
             at = f" at {own[-1].filename}, line {own[-1].lineno}" if own else ""
             raise TrilaneError(f"{self.settings.where}: {type(error).__name__}: {error}{at}") from error
+
+
+def _imported(name: str, where: str) -> ModuleType:
+    try:
+        return import_module(name)
+    except ModuleNotFoundError as error:
+        missing = f"no module {error.name!r}"
+        remedy = f"put {name}.py beside the pipeline file, or install it"
+        raise BadInputError(where, missing, "a module of the file's folder or an installed one", remedy) from None
 
 
 def _is_own(file: str) -> bool:

@@ -39,17 +39,16 @@ OWN_CODE: Final = "a stage with python can prepare it"
 
 
 class Preparation:
-    """Turns pictures of one type into inputs of a network.
+    """Turns pictures into inputs of a network.
 
-    `picture`: type of the pictures, (h,w,c).
     `wanted`: type of the network's input.
     `keys`: fit, layout, mean, sd, step and zero_point of the block, as far as they are given.
     `where`: place of the stage in its file, for errors.
 
-    Raises BadInputError if the keys or the types do not fit each other.
+    Raises BadInputError if the keys and the type do not fit each other.
     """
 
-    def __init__(self, picture: PortType, wanted: PortType, keys: Mapping[str, Any], where: str) -> None:
+    def __init__(self, wanted: PortType, keys: Mapping[str, Any], where: str) -> None:
         self._fit = keys.get("fit") or "stretch"
         self._layout, (self._height, self._width, self._channels) = _layout(wanted, keys.get("layout"), where)
         self._dtype = np.dtype(TYPES[wanted.dtype])
@@ -66,7 +65,6 @@ class Preparation:
         #: The network's number for each byte and channel (256, channels), so that each byte needs one look-up.
         self._table = numbers.astype(self._dtype)
         self._is_same = self._dtype == np.uint8 and (self._table == np.arange(STEPS + 1)[:, None]).all()
-        self._height_in, self._width_in, self._channels_in = picture.shape
 
     def _quantised(self, keys: Mapping[str, Any], where: str) -> tuple[float, float]:
         """Return (step, zero point) of the network's numbers. `keys`, `where`: as in `Preparation`."""
@@ -159,7 +157,7 @@ class Prepare(PortedStage):
     def __init__(self, settings: Mapping[str, Any]) -> None:
         super().__init__(settings)
         (wanted,) = self.writes.values()
-        self._preparation = Preparation(self.reads[0].type, wanted, self.settings.keys, self.settings.where)
+        self._preparation = Preparation(wanted, self.settings.keys, self.settings.where)
 
     def work(self, frame: int, arrays: Sequence[NDArray[Any] | None], outputs: Arrays) -> Mapping[str, float]:  # noqa: ARG002
         if arrays[0] is not None:
@@ -269,7 +267,10 @@ def _classes(mask: NDArray[Any]) -> U8:
 
 
 def _depth_colours(depth: F32) -> U8:
-    low, high = float(depth.min()), float(depth.max())
+    """Return the colours (h,w,3) of `depth` (h,w). Infinities count as the nearest finite depth, NaN as the least."""
+    finite = depth[np.isfinite(depth)]
+    low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
+    depth = np.nan_to_num(np.clip(depth, low, high), nan=low)
     share = (depth - low) / (high - low) if high > low else np.zeros_like(depth)
     return np.asarray(np.stack([share, 1 - np.abs(2 * share - 1), 1 - share], axis=-1) * STEPS, np.uint8)
 

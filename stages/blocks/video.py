@@ -12,8 +12,6 @@ the run, the newest picture goes to the window too.
 
 from __future__ import annotations
 
-import os
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,14 +19,13 @@ from typing import Any, NamedTuple
 import av
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageOps, UnidentifiedImageError
 
 from trilane.arrays import U8, Shape
 from trilane.errors import BadInputError
-from trilane.files import PICTURE_SUFFIXES
 from trilane.pipeline.stage import Arrays, PortedStage, UnitContext
 from trilane.stages.cpu.present import Segment
-from trilane.stages.gpu.video_reader import VideoReader, video_stream
+from trilane.stages.gpu.background import pictures_in, read_picture
+from trilane.stages.gpu.video_reader import VideoReader, require_video, video_stream
 from trilane.transport.live_window import LiveWindow
 
 DEFAULT_FPS = 30.0
@@ -51,7 +48,8 @@ def footage(path: Path) -> FoundPictures:
     if not path.exists():
         raise BadInputError(path, "no such file", EXPECTED, "put it there, or change `path`")
     if path.is_dir():
-        return FoundPictures(len(picture_files(path)), None)
+        return FoundPictures(len(pictures_in(path)), None)
+    require_video(path)
     try:
         with av.open(str(path), metadata_errors="replace") as container:
             stream = video_stream(container, path)
@@ -62,15 +60,6 @@ def footage(path: Path) -> FoundPictures:
         raise BadInputError(path, f"no readable video ({error})", EXPECTED, "convert it to .mp4") from None
 
 
-def picture_files(folder: Path) -> list[Path]:
-    """Return the pictures of a folder, sorted by name. Raises BadInputError if there is none."""
-    files = sorted(file for file in folder.iterdir() if file.suffix.lower() in PICTURE_SUFFIXES)
-    if not files:
-        expected = f"files that end in {', '.join(PICTURE_SUFFIXES)}"
-        raise BadInputError(folder, "a folder without pictures", expected, "put some there, or change `path`")
-    return files
-
-
 class VideoStage(PortedStage):
     """Writes one picture for each frame. Raises BadInputError for a file that cannot be read."""
 
@@ -79,14 +68,14 @@ class VideoStage(PortedStage):
         self._path = self.settings.folder / self.settings.keys["path"]
         height, width = next(iter(self.writes.values())).shape[:2]
         self._shape: Shape = (height, width)
-        self._files = picture_files(self._path) if self._path.is_dir() else []
+        self._files = pictures_in(self._path) if self._path.is_dir() else []
         self._reader = None if self._files else VideoReader(self._path, self._shape)
         self._fps = self.settings.keys.get("fps") or (None if self._files else footage(self._path).fps) or DEFAULT_FPS
         self._picture: U8 = np.zeros((height, width, 3), np.uint8)
 
     def work(self, frame: int, arrays: Sequence[NDArray[Any] | None], outputs: Arrays) -> Mapping[str, float]:  # noqa: ARG002
         if self._reader is None:
-            self._picture = self._of_file(self._files[frame % len(self._files)])
+            self._picture = read_picture(self._files[frame % len(self._files)], self._shape)
         elif (picture := self._reader.at(frame / self._fps)) is not None:
             self._picture = picture
         for target in outputs.values():
@@ -97,14 +86,6 @@ class VideoStage(PortedStage):
         if self._reader is not None:
             self._reader.close()
 
-    def _of_file(self, path: Path) -> U8:
-        try:
-            with Image.open(path) as image:
-                upright = ImageOps.exif_transpose(image).convert("RGB")
-        except (OSError, UnidentifiedImageError, Image.DecompressionBombError) as error:
-            raise BadInputError(path, f"no readable picture ({error})", "a picture", "remove it") from None
-        return np.asarray(ImageOps.fit(upright, self._shape[::-1], Image.Resampling.BILINEAR), np.uint8)
-
 
 def build_video(settings: Mapping[str, Any], unit: UnitContext) -> VideoStage:  # noqa: ARG001 - a factory's signature
     """Build the block `video`. Raises BadInputError."""
@@ -114,7 +95,8 @@ def build_video(settings: Mapping[str, Any], unit: UnitContext) -> VideoStage:  
 class Encode(PortedStage):
     """Encodes one picture for each frame.
 
-    Sides are cut to even numbers, because the video's colours need it. Its keys:
+    Sides are cut to even numbers, because the video's colours need it. Raises BadInputError for a side of one pixel.
+    Its keys:
 
     `fps`: rate of the video in frames a second.
     `segments`: name of the folder of segments below the run's folder.
@@ -124,12 +106,13 @@ class Encode(PortedStage):
     def __init__(self, settings: Mapping[str, Any]) -> None:
         super().__init__(settings)
         height, width, self._channels = self.reads[0].type.shape
-        self._height, self._width = max(height // 2 * 2, 2), max(width // 2 * 2, 2)
-        folder = self.settings.run_folder / self.settings.keys["segments"]
-        folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"{time.monotonic_ns():020d}-{os.getpid()}.mp4"
+        if min(height, width) < 2:
+            where, found = f"{self.settings.where}.in", f"a picture of {width}x{height} pixels"
+            raise BadInputError(where, found, "at least 2x2 pixels")
+        self._height, self._width = height // 2 * 2, width // 2 * 2
         self._fps = self.settings.keys["fps"]
-        self._segment: Segment | None = Segment(path, self._fps, self._height, self._width)
+        folder = self.settings.run_folder / self.settings.keys["segments"]
+        self._segment: Segment | None = Segment.begun(folder, self._fps, self._height, self._width)
         window = self.settings.keys.get("window")
         self._window = LiveWindow.opened(Path(window), self._height, self._width) if window else None
 

@@ -78,6 +78,20 @@ class Segment:
         # Line buffering keeps the digests of finished frames when the process is killed.
         self._digests = path.with_suffix(".sha256").open("w", encoding="ascii", buffering=1)
 
+    @classmethod
+    def begun(cls, folder: Path, fps: float, height: int, width: int) -> Segment:
+        """Return a new segment in `folder`, which is made if it is missing.
+
+        Raises UnwrittenError if the disk is full or fails, or if somebody removed the folder.
+        """
+        path = folder / f"{time.monotonic_ns():020d}-{os.getpid()}.mp4"
+        try:
+            with full_disk_told(path):
+                folder.mkdir(parents=True, exist_ok=True)
+                return cls(path, fps, height, width)
+        except FileNotFoundError as error:  # somebody removed the folder just now
+            raise UnwrittenError(path, FileNotFoundError(errno.ENOENT, REMOVED)) from error
+
     def digest(self, frame: int, pixels: NDArray[np.uint8], repeats: bool = False) -> None:
         """Write the digest of `pixels`, (height, width, 3) and C-contiguous.
 
@@ -146,7 +160,7 @@ class PresentStage:
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
         """Make the views of the slots, and the encoder.
 
-        Raises ValueError if there are outputs, UnwrittenError if somebody removed the folder of segments.
+        Raises ValueError if there are outputs, UnwrittenError as `Segment.begun` does.
         """
         if outputs:
             raise ValueError("the present stage has no output edge")
@@ -154,12 +168,7 @@ class PresentStage:
         self._headers = [packet.header for packet in inputs]
         self._frames = [packet.payload[:size].reshape(self._height, self._width, 3) for packet in inputs]
         if self._folder is not None:
-            self._folder.mkdir(parents=True, exist_ok=True)
-            path = self._folder / f"{time.monotonic_ns():020d}-{os.getpid()}.mp4"
-            try:
-                self._segment = Segment(path, self._fps, self._height, self._width)
-            except FileNotFoundError as error:  # somebody removed the folder just now
-                raise UnwrittenError(path, FileNotFoundError(errno.ENOENT, REMOVED)) from error
+            self._segment = Segment.begun(self._folder, self._fps, self._height, self._width)
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
         """Present `inputs[slot_in]` as frame `frame`, and return metrics.

@@ -12,7 +12,6 @@ started.
 
 from __future__ import annotations
 
-import re
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -29,16 +28,18 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 from trilane import machine
 from trilane.arrays import U8, Shape
 from trilane.errors import BadInputError, reason
-from trilane.files import HEAD_BYTES, PICTURE, PICTURE_SUFFIXES, VIDEO, require_file, signature_of_head
+from trilane.files import PICTURE_SUFFIXES, require_file
 from trilane.scene.camera.path import CameraPath
 from trilane.scene.footage import Footage, Stored, film_of, in_order
 from trilane.scene.lens import cover
 from trilane.stages.gpu.video_reader import (
+    A_VIDEO,
     DEFAULT_STEP_S,
     VideoReader,
     check_size,
     pixels_of,
     quarters_of,
+    require_video,
     video_stream,
 )
 
@@ -61,7 +62,6 @@ BY_TAG = {
 QUARTERS = {5: 1, 6: 1, 3: 2, 4: 2, 7: 3, 8: 3}
 CLOCKWISE = {1: Image.Transpose.ROTATE_270, 2: Image.Transpose.ROTATE_180, 3: Image.Transpose.ROTATE_90}
 EXPECTED = "a PNG, JPEG, BMP, WebP or TIFF file"
-A_VIDEO = "a video, a picture, or a folder of pictures"
 
 
 def look_at_picture(path: Path) -> Stored:
@@ -211,8 +211,6 @@ STEADY = 0.25
 MOST_PACKETS = 500_000
 #: Least share of its stated frames that a whole file contains.
 LEAST_WHOLE = 0.99
-#: Control characters that no text contains.
-NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
 QUARTER_WORDS = {1: ", turned by 90 degrees", 2: ", turned by 180 degrees", 3: ", turned by 270 degrees"}
 EIGHT_BITS = 8
 
@@ -270,28 +268,6 @@ def _folder(path: Path, fps: float) -> Footage:
 def _size(stored: Stored) -> str:
     height, width = stored.shown()
     return f"{width}x{height}{QUARTER_WORDS.get(stored.turned, '')}"
-
-
-def require_video(path: Path) -> None:
-    """Raise BadInputError for a text or another file that is no video, even if FFmpeg would open it.
-
-    FFmpeg opens texts that name other files, such as playlists.
-    """
-    try:
-        with path.open("rb") as file:
-            head = file.read(HEAD_BYTES)
-    except OSError as error:
-        raise BadInputError.of_os_error(path, error, A_VIDEO) from None
-    signature = signature_of_head(head)
-    if signature is not None and signature.group not in (PICTURE, VIDEO):
-        raise BadInputError(path, signature.name, A_VIDEO, signature.remedy)
-    if is_text(head):
-        raise BadInputError(path, "text", A_VIDEO)
-
-
-def is_text(head: bytes) -> bool:
-    """Return whether a file that begins with `head` may be text; the head of a video has bytes that no text has."""
-    return not NO_TEXT.search(head)
 
 
 def _video(path: Path) -> Footage:

@@ -283,6 +283,7 @@ class RoomPainter:
         ]
         self._extent = reduce(Extent.holding, (np.asarray(eye, np.float64) for eye in eyes), Extent())
         self._batches: list[Any] = []
+        self._buffers: list[Any] = []
         self._build()
 
     def draw(self, target: Any, view: Floats, projection: Floats) -> None:
@@ -304,13 +305,14 @@ class RoomPainter:
 
     def _build(self) -> None:
         mesh = room_mesh(self._extent)
-        for batch in self._batches:
-            batch.release()
+        for old in (*self._batches, *self._buffers):
+            old.release()
         vertices = uploaded_buffer(self._ctx, mesh.vertices.tobytes())
         content = [(vertices, "3f 2f 3f", "position", "uv", "light")]
         parts = (mesh.floor, mesh.boards, mesh.paint)
         indices = [uploaded_buffer(self._ctx, part.tobytes()) for part in parts]
         self._batches = [self._ctx.vertex_array(self._program, content, index) for index in indices]
+        self._buffers = [vertices, *indices]
 
 
 class PicturePainter:

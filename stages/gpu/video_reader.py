@@ -17,6 +17,7 @@ at 203 cd/m2 is from BT.2408-5; the matrix is from BT.2087-0.
 from __future__ import annotations
 
 import queue
+import re
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
@@ -30,7 +31,8 @@ from av.sidedata.sidedata import Type
 from numpy.typing import NDArray
 
 from trilane.arrays import F32, F64, U8, Shape
-from trilane.errors import BadInputError, TrilaneError
+from trilane.errors import BadInputError
+from trilane.files import HEAD_BYTES, PICTURE, VIDEO, require_file, signature_of_head
 from trilane.scene.lens import cover
 
 PQ, HLG = "PQ", "HLG"
@@ -125,6 +127,9 @@ def _srgb() -> U8:
 
 
 AHEAD = 4
+A_VIDEO = "a video, a picture, or a folder of pictures"
+#: Control characters that no text contains.
+NO_TEXT = re.compile(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]")
 MAX_PIXELS = 64_000_000
 DEFAULT_STEP_S = 1 / 30
 ROUNDING_S = 1e-6
@@ -140,16 +145,17 @@ class VideoReader:
     `path`: video file.
     `shape`: size of the pictures, (h,w).
     `turned`: number of quarter turns clockwise; None for what the file says.
-    Raises BadInputError if the file cannot be decoded.
+    Raises BadInputError if the file is no video or cannot be decoded.
     """
 
     def __init__(self, path: Path, shape: Shape, turned: int | None = None) -> None:
+        require_video(path)
         self._path, self._shape, self._turned = path, shape, turned
         self._start_s: float | None = None  # time of the file's first frame, by the file's own clock
         self._period_s = 0.0  # length of the loop; 0 until the video has ended once
         self._shown_s = -1.0
         self._next: tuple[float, U8]
-        self._queue: queue.Queue[tuple[float, U8] | TrilaneError]
+        self._queue: queue.Queue[tuple[float, U8] | Exception]
         self._open(0.0)
 
     def at(self, time_s: float) -> U8 | None:
@@ -165,7 +171,7 @@ class VideoReader:
         while self._next[0] <= time_s + ROUNDING_S:
             self._shown_s, due = self._next
             item = self._queue.get()
-            if isinstance(item, TrilaneError):
+            if isinstance(item, Exception):
                 raise item
             self._next = item
         return due
@@ -194,10 +200,10 @@ class VideoReader:
                 self._put(item)
                 if self._stop.is_set():
                     return
-        except TrilaneError as error:
+        except Exception as error:
             self._put(error)
 
-    def _put(self, item: tuple[float, U8] | TrilaneError) -> None:
+    def _put(self, item: tuple[float, U8] | Exception) -> None:
         while not self._stop.is_set():
             with suppress(queue.Full):
                 return self._queue.put(item, timeout=0.1)
@@ -281,6 +287,29 @@ def check_size(path: Path, frame: Any) -> None:
     """Raise BadInputError if `frame` of `path` is too large."""
     if frame.width * frame.height > MAX_PIXELS:
         raise BadInputError(path, f"{frame.width}x{frame.height} pixels", f"at most {MAX_PIXELS} pixels")
+
+
+def require_video(path: Path) -> None:
+    """Raise BadInputError for a text or another file that is no video, even if FFmpeg would open it.
+
+    FFmpeg opens texts that name other files, such as playlists.
+    """
+    require_file(path, A_VIDEO)
+    try:
+        with path.open("rb") as file:
+            head = file.read(HEAD_BYTES)
+    except OSError as error:
+        raise BadInputError.of_os_error(path, error, A_VIDEO) from None
+    signature = signature_of_head(head)
+    if signature is not None and signature.group not in (PICTURE, VIDEO):
+        raise BadInputError(path, signature.name, A_VIDEO, signature.remedy)
+    if is_text(head):
+        raise BadInputError(path, "text", A_VIDEO)
+
+
+def is_text(head: bytes) -> bool:
+    """Return whether a file that begins with `head` may be text; the head of a video has bytes that no text has."""
+    return not NO_TEXT.search(head)
 
 
 def video_stream(container: Any, path: Path) -> Any:

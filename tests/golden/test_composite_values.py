@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import moderngl
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -225,6 +226,16 @@ def test_a_room_that_held_its_cameras_is_the_same_from_the_start(gl: Any, camera
     painter.draw(grown.target, *views)
     assert np.array_equal(told.read(), grown.read())
     assert not np.array_equal(told.read(), small.read())
+
+
+def test_a_room_that_grows_keeps_no_old_buffer(gl: Any, camera: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    made: list[Any] = []
+    upload = composite_painters.uploaded_buffer
+    monkeypatch.setattr(composite_painters, "uploaded_buffer", lambda *what: made.append(upload(*what)) or made[-1])
+    painter = RoomPainter(gl)
+    painter.draw(Canvas(gl, noise(SHAPE)).target, *camera((6.5, 3.4, -1.0), (0, 1, 0), 70))
+    is_released = [isinstance(buffer.mglo, moderngl.InvalidObject) for buffer in made]
+    assert is_released == [True] * 4 + [False] * 4
 
 
 def test_planes_are_blended_white_in_linear_light_inside_their_sides(gl: Any) -> None:

@@ -22,14 +22,17 @@ from trilane.errors import BadInputError
 from trilane.files import read_npz
 from trilane.scene.motion.smpl_files import WHOLE as WIDTHS
 from trilane.training.capture.capture_file import (
+    A_ROTATION,
     FRAME,
     MASK,
     NAME,
+    NO_ROTATION,
     CaptureFile,
     Fault,
     FaultyCaptureError,
     PictureFolder,
     Pictures,
+    is_rotation,
     open_pictures,
     read_capture_file,
 )
@@ -39,6 +42,7 @@ from trilane.unexpected_value import UnexpectedValue
 LEAST_FRAMES = 4
 #: Least value of a mask's pixel that shows the person.
 HALF = 128
+ONE_MASK = "one mask for each frame"
 EXPECTED_FITS = "a folder of .npz files named like the frames, or one .npz"
 BODY = "body.npz"
 Read = TypeVar("Read")
@@ -165,9 +169,15 @@ class _Opening:
             by_stem = {Path(name).stem: number for number, name in enumerate(masks.names)}
             found = [by_stem.get(Path(name).stem, -1) for name in frames.names]
             wanted = [f"{self.file.masks}/{Path(name).stem}.png" for name in frames.names]
+            for number, name in enumerate(masks.names):
+                if by_stem[Path(name).stem] != number:
+                    self.faults.append(Fault(f"{self.file.masks}/{name}", "a second mask", ONE_MASK, "remove one"))
         else:
             found = [number if number < len(masks.names) else -1 for number in range(len(frames.names))]
             wanted = [f"{self.file.masks}#{number}" for number in range(len(frames.names))]
+            if len(masks.names) > len(frames.names):
+                count = f"{len(masks.names)} masks for {len(frames.names)} frames"
+                self.faults.append(Fault(self.file.masks, count, ONE_MASK))
         missing = [name for name, number in zip(wanted, found, strict=True) if number < 0]
         self.faults += [Fault(name, "no mask", "a mask for every frame") for name in missing]
         return found
@@ -360,10 +370,12 @@ def read_fit(where: str, arrays: Arrays, body: Body, flat_hand_mean: bool) -> tu
     for name, size in CAMERA.items():
         if name in values:
             _require_size(f"{where}[{name}]", values[name], size, faults)
+    rotation, translation = (values.get(name) for name in CAMERA)
+    if not faults and rotation is not None and not is_rotation(rotation.reshape(3, 3)):
+        faults.append(Fault(f"{where}[camera_rotation]", NO_ROTATION, A_ROTATION))
     betas, expression = (_coefficients(where, name, values, body, faults) for name in SHAPE)
     if faults or place is None:
         return None, faults
-    rotation, translation = (values.get(name) for name in CAMERA)
     full = body.full_pose(pose, flat_hand_mean).reshape(JOINTS, 3)
     return Fit(full, place, betas, expression, None if rotation is None else rotation.reshape(3, 3), translation), []
 

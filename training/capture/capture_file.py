@@ -15,14 +15,15 @@ from typing import Annotated, Any, Literal, Protocol
 import av
 import numpy as np
 from PIL import Image
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, field_validator
 
 from trilane.arrays import F64, MAX_SIDE, U8, Shape
 from trilane.errors import BadInputError, did_you_mean, reason
 from trilane.files import read_text
 from trilane.scene.lens import Lens
 from trilane.scene.schema import LISTED, Finite, Table
-from trilane.unexpected_value import UnexpectedValue, expected_in
+from trilane.stages.gpu.video_reader import require_video
+from trilane.unexpected_value import UnexpectedValue, expected_in, unexpected_in
 
 # The faults of a capture are listed together, so that a person can fix all of them before the next try.
 #
@@ -85,6 +86,18 @@ Row = Annotated[tuple[Finite, Finite, Finite], LISTED]
 OPENGL_FROM_OPENCV: F64 = np.diag([1.0, -1.0, -1.0])
 
 
+#: Most by which the product of a rotation with its transpose may differ from the identity, in any entry.
+ROTATION_TOLERANCE = 0.01
+NO_ROTATION = "a matrix that is no rotation"
+A_ROTATION = f"a rotation: orthogonal rows of length 1 (to within {ROTATION_TOLERANCE}), determinant 1"
+
+
+def is_rotation(matrix: F64) -> bool:
+    """Return whether `matrix` (3,3) rotates, and neither scales nor mirrors."""
+    off = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    return bool(off <= ROTATION_TOLERANCE and np.linalg.det(matrix) > 0)
+
+
 class CameraTable(Table):
     """The table of the camera.
 
@@ -104,6 +117,13 @@ class CameraTable(Table):
     axes: Literal["opencv", "opengl"] = "opencv"
     rotation: Annotated[tuple[Row, Row, Row], LISTED] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     translation: Row = (0.0, 0.0, 0.0)
+
+    @field_validator("rotation")
+    @classmethod
+    def _rotates(cls, rotation: tuple[Row, Row, Row]) -> tuple[Row, Row, Row]:
+        if not is_rotation(np.array(rotation)):
+            raise UnexpectedValue(NO_ROTATION, A_ROTATION)
+        return rotation
 
     @property
     def shape(self) -> Shape:
@@ -176,6 +196,8 @@ def _fault(details: dict[str, Any]) -> Fault:
         table = CameraTable if details["loc"][0] == "camera" else CaptureFile
         known = [field.alias or name for name, field in table.model_fields.items()]
         return Fault(where, "an unknown key", f"one of {', '.join(known)}", did_you_mean(details["loc"][-1], known))
+    if (cause := unexpected_in(details)) is not None:
+        return Fault(where, cause.found, cause.expected, cause.remedy)
     return Fault(where, repr(details["input"])[:80], expected_in(details))
 
 
@@ -234,6 +256,7 @@ def open_pictures(path: Path, kind: str) -> Pictures:
         raise BadInputError(path, "no such file or folder", expected)
     if path.suffix.lower() not in VIDEO_ENDINGS:
         raise BadInputError(path, f"the ending {path.suffix!r}", expected)
+    require_video(path)
     return PictureVideo(path, kind)
 
 
@@ -277,10 +300,12 @@ class PictureVideo:
             self._stream, self._next = self._frames(), 0
         frame = None
         while self._next <= number:
-            frame = next(self._stream)
+            frame = next(self._stream, None)
             self._next += 1
         _, expected, remedy, form = STORED[self._kind]
-        if frame is None or len(frame.format.components) > 3:
+        if frame is None:
+            raise UnexpectedValue(f"no picture {number}", f"the {len(self.names)} pictures that the video had")
+        if len(frame.format.components) > 3:
             raise UnexpectedValue("four channels", expected, remedy)
         return np.asarray(frame.to_ndarray(format=form))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from contextlib import nullcontext
 from types import SimpleNamespace
 from typing import Any
 
@@ -128,6 +129,19 @@ def test_what_cores_do_is_the_median_of_bursts_and_the_mean_of_cores(monkeypatch
     monkeypatch.setattr(roofline.os, "sched_setaffinity", lambda _, cores: setattr(core, "number", *cores))
     monkeypatch.setattr(machine.here, "architecture", lambda: "x86_64")
     assert measure_issued("AVX-VNNI", [2, 5]) == Issued(*(pytest.approx(value) for value in (1.5, 3.0, 3.0, 3.0)))
+
+
+@pytest.mark.timeout(20)
+def test_a_core_that_cannot_be_bound_stops_no_other_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
+    def bind(_: int, cores: set[int]) -> None:
+        if cores == {5}:
+            raise OSError(22, "no such core")
+
+    monkeypatch.setattr(roofline, "_Code", lambda _: nullcontext(SimpleNamespace(ns=lambda _: 1.0)))
+    monkeypatch.setattr(roofline.os, "sched_setaffinity", bind)
+    monkeypatch.setattr(machine.here, "architecture", lambda: "x86_64")
+    with pytest.raises(OSError, match="no such core"):
+        measure_issued("AVX-VNNI", [2, 5])
 
 
 @pytest.mark.parametrize(("refused", "words"), [(0, ""), (1, "the tiles of AMX are refused")])

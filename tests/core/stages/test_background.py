@@ -13,8 +13,9 @@ import pytest
 from PIL import Image
 
 from trilane.errors import BadInputError
+from trilane.stages.gpu import video_reader
 from trilane.stages.gpu.background import open_background, survey
-from trilane.stages.gpu.video_reader import HLG, PQ, Pixels, fitted, pq_code, pq_light, roll_off, to_srgb
+from trilane.stages.gpu.video_reader import HLG, PQ, Pixels, VideoReader, fitted, pq_code, pq_light, roll_off, to_srgb
 
 
 def test_picture_covers_the_output(tmp_path: Path) -> None:
@@ -70,6 +71,19 @@ def test_every_frame_of_a_video_is_shown_at_its_own_time(ramp: Path, numbers: Se
         picture = due if due is not None else picture
         assert picture is not None
         assert float(picture.mean()) == pytest.approx(40 + 3 * (number % 60), abs=2), number
+    reader.close()
+
+
+@pytest.mark.timeout(20)
+def test_any_error_of_the_decoding_thread_reaches_the_reader(ramp: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    reader = VideoReader(ramp, (48, 64))
+
+    def broken(*_: Any) -> Any:
+        raise MemoryError("no memory for a frame")
+
+    monkeypatch.setattr(video_reader, "fitted", broken)
+    with pytest.raises(MemoryError, match="no memory for a frame"):
+        reader.at(1.9)
     reader.close()
 
 

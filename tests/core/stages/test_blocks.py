@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import time
 from pathlib import Path
 from typing import Any
@@ -216,6 +217,16 @@ def test_a_box_is_a_frame_in_pixels_or_in_shares_and_only_with_a_score(tmp_path:
     assert not stage(np.zeros((10, 20, 3)), None).any()
 
 
+def test_infinite_depths_are_the_ends_of_the_finite_ones(tmp_path: Path) -> None:
+    """Blue (0, 0, 255) is the least depth, and red (255, 0, 0) the largest."""
+    reads = {"frame": "u8 2x5x3", "depth": "f32 2x5"}
+    stage = Ported(pictures.build_overlay, reads, {"": "u8 2x5x3"}, tmp_path, alpha=1.0)
+    depth = np.array([[2.0, 4.0, np.inf, -np.inf, np.nan]] * 2, np.float32)
+    red, blue = [255, 0, 0], [0, 0, 255]
+    assert stage(np.zeros((2, 5, 3)), depth)[1].tolist() == [blue, red, red, blue, blue]
+    assert stage(np.zeros((2, 5, 3)), np.full((2, 5), np.inf, np.float32))[1].tolist() == [blue] * 5
+
+
 # own code
 
 
@@ -270,6 +281,14 @@ def test_what_is_wrong_with_code_names_the_stage_and_the_line(line: str, match: 
         tmp_path, f"def make(settings):\n    def work(a, b):\n        {line}\n    return work\n", READS, {"y": "f32 3"}
     )
     with pytest.raises(TrilaneError, match=match.removeprefix("found|")):
+        stage(np.zeros(3), np.zeros(3))
+
+
+def test_a_module_that_is_missing_later_is_told_with_the_line_that_imports_it(tmp_path: Path) -> None:
+    code = "def make(settings):\n    def work(a, b):\n        import nowhere_at_all\n    return work\n"
+    stage = own(tmp_path, code, READS, {"y": "f32 3"})
+    expected = r"stages.tried: ModuleNotFoundError: No module named 'nowhere_at_all' at .*/own\d+\.py, line 4$"
+    with pytest.raises(TrilaneError, match=expected):
         stage(np.zeros(3), np.zeros(3))
 
 
@@ -328,11 +347,45 @@ def test_pictures_of_a_folder_are_shown_by_name_at_one_size(tmp_path: Path) -> N
     assert [int(stage(frame=frame)[0, 0, 0]) for frame in range(4)] == [0, 50, 100, 0]
     assert video.footage(tmp_path) == (3, None)
     (tmp_path / "no").mkdir()
-    with pytest.raises(BadInputError, match="found a folder without pictures"):
+    with pytest.raises(BadInputError, match="found no pictures"):
         video.footage(tmp_path / "no")
-    (tmp_path / "no.mp4").write_bytes(b"nothing")
+    (tmp_path / "no.mp4").write_bytes(b"\0nothing")
     with pytest.raises(BadInputError, match="no readable video"):
         video.footage(tmp_path / "no.mp4")
+
+
+def test_a_text_that_names_another_video_is_refused(tmp_path: Path) -> None:
+    written_video(tmp_path / "other.mp4", 2)
+    (tmp_path / "list.txt").write_text("ffconcat version 1.0\nfile other.mp4\n")
+    with pytest.raises(BadInputError, match=r"list\.txt: found text, expected a video"):
+        video.footage(tmp_path / "list.txt")
+    with pytest.raises(BadInputError, match=r"list\.txt: found text, expected a video"):
+        Ported(video.build_video, {}, {"": "u8 16x32x3"}, tmp_path, path="list.txt", fps=25.0)
+
+
+def test_a_folder_is_in_the_order_of_numbers_and_refused_if_it_cannot_be_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in (2, 10):
+        Image.new("RGB", (4, 4), (20 * number, 0, 0)).save(tmp_path / f"frame{number}.png")
+    stage = Ported(video.build_video, {}, {"": "u8 4x4x3"}, tmp_path, path=".")
+    assert [int(stage(frame=frame)[0, 0, 0]) for frame in range(2)] == [40, 200]
+    (tmp_path / "frame3.png").mkdir()
+    with pytest.raises(BadInputError, match=r"frame3\.png: found a folder"):
+        video.footage(tmp_path)
+
+    def refuse(_: Path) -> Any:
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "iterdir", refuse)
+    with pytest.raises(BadInputError, match="no readable folder \\(permission denied\\)"):
+        video.footage(tmp_path)
+
+
+@pytest.mark.parametrize(("height", "width"), [(1, 8), (8, 1)])
+def test_a_picture_too_small_for_a_video_is_refused(height: int, width: int, tmp_path: Path) -> None:
+    with pytest.raises(BadInputError, match=f"tried.in: found a picture of {width}x{height} pixels"):
+        Ported(video.build_encode, {"": f"u8 {height}x{width}x3"}, {}, tmp_path, segments="s", fps=30.0)
 
 
 def test_a_made_up_load_takes_its_time_of_the_core(tmp_path: Path) -> None:

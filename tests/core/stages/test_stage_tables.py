@@ -69,6 +69,15 @@ def test_edges_have_room_for_what_crosses_them(tiny_bundle: Path) -> None:
     ]
 
 
+@pytest.mark.parametrize(("asked", "run"), [(None, 9), (0, 0), (4, 4)])
+def test_a_run_has_the_frames_that_are_asked_for(
+    asked: int | None, run: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(avatar_pipeline, "avatar_pipeline", lambda *_: "pipeline")
+    monkeypatch.setattr(avatar_pipeline, "run_pipeline", lambda _, frames, **__: frames)
+    assert avatar_pipeline.run_avatar(configured(tmp_path), {}, frames=asked) == run
+
+
 def test_the_shape_is_the_squarest_of_those_that_are_large() -> None:
     """Half of the most pixels is too small; of two as square the one with fewer rows."""
 

@@ -41,9 +41,11 @@ def test_a_look_without_a_garment_that_hangs_keeps_the_body_s_file(tmp_path: Pat
     assert not (tmp_path / "w").exists()
 
 
-def test_a_file_that_is_there_is_kept(tmp_path: Path) -> None:
-    (tmp_path / "body.npz").write_bytes(b"kept")
-    assert dressed_body(DEFAULT_BODY, "dancer", tmp_path).read_bytes() == b"kept"
+def test_a_file_of_another_body_is_replaced_and_the_same_body_gives_the_same_bytes(tmp_path: Path) -> None:
+    (tmp_path / "body.npz").write_bytes(b"of another body")
+    first = dressed_body(DEFAULT_BODY, "dancer", tmp_path).read_bytes()
+    assert first != b"of another body"
+    assert dressed_body(DEFAULT_BODY, "dancer", tmp_path).read_bytes() == first
 
 
 def test_a_body_without_free_texels_is_refused_and_leaves_nothing(

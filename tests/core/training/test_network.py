@@ -154,6 +154,18 @@ def test_counters_of_batches_may_be_missing(tmp_path):
     assert all(torch.equal(made[name], value) for name, value in avatar().network.state_dict().items())
 
 
+@pytest.mark.parametrize("damage", ["empty", "broken", "lone"])
+def test_a_damaged_file_of_weights_is_refused(tmp_path, damage):
+    path = kept_weights(tmp_path / "b.npz")
+    if damage == "lone":
+        with path.open("wb") as file:
+            np.save(file, np.zeros(3))
+    else:
+        path.write_bytes(path.read_bytes()[:100] if damage == "broken" else b"")
+    with pytest.raises(BadInputError, match=r"expected weights that this network's training saved$"):
+        load_network(UNet(width=8, channels=CHANNELS), path)
+
+
 @pytest.mark.parametrize(
     ("width", "changes", "found"),
     [

@@ -279,9 +279,24 @@ def test_a_step_is_measured_on_a_copy(groups: list[ShapeGroup]) -> None:
     before = {name: value.clone() for name, value in made.state_dict().items()}
     assert step_seconds(made, groups, settings()) > 0
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(step_loop, "_measured", lambda *words: {1.0: 2.0, 0.0: 10.0}[words[-1]])
+        patch.setattr(step_loop, "_measured", lambda *words: 2.0 if words[-1] < words[2].small_until else 10.0)
         assert [step_seconds(made, groups, settings(small_until=share)) for share in (0.0, 0.25, 1.0)] == [10, 8, 2]
     assert all(torch.equal(value, before[name]) for name, value in made.state_dict().items())
+
+
+def test_steps_that_round_are_measured_with_rounding(groups: list[ShapeGroup], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A step takes 1 s, a step that rounds takes 3 s, and half of the steps round: (1 + 3) / 2."""
+    now, paint = [0.0], step_loop.add_gradients
+
+    def took(avatar: TrainableAvatar, *words: Any) -> dict[str, float]:
+        assert avatar.grid is not None
+        now[0] += 3.0 if avatar.grid.active else 1.0
+        return paint(avatar, *words)
+
+    monkeypatch.setattr(step_loop, "add_gradients", took)
+    monkeypatch.setattr(step_loop.time, "monotonic", lambda: now[0])
+    asked = settings(bytes_from=0.5, freeze_norms_at=0.5)
+    assert step_seconds(avatar(), groups, asked) == 2.0
 
 
 def test_a_state_of_another_training_is_refused(groups: list[ShapeGroup], tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from trilane.avatars.bundle import bundle_folder, load_bundle  # noqa: E402
 from trilane.avatars.manifest import sha256_of  # noqa: E402
 from trilane.errors import BadInputError  # noqa: E402
 from trilane.training import train as command  # noqa: E402
-from trilane.training.dataset import create_group  # noqa: E402
+from trilane.training.dataset import create_group, open_groups  # noqa: E402
 from trilane.training.first_texture import used_texels  # noqa: E402
 from trilane.training.subject import Person, Subject  # noqa: E402
 from trilane.training.surface import body_arrays  # noqa: E402
@@ -189,6 +189,46 @@ def test_samples_of_another_capture_or_body_are_refused(changed: dict[str, Any],
     own |= {"body": sha256_of([BODY])}
     (there.work / "samples.json").write_text(json.dumps(own | changed))
     with pytest.raises(BadInputError, match=rf"samples\.json: found .*{said}.*use another --work folder"):
+        train_avatar(there, settings(), Told())
+
+
+@pytest.mark.usefixtures("log")
+def test_what_an_ended_draw_left_is_not_trained_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The ended draw made a shape that another has not. With the same settings the draw begins again."""
+    there, whole = places(tmp_path), command.write_dataset
+
+    def ended(_source: Any, _samples: Any, folder: Path, *_: Any) -> None:
+        create_group(folder, (64, 32), np.zeros(3, np.int8))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "write_dataset", ended)
+    with pytest.raises(KeyboardInterrupt):
+        train_avatar(there, settings(), Told())
+    monkeypatch.setattr(command, "write_dataset", whole)
+    (there.work / "offsets.npz").write_bytes(b"of seed 1")
+    for other in ({"samples": 9}, {"seed": 2}):
+        with pytest.raises(BadInputError, match=r"samples\.json: found .*use another --work folder"):
+            train_avatar(there, settings(**other), Told())
+    train_avatar(there, settings(), Told())
+    assert [group.shape for group in open_groups(there.work / "samples")] == [SHAPE]
+    assert not list(there.work.glob(".trilane-*"))
+
+
+@pytest.mark.usefixtures("log")
+def test_samples_of_unknown_settings_are_refused(tmp_path: Path) -> None:
+    there = places(tmp_path)
+    (there.work / "samples" / "64x32").mkdir(parents=True)
+    with pytest.raises(BadInputError, match=r"found samples without samples\.json, .*use another --work folder"):
+        train_avatar(there, settings(), Told())
+
+
+@pytest.mark.usefixtures("log")
+@pytest.mark.parametrize("name", ["samples.json", "loss-before.json"])
+def test_a_damaged_file_of_a_training_is_refused_by_name(name: str, tmp_path: Path) -> None:
+    there = places(tmp_path)
+    train_avatar(there, settings(), Told())
+    (there.work / name).write_text("{0.5")
+    with pytest.raises(BadInputError, match=rf"{name}: found no valid JSON .*use another --work folder"):
         train_avatar(there, settings(), Told())
 
 

@@ -177,6 +177,15 @@ def test_a_full_disk_is_told_with_its_file(error: Any) -> None:
         raise FileNotFoundError(errno.ENOENT, "x")
 
 
+def test_a_disk_that_is_full_at_the_start_is_told_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        av.error.err_check(-errno.ENOSPC)
+
+    monkeypatch.setattr(av, "open", full)
+    with pytest.raises(UnwrittenError, match=r"\.mp4: no space left on device; free space there"):
+        PresentStage(make_config(tmp_path)).bind([make_slot()], [])
+
+
 def test_no_segment_gives_no_video(tmp_path: Path) -> None:
     assert join_segments([], tmp_path / "video.mp4", FPS) is None
     assert not (tmp_path / "video.mp4").exists()

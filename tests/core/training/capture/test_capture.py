@@ -15,6 +15,7 @@ from PIL import Image
 
 from support.small_inputs import CAMERA, HEIGHT, WIDTH, fit, write_capture_folder
 from trilane.body.body import ShapedBody
+from trilane.body.joints import rodrigues
 from trilane.errors import BadInputError
 from trilane.training.capture import check
 from trilane.training.capture.capture import frames_by_side, open_capture, read_fit, widest_gap_deg
@@ -23,8 +24,10 @@ from trilane.training.capture.capture_file import (
     Fault,
     FaultyCaptureError,
     fault_lines,
+    open_pictures,
     read_capture_file,
 )
+from trilane.unexpected_value import UnexpectedValue
 
 Command = Callable[..., tuple[str, str]]
 
@@ -236,6 +239,64 @@ def test_frames_and_masks_may_be_videos(folder: Path) -> None:
     assert capture.names[2] == "film.mkv#2" and np.array_equal(capture.fits[6].pose, whole.fits[6].pose)
     for number in (5, 2, 2, 7):  # also backwards
         assert np.array_equal(capture.picture(number), pictures[number])
+
+
+def test_a_mask_too_many_is_a_fault_where_it_may_belong_to_another_frame(folder: Path) -> None:
+    """In a video, where masks are found by number; and in a folder, if two have the name of one frame."""
+    masks = [open_capture(folder).picture(number)[..., 3] for number in range(8)]
+    Image.fromarray(masks[0]).save(folder / "masks" / "000.jpg")
+    assert [(fault.where, fault.found) for fault in faults_of(folder)] == [("masks/000.jpg", "a second mask")]
+    video(folder / "masks.mkv", [*masks, masks[0]], "gray")
+    text = (folder / "capture.toml").read_text()
+    (folder / "capture.toml").write_text("masks = 'masks.mkv'\n" + text)
+    assert [(fault.where, fault.found) for fault in faults_of(folder)] == [("masks.mkv", "9 masks for 8 frames")]
+
+
+def test_a_video_that_got_shorter_has_no_such_picture(tmp_path: Path) -> None:
+    grey = np.full((HEIGHT, WIDTH), 90, np.uint8)
+    video(tmp_path / "masks.mkv", [grey] * 4, "gray")
+    masks = open_pictures(tmp_path / "masks.mkv", "mask")
+    video(tmp_path / "masks.mkv", [grey] * 2, "gray")
+    assert np.array_equal(masks.read(1), grey)
+    with pytest.raises(UnexpectedValue, match="found no picture 3, expected the 4 pictures that the video had"):
+        masks.read(3)
+
+
+def test_a_text_with_the_ending_of_a_video_is_refused(tmp_path: Path) -> None:
+    video(tmp_path / "other.mkv", [np.zeros((HEIGHT, WIDTH), np.uint8)], "gray")
+    (tmp_path / "masks.mkv").write_text("ffconcat version 1.0\nfile other.mkv\n")
+    with pytest.raises(BadInputError, match="found text"):
+        open_pictures(tmp_path / "masks.mkv", "mask")
+
+
+TURN = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+
+
+@pytest.mark.parametrize(
+    ("matrix", "is_taken"),
+    [
+        (TURN, True),
+        (np.round(rodrigues(np.array([0.4, -0.3, 0.7])), 3), True),
+        (np.zeros((3, 3)), False),
+        (1.02 * TURN, False),
+        (np.diag([1.0, 1, -1]), False),
+        (TURN + np.eye(3), False),
+    ],
+    ids=["turn", "three digits", "zeros", "scaled", "mirrored", "sheared"],
+)
+def test_only_a_rotation_is_taken_as_one(matrix: np.ndarray, is_taken: bool, folder: Path) -> None:
+    own = {"camera_rotation": matrix, "camera_translation": np.zeros(3)}
+    body = open_capture(folder).shaped.body
+    found, faults = read_fit("a.npz", {name: np.asarray(value) for name, value in (fit(2) | own).items()}, body, True)
+    assert (found is not None) == is_taken
+    said = [] if is_taken else ["a matrix that is no rotation"]
+    assert [fault.found for fault in faults] == said
+    text = (folder / "capture.toml").read_text()
+    (folder / "capture.toml").write_text(text + f"rotation = {matrix.tolist()}\n")
+    if is_taken:
+        read_capture_file(folder)
+    else:
+        assert [(fault.where, fault.found) for fault in faults_of(folder)] == [("capture.toml: camera.rotation", *said)]
 
 
 def test_the_widest_gap_goes_over_the_turn() -> None:
