@@ -22,7 +22,7 @@ from trilane.hw_profiles.graph_file import fed_inputs, read_graph
 from trilane.pipeline.description import LONGEST_NAME
 from trilane.pipeline.file_keys import PortType
 from trilane.pipeline.pipeline_file import read_pipeline
-from trilane.stages.gpu.video_reader import require_video
+from trilane.stages.gpu.video_reader import open_video, require_video
 from trilane.writing import write_bytes
 
 A_VIDEO = "a video that PyAV reads"
@@ -176,7 +176,7 @@ def _video(path: Path) -> tuple[int, int, float]:
     """
     require_video(path)
     try:
-        with av.open(str(path), metadata_errors="replace") as container:
+        with open_video(path) as container:
             stream = container.streams.video[0]
             return stream.width, stream.height, round(float(stream.average_rate or stream.guessed_rate or 30), 3)
     except (av.FFmpegError, IndexError, ValueError) as error:

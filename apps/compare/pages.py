@@ -38,6 +38,7 @@ from trilane.apps.compare.frontier import SAME_DB, frontier, knees
 from trilane.apps.compare.overview import Entry, table_rows, told_choices
 from trilane.apps.compare.rows import Figure
 from trilane.hw_profiles.schema import SHARE_TEXT
+from trilane.stages.gpu.video_reader import open_video
 
 UNITS = {"frame_ms": "frame, ms", "low_ms": "from, ms", "high_ms": "to, ms", "latency_ms": "latency, ms"}
 UNITS |= {"psnr_db": "PSNR, dB", "worst_psnr_db": "worst frame, dB", "p1_psnr_db": "1st percentile, dB"}
@@ -368,7 +369,7 @@ def still(video: Path) -> bytes | None:
     None is returned if the video cannot be read.
     """
     try:
-        with av.open(str(video)) as container:
+        with open_video(video) as container:
             stream = container.streams.video[0]
             if stream.duration:
                 container.seek(stream.duration // 2, stream=stream)

@@ -44,6 +44,7 @@ from trilane.errors import BadInputError
 from trilane.pipeline.journal import NAME, Begun, Ended, Record, Stepped, journal_in, read_journal
 from trilane.pipeline.unit_history import UNEXPLAINED
 from trilane.scheduler.ledger import idle_causes
+from trilane.stages.gpu.video_reader import open_video
 
 FIRST_SPAN_MS: Final = 5000.0
 FIGURES_EVERY_MS: Final = 1000.0
@@ -238,7 +239,7 @@ class _RunPictures:
         self._fps = fps
         self._container: Any = None
         with suppress(OSError, av.error.FFmpegError, IndexError):  # the run was not recorded, or has no pictures
-            container = av.open(str(path))
+            container = open_video(path)
             self._stream: Any = container.streams.video[0]
             self._container = container
 

@@ -47,7 +47,7 @@ from trilane.scene.recordings import Detected
 from trilane.scene.rotations import matrix_from_quat
 from trilane.scene.schema import AvatarSpec, CameraSpec, load_scene
 from trilane.stages.gpu.background import MOST_PACKETS, is_picture, open_background, pictures_in, read_picture, survey
-from trilane.stages.gpu.video_reader import quarters_of
+from trilane.stages.gpu.video_reader import open_video, quarters_of
 
 MOMENTS = 6
 MOST_PATH_POINTS = 2000
@@ -411,7 +411,7 @@ def inspect_video(path: Path) -> Inspection:
     """Describe a video. Raises BadInputError if the video cannot be a background."""
     footage = survey(path, FOLDER_FPS)
     try:
-        with av.open(str(path), metadata_errors="replace") as container:
+        with open_video(path) as container:
             stream = container.streams.video[0]
             pixels, codec = stream.format, stream.codec_context.name
             rate = float(stream.average_rate) if stream.average_rate else None
@@ -435,7 +435,7 @@ def inspect_video(path: Path) -> Inspection:
 
 def _counted(path: Path) -> int:
     """Return the number of frames in a video file, counted up to MOST_PACKETS packets."""
-    with av.open(str(path), metadata_errors="replace") as container:
+    with open_video(path) as container:
         packets = container.demux(container.streams.video[0])
         return sum(packet.size > 0 for packet in itertools.islice(packets, MOST_PACKETS))
 

@@ -25,7 +25,7 @@ from trilane.errors import BadInputError
 from trilane.pipeline.stage import Arrays, PortedStage, UnitContext
 from trilane.stages.cpu.present import Segment
 from trilane.stages.gpu.background import pictures_in, read_picture
-from trilane.stages.gpu.video_reader import VideoReader, require_video, video_stream
+from trilane.stages.gpu.video_reader import VideoReader, open_video, require_video, video_stream
 from trilane.transport.live_window import LiveWindow
 
 DEFAULT_FPS = 30.0
@@ -51,7 +51,7 @@ def footage(path: Path) -> FoundPictures:
         return FoundPictures(len(pictures_in(path)), None)
     require_video(path)
     try:
-        with av.open(str(path), metadata_errors="replace") as container:
+        with open_video(path) as container:
             stream = video_stream(container, path)
             rate = stream.average_rate or stream.guessed_rate
             count = stream.frames or sum(packet.size > 0 for packet in container.demux(stream))

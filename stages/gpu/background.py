@@ -37,6 +37,7 @@ from trilane.stages.gpu.video_reader import (
     DEFAULT_STEP_S,
     VideoReader,
     check_size,
+    open_video,
     pixels_of,
     quarters_of,
     require_video,
@@ -273,7 +274,7 @@ def _size(stored: Stored) -> str:
 def _video(path: Path) -> Footage:
     require_video(path)
     try:
-        with av.open(str(path), metadata_errors="replace") as container:
+        with open_video(path) as container:
             stream = video_stream(container, path)
             frame = next(iter(container.decode(stream)), None)
             if frame is None:
@@ -282,7 +283,7 @@ def _video(path: Path) -> Footage:
             pixels, codec = pixels_of(stream), stream.codec_context.name
             stored = Stored((frame.height, round(frame.width * pixels.aspect)), quarters_of(frame))
             bits = max(component.bits for component in frame.format.components)
-        with av.open(str(path), metadata_errors="replace") as container:
+        with open_video(path) as container:
             times = _times(container, path)
     except (av.FFmpegError, ValueError) as error:
         raise BadInputError(path, f"no readable video ({error})", "a video that FFmpeg can decode") from error

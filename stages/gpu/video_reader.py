@@ -35,6 +35,11 @@ from trilane.errors import BadInputError
 from trilane.files import HEAD_BYTES, PICTURE, VIDEO, require_file, signature_of_head
 from trilane.scene.lens import cover
 
+#: Containers whose reader opens no other file, by FFmpeg's names. Readers of playlists and of numbered pictures do.
+CONTAINERS = (
+    "mov,matroska,webm,avi,mpegts,mpeg,mpegvideo,m4v,h264,hevc,av1,obu,ivf,ogg,flv,asf,dv,mxf,nut,gif,mjpeg,"
+    "yuv4mpegpipe,apng,webp_pipe,png_pipe,jpeg_pipe,bmp_pipe,tiff_pipe"
+)
 PQ, HLG = "PQ", "HLG"
 #: Light of white on a common display, and the brightest light of a video that is still reduced, not cut; cd/m2.
 WHITE, PEAK = 203.0, 1000.0
@@ -230,7 +235,7 @@ class VideoReader:
     def _one_round(self, seek_s: float) -> Iterator[tuple[float, U8]]:
         """Yield (time, picture) from the last key frame before `seek_s` on. The file's first frame has time 0."""
         try:
-            with av.open(str(self._path), metadata_errors="replace") as container:
+            with open_video(self._path) as container:
                 stream = video_stream(container, self._path)
                 if self._start_s is not None and 0 < seek_s < (container.duration or 0) / MICROSECONDS:
                     container.seek(round((self._start_s + seek_s) * MICROSECONDS))
@@ -287,6 +292,14 @@ def check_size(path: Path, frame: Any) -> None:
     """Raise BadInputError if `frame` of `path` is too large."""
     if frame.width * frame.height > MAX_PIXELS:
         raise BadInputError(path, f"{frame.width}x{frame.height} pixels", f"at most {MAX_PIXELS} pixels")
+
+
+def open_video(path: Path) -> Any:
+    """Return the open file as a container, for reading.
+
+    Raises av.FFmpegError for a file that is no video, or that makes FFmpeg open another file.
+    """
+    return av.open(str(path), metadata_errors="replace", options={"format_whitelist": CONTAINERS})
 
 
 def require_video(path: Path) -> None:

@@ -22,7 +22,7 @@ from trilane.errors import BadInputError, did_you_mean, reason
 from trilane.files import read_text
 from trilane.scene.lens import Lens
 from trilane.scene.schema import LISTED, Finite, Table
-from trilane.stages.gpu.video_reader import require_video
+from trilane.stages.gpu.video_reader import open_video, require_video
 from trilane.unexpected_value import UnexpectedValue, expected_in, unexpected_in
 
 # The faults of a capture are listed together, so that a person can fix all of them before the next try.
@@ -315,7 +315,7 @@ class PictureVideo:
 
     def _frames(self) -> Iterator[Any]:
         try:
-            with av.open(str(self._path)) as container:
+            with open_video(self._path) as container:
                 yield from container.decode(video=0)
         except (av.FFmpegError, IndexError) as error:
             found = f"a video that cannot be decoded ({error})"

@@ -361,6 +361,10 @@ def test_a_text_that_names_another_video_is_refused(tmp_path: Path) -> None:
         video.footage(tmp_path / "list.txt")
     with pytest.raises(BadInputError, match=r"list\.txt: found text, expected a video"):
         Ported(video.build_video, {}, {"": "u8 16x32x3"}, tmp_path, path="list.txt", fps=25.0)
+    # A byte that no text has makes the head look like a video's, but FFmpeg still takes the list.
+    (tmp_path / "list.mp4").write_text("ffconcat version 1.0\n#\x01\nfile other.mp4\n")
+    with pytest.raises(BadInputError, match=r"list\.mp4: found no readable video"):
+        video.footage(tmp_path / "list.mp4")
 
 
 def test_a_folder_is_in_the_order_of_numbers_and_refused_if_it_cannot_be_read(
