@@ -263,6 +263,10 @@ class Core:
         frame = self.frames.get(job.frame) or self.flow.gone.get(job.frame)
         return None if frame is None else frame.ready_ns[self._stage_named[job.stage].position]
 
+    def deadline_ns(self, job: Job) -> int:
+        """Return the deadline in ns, or NEVER, of the frame of a job that a unit holds."""
+        return (self.frames.get(job.frame) or self.flow.gone[job.frame]).deadline_ns
+
     def _step_work(self, ladder: WorkLadder, stage: StageState, frame: FrameState, service_ns: int) -> None:
         """Give the ladder a measured service time; if this changes the rung, set the estimates of all stages to it."""
         ladder.learn(stage.position, frame.rung, service_ns)
