@@ -148,7 +148,7 @@ class Core:
         `events`: events since the last step. Those after the finish are ignored.
 
         Raises KeyError for an unknown unit or stage, and UnitLifeError for an event that cannot happen to a unit now.
-        Raises ValueError for a frame that skips where no bypass begins.
+        Raises ValueError for a frame that skips where no bypass begins, and for a rung that the ladder does not have.
         """
         self.now_ns = now_ns
         self.actions = []
