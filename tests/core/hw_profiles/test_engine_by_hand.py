@@ -102,7 +102,11 @@ def test_a_batch_normalisation_behind_an_activation_is_a_layer(activation: str) 
         node("Conv", "x w0", "a", kernel_shape=[1, 1]),
         *(node(activation, "a", "b"), node("BatchNormalization", "b w1 w2 w3 w4", "y")),
     ]
-    shapes = {**dict.fromkeys("xaby", (1, 8, 4, 4)), "w0": (8, 8, 1, 1), **dict.fromkeys(("w1", "w2", "w3", "w4"), (8,))}
+    shapes = {
+        **dict.fromkeys("xaby", (1, 8, 4, 4)),
+        "w0": (8, 8, 1, 1),
+        **dict.fromkeys(("w1", "w2", "w3", "w4"), (8,)),
+    }
     assert [layer.op_type for layer in layers_of_nodes(nodes, shapes)] == ["Conv", "BatchNormalization"]
 
 
