@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 from dataclasses import dataclass
 from functools import lru_cache
-from math import gcd, inf, prod
+from math import gcd, inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -129,12 +129,6 @@ def _decoder(b: GraphBuilder, features: list[TensorRef]) -> TensorRef:
             x = b.op("Concat", [x.name, skip.name], (x.channels + skip.channels, x.height, x.width), axis=1)
         x = b.unit(b.unit(x, width, 3), width, 3)
     return x
-
-
-def parameters(model: Any) -> int:
-    """Return the number of weights and biases of a model made by `build_network`."""
-    weights = [info.type.tensor_type.shape.dim for info in model.graph.input if info.name.startswith("w")]
-    return sum(prod(size.dim_value for size in shape) for shape in weights)
 
 
 @dataclass(frozen=True)
