@@ -132,5 +132,5 @@ def test_too_many_open_files_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
         raise OSError(errno.EMFILE, "Too many open files")
 
     monkeypatch.setattr(os, "memfd_create", full)
-    with pytest.raises(TrilaneError, match="^no memory for assets: too many open files$"):
+    with pytest.raises(TrilaneError, match=r"^no memory for assets: too many open files$"):
         share_assets({"a": np.zeros(3)})

@@ -103,7 +103,7 @@ def test_too_many_open_files_are_told(call: str, monkeypatch: pytest.MonkeyPatch
         raise OSError(24, "Too many open files")
 
     monkeypatch.setattr(call, full)
-    with pytest.raises(TrilaneError, match="^no memory for edge e: too many open files$"):
+    with pytest.raises(TrilaneError, match=r"^no memory for edge e: too many open files$"):
         create_region("e", RegionLayout(1, SlotLayout(header_dtype(), 1)))
 
 
