@@ -82,11 +82,15 @@ COLUMNS = ("network", "chip", "hexagon", "precision", "runtime", "ms", "caution"
 
 
 class PublishedTime(NamedTuple):
-    """A published time and the predicted time, both for the same runtime."""
+    """A published time and the predicted time, both for the same runtime.
+
+    `independent`: True if no number of the profile comes from this published time.
+    """
 
     profile: str
     network: str
     runtime: EngineRuntime
+    independent: bool
     published_ms: float
     predicted_ms: float
 
@@ -144,7 +148,7 @@ def check_published(name: str, profile: Profile) -> list[PublishedTime]:
             running = unit.model_copy(update={"engine_runtime": runtime})
             if running.engine is not None:
                 predicted = time_on(running, profile.memory, WORK[network](), clock).total_ms
-                checks.append(PublishedTime(name, network, runtime, ms, predicted))
+                checks.append(PublishedTime(name, network, runtime, False, ms, predicted))
     return checks
 
 

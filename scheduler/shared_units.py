@@ -258,7 +258,7 @@ class BesideDriver:
                 raise RuntimeError(f"{action} of pipeline {line.number}: its hang_ns is shorter than a job takes")
         if line.recording is not None:
             line.recording.add(self._now_ns, events, actions, line.core)
-        if line.core.finished:
+        if line.core.outcome is not None:
             for unit in line.units.values():
                 unit.queue.clear()
 

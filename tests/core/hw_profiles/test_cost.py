@@ -405,6 +405,7 @@ def test_profiles_are_within_a_quarter_of_published_times_that_the_fit_has_seen(
     assert len(checks) == sum(len(times) for networks in PUBLISHED_MS.values() for times in networks.values())
     for check in checks:
         assert abs(check.error) < 0.25, check
+        assert not check.independent
 
 
 def test_a_published_time_is_compared_with_the_runtime_that_it_is_of() -> None:
