@@ -168,10 +168,11 @@ class Body:
     def has_pose_blend_shapes(self) -> bool:
         return self.posedirs is not None
 
+    @np.errstate(over="ignore", invalid="ignore")  # the vertices are checked
     def shape(self, betas: ArrayLike = (), expression: ArrayLike = ()) -> ShapedBody:
         """Return the body shaped by up to S `betas` and up to E `expression` coefficients; missing coefficients are 0.
 
-        Raises BadInputError when there are too many coefficients, or when some are not finite.
+        Raises BadInputError when there are too many coefficients, or when some or their vertices are not finite.
         """
         rest = self.v_template.astype(np.float64)
         for name, dirs, coefficients in (
@@ -187,7 +188,10 @@ class Body:
         joints = self.j_regressor.astype(np.float64) @ rest
         if self.offsets is not None:
             rest += self.offsets
-        return ShapedBody(_frozen(rest.astype(np.float32)), _frozen(joints), self)
+        vertices = rest.astype(np.float32)
+        if not np.isfinite(vertices).all():
+            raise BadInputError("betas and expression", "vertices that are not finite", "smaller coefficients")
+        return ShapedBody(_frozen(vertices), _frozen(joints), self)
 
     def full_pose(self, poses: ArrayLike, flat_hand_mean: bool) -> F64:
         """Return a copy of `poses` whose hand poses are absolute, which means that they contain the mean hand pose.

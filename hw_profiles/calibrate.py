@@ -49,6 +49,7 @@ from trilane.hw_profiles.network_time import Interval, in_precision, interval, p
 from trilane.hw_profiles.network_work import Work
 from trilane.hw_profiles.operators import NAMES, RATES, TERMS
 from trilane.hw_profiles.profile_files import load_tables, parse_profile
+from trilane.hw_profiles.reference_networks import header_of, numbered_lines
 from trilane.hw_profiles.schema import (
     KEY_OF_RATE,
     MOST_ERROR_SCALE,
@@ -164,12 +165,14 @@ class Calibrated:
 
 
 def is_own_table(path: Path) -> bool:
-    """Return whether `path` is a table of networks in files. A table of reference networks has a column `encoder`."""
+    """Return whether the table `path` lists networks in files. A table of reference networks has a column `encoder`.
+
+    Raises BadInputError for a file that is no text, and for a column that comes twice.
+    """
     if not path.is_file():
         return False
-    lines = [line for line in read_text(path, "a table of measured rows").splitlines() if not line.startswith("#")]
-    header = [cell.strip() for cell in next(csv.reader(lines[:1]), [])]
-    return "encoder" not in header
+    lines = numbered_lines(read_text(path, "a table of measured rows"))
+    return not lines or "encoder" not in header_of(path, *lines[0])
 
 
 def read_own_rows(path: Path, folder: Path) -> list[OwnRow]:
@@ -179,12 +182,11 @@ def read_own_rows(path: Path, folder: Path) -> list[OwnRow]:
 
     Raises BadInputError.
     """
-    text = read_text(path, "a table of measured rows")
-    numbered = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
+    numbered = numbered_lines(read_text(path, "a table of measured rows"))
     if not LEAST_ROWS <= len(numbered) - 1 <= MOST_ROWS:
         raise BadInputError(path, f"{max(len(numbered) - 1, 0)} rows", f"{LEAST_ROWS} to {MOST_ROWS}")
     first, line = numbered[0]
-    header = [cell.strip() for cell in next(csv.reader([line]))]
+    header = header_of(path, first, line)
     if not {"network", "ms"} <= set(header):
         expected = f"network and ms, and maybe {', '.join(column for column, *_ in WORDS)}"
         remedy = "separate cells by commas" if ";" in line or "\t" in line else "name the columns so in the first line"

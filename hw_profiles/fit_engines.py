@@ -31,6 +31,7 @@ import numpy as np
 
 from trilane.arrays import F64, I64
 from trilane.errors import BadInputError
+from trilane.files import read_text
 from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.network_work import Work, count_work
 from trilane.hw_profiles.operators import NAMES, RATES, TERMS, Layers
@@ -172,31 +173,41 @@ class Latency(NamedTuple):
 
 def read_latencies(folder: Path) -> list[Latency]:
     """Return the rows of `chip_rows.csv` whose networks ran on the engine. Raises BadInputError."""
-    families = {row["name"]: row["family"] for row in _table(folder / "networks.csv") if row["split"] != "extra"}
-    rows = _table(folder / "chip_rows.csv")
-    if not rows or set(COLUMNS) - rows[0].keys():
-        raise BadInputError(folder / "chip_rows.csv", "other columns", "the columns " + ", ".join(COLUMNS))
+    networks = _table(folder / "networks.csv", ("name", "split", "family"))
+    families = {row["name"]: row["family"] for _, row in networks if row["split"] != "extra"}
     return [
         Latency(
             row["network"],
             families[row["network"]],
             row["chip"],
             row["hexagon"],
-            ENGINE_OF[row["precision"], row["runtime"]],
-            float(row["ms"]),
+            *_engine_and_ms(place, row),
             row["use"] == "anchor",
         )
-        for row in rows
+        for place, row in _table(folder / "chip_rows.csv", COLUMNS)
         if row["network"] in families and not any(words in row["caution"] for words in NOT_OF_THE_ENGINE)
     ]
 
 
-def _table(path: Path) -> list[dict[str, str]]:
+def _engine_and_ms(place: str, row: Mapping[str, str]) -> tuple[EngineName, float]:
+    ran = row["precision"], row["runtime"]
+    if ran not in ENGINE_OF:
+        raise BadInputError(place, ", ".join(ran), f"one of {'; '.join(', '.join(each) for each in ENGINE_OF)}")
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            return list(csv.DictReader(file))
-    except OSError as error:
-        raise BadInputError.of_os_error(path, error, "a CSV file that can be read") from None
+        ms = float(row["ms"])
+    except ValueError:
+        ms = math.nan
+    if not 0 < ms < math.inf:
+        raise BadInputError(f"{place}: ms", repr(row["ms"]), "a time in ms above 0")
+    return ENGINE_OF[ran], ms
+
+
+def _table(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str, str]]]:
+    """Return pairs (file and line, cells by column) of a table, with "" for a cell that its row lacks."""
+    reader = csv.DictReader(read_text(path, "a CSV file").splitlines(), restval="")
+    if missing := [column for column in columns if column not in (reader.fieldnames or ())]:
+        raise BadInputError(path, f"no column {', '.join(missing)}", f"the columns {', '.join(columns)}")
+    return [(f"{path}: line {reader.line_num}", row) for row in reader]
 
 
 @lru_cache(maxsize=128)

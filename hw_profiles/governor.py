@@ -430,7 +430,7 @@ def caps_of(moments: Sequence[Moment]) -> Throttling:
 
 
 def timeline_of(moments: Sequence[Moment]) -> list[dict[str, Any]]:
-    """Return every n-th moment as JSON values; of more than MOST_SHOWN moments, fewer than 2 * MOST_SHOWN remain."""
+    """Return every n-th moment as JSON values, with the least n such that at most MOST_SHOWN remain."""
     return [
         {
             "t_s": m.t_s,
@@ -440,7 +440,7 @@ def timeline_of(moments: Sequence[Moment]) -> list[dict[str, Any]]:
             "power_w": m.power_w,
             "corners": dict(zip(UNITS, m.corners, strict=True)),
         }
-        for m in moments[:: max(1, len(moments) // MOST_SHOWN)]
+        for m in moments[:: max(1, -(-len(moments) // MOST_SHOWN))]
     ]
 
 

@@ -233,12 +233,17 @@ STAND_INS = {
 
 Values = dict[str, NDArray[np.generic]]
 
-#: Operators whose results are no larger than all their inputs together, or than the product of their inputs.
-_BOUNDED = frozenset(
+#: Operators whose results have the common shape of all their inputs.
+_BROADCAST = frozenset(
     (
         *("Add", "Sub", "Mul", "Div", "Mod", "Min", "Max", "Neg", "Abs", "Floor", "Ceil", "Round", "Sqrt", "Pow"),
         *("Equal", "Greater", "GreaterOrEqual", "Less", "LessOrEqual", "And", "Or", "Not", "Where", "Cast"),
-        *("Concat", "Gather", "Slice", "Squeeze", "Unsqueeze", "Reshape", "Transpose", "Identity", "Split"),
+    )
+)
+#: Operators whose results are no larger than the product of two inputs.
+_BOUNDED = frozenset(
+    (
+        *("Gather", "Slice", "Squeeze", "Unsqueeze", "Reshape", "Transpose", "Identity", "Split"),
         *("ReduceProd", "ReduceSum", "ReduceMax", "ReduceMin"),
     )
 )
@@ -502,4 +507,11 @@ def _is_small(node: onnx.NodeProto, values: Sequence[NDArray[np.generic]]) -> bo
     if node.op_type in ("ConstantOfShape", "Expand") and values:
         sizes = values[-1].astype(np.int64).ravel().tolist()
         return all(size >= 0 for size in sizes) and prod(sizes) * values[0].size <= KEPT_ELEMENTS
+    if node.op_type == "Concat":
+        return sum(value.size for value in values) <= KEPT_ELEMENTS
+    if node.op_type in _BROADCAST and values:
+        try:
+            return prod(np.broadcast_shapes(*(value.shape for value in values))) <= KEPT_ELEMENTS
+        except ValueError:  # shapes that do not fit, or a result that is too large for NumPy
+            return False
     return node.op_type in _BOUNDED and bool(values)

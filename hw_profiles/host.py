@@ -202,7 +202,7 @@ def network_threads() -> int:
 
     The unit's peak rates in this profile are the rates of as many cores.
     """
-    return max(1, len(usable_cores()) - 2)
+    return len(split_cores(usable_cores())["dsp"])
 
 
 def _runtimes(flag: str) -> dict[str, Any]:

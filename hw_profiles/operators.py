@@ -380,6 +380,7 @@ def layers_of(graph: Any, shapes: Shapes, constants: set[str]) -> Layers:
     """
     names = _Graph(graph, shapes, constants)
     layers: dict[str, EngineLayer] = {}
+    activated: set[str] = set()  # results of layers that have taken up an activation
     for node in names.nodes:
         if _renames(node) or not names.given(node):
             continue
@@ -391,7 +392,8 @@ def layers_of(graph: Any, shapes: Shapes, constants: set[str]) -> Layers:
         if kind in FOLDED_ACTIVATIONS and taker in TAKES:
             layers[before[0].writes] = before[0]._replace(amounts={**before[0].amounts, **_clip(node, shapes)})
             names.rename(node.output[0], before[0].writes)
-        elif node.op_type == "BatchNormalization" and taker in PLAIN_PRODUCTS:
+            activated.add(before[0].writes)
+        elif node.op_type == "BatchNormalization" and taker in PLAIN_PRODUCTS and before[0].writes not in activated:
             names.rename(node.output[0], before[0].writes)
         elif sigmoid is not None:
             del layers[sigmoid.writes]

@@ -19,6 +19,7 @@ from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import GraphFile
@@ -35,7 +36,7 @@ from trilane.pipeline.file_graph import (
     skips_of,
     source_ns,
 )
-from trilane.pipeline.file_keys import OnnxStage, StageTime
+from trilane.pipeline.file_keys import LONGEST_MS, OnnxStage, StageTime
 from trilane.pipeline.pipeline_file import PipelineFile
 from trilane.scheduler.events import Graph, Settings, Stop
 from trilane.scheduler.period_bound import PeriodBound, period_bound
@@ -127,11 +128,18 @@ def measured_price(file: PipelineFile, name: str, measured: MeasuredStages) -> S
     """Return the time of the stage `name` from a run on this machine; None if the stage was not measured.
 
     For another chip, the stage's key `scale` multiplies the time; without this key, the result is None.
+
+    Raises BadInputError for a `scale` that makes a time too long.
     """
     factor = 1.0 if measured.chip == HOST else file.stages[name].scale.get(measured.chip)
     if name not in measured.times or factor is None:
         return None
-    time = measured.times[name].times(factor)
+    try:
+        time = measured.times[name].times(factor)
+    except ValidationError:
+        found = f"{factor:g} times {measured.times[name].mean_ms:g} ms"
+        where = f"{file.path}: stages.{name}.scale.{measured.chip}"
+        raise BadInputError(where, found, f"a time of at most {LONGEST_MS:g} ms") from None
     source = f"measured in {measured.run}" + (f", times {factor:g}" if measured.chip != HOST else "")
     return StagePrice(time, source, *interval_around(time.mean_ms, MODEL_ERROR), is_measured=True)
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import csv
 from dataclasses import dataclass
 from functools import lru_cache
-from math import gcd, inf, prod
+from math import gcd, inf
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -131,12 +131,6 @@ def _decoder(b: GraphBuilder, features: list[TensorRef]) -> TensorRef:
     return x
 
 
-def parameters(model: Any) -> int:
-    """Return the number of weights and biases of a model made by `build_network`."""
-    weights = [info.type.tensor_type.shape.dim for info in model.graph.input if info.name.startswith("w")]
-    return sum(prod(size.dim_value for size in shape) for shape in weights)
-
-
 @dataclass(frozen=True)
 class ConfigurationRow:
     """One row of a table of configurations.
@@ -188,18 +182,29 @@ def read_table(path: Path) -> list[ConfigurationRow]:
         raise BadInputError(path, str(error), "text in UTF-8") from None
     except OSError as error:
         raise BadInputError.of_os_error(path, error, "a file that can be read") from None
-    lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
+    lines = numbered_lines(text)
     if len(lines) < 2:
         raise BadInputError(path, "no rows", "a header and at least one row")
     if len(lines) > MAX_ROWS:
         raise BadInputError(path, f"{len(lines)} rows", f"at most {MAX_ROWS}")
-    header = [cell.strip() for cell in next(csv.reader([lines[0][1]]))]
-    if repeated := [key for key in dict.fromkeys(header) if header.count(key) > 1]:
-        raise BadInputError(f"{path}: line {lines[0][0]}", f"column {repeated[0]!r} twice", "every column once")
+    header = header_of(path, *lines[0])
     missing = [key for key in KEYS if key not in header]
     if missing:
         raise BadInputError(f"{path}: line {lines[0][0]}", f"no column {', '.join(missing)}", ", ".join(KEYS))
     return [_row(f"{path}: line {n}", header, next(csv.reader([line]))) for n, line in lines[1:]]
+
+
+def numbered_lines(text: str) -> list[tuple[int, str]]:
+    """Return pairs (number, line) of the lines of a table that are neither blank nor comments; numbers begin at 1."""
+    return [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip() and not line.startswith("#")]
+
+
+def header_of(path: Path, number: int, line: str) -> list[str]:
+    """Return the columns that the header `line` of `path` names. Raises BadInputError for a column that comes twice."""
+    header = [cell.strip() for cell in next(csv.reader([line]))]
+    if repeated := [key for key in header if header.count(key) > 1]:
+        raise BadInputError(f"{path}: line {number}", f"column {repeated[0]!r} twice", "every column once")
+    return header
 
 
 def _row(place: str, header: list[str], cells: list[str]) -> ConfigurationRow:

@@ -42,6 +42,8 @@ from trilane.units import NS_PER_MS
 
 LONGEST_FOUND = 120  # characters of a wrong value that a message shows
 LONGEST_NAME = 40  # characters of a stage or unit; a socket of that name must fit into a path of 107 bytes
+#: Only ASCII: each character is one byte of a path, and the name is a key of TOML without quotes.
+LETTERS = "[A-Za-z0-9_-]"
 MOST_EDGES = 200  # edges of one unit; all its descriptors must fit into one message of 250 descriptors
 FACTORY = r"^[A-Za-z_][\w.]*:[A-Za-z_]\w*$"
 
@@ -136,8 +138,8 @@ class PipelineStage(Described):
     `every`: distance between the frames that the stage takes: 3 for the first, the fourth and so on.
     """
 
-    name: str = Field(pattern=r"^[\w-]+$", max_length=LONGEST_NAME)
-    unit: str = Field(pattern=r"^[\w-]+$", max_length=LONGEST_NAME)
+    name: str = Field(pattern=f"^{LETTERS}+$", max_length=LONGEST_NAME)
+    unit: str = Field(pattern=f"^{LETTERS}+$", max_length=LONGEST_NAME)
     factory: str = Field(pattern=FACTORY)
     settings: dict[str, Any] = {}
     pace_ns: int = Field(default=0, ge=0)
@@ -365,7 +367,7 @@ def unsaid(pipeline: Pipeline) -> Iterator[str]:
 def file_text(tables: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
     """Return the text of a pipeline file, TOML with one line for each key of a table.
 
-    A stage is one key of the table [stages]. Keys have no quotes, so names of stages and units must be ASCII.
+    A stage is one key of the table [stages].
 
     `tables`: tables of the file, such as from `tables_of`. `comments`: lines before the tables.
     """
@@ -379,4 +381,4 @@ def file_text(tables: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
 def _value(value: object) -> str:
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key} = {_value(each)}" for key, each in value.items()) + " }"
-    return json.dumps(value, ensure_ascii=False)
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")  # JSON leaves it as it is

@@ -20,7 +20,7 @@ from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Fie
 
 from trilane.errors import did_you_mean
 from trilane.options import one_of
-from trilane.pipeline.description import FACTORY, LONGEST_NAME
+from trilane.pipeline.description import FACTORY, LETTERS, LONGEST_NAME
 from trilane.scheduler.policy import MOST_FRAMES, PACED_WORDS, POLICIES, POLICY_WORDS
 from trilane.transport.slots import EDGE_WORDS, edge_rule
 from trilane.unexpected_value import UnexpectedValue
@@ -34,9 +34,12 @@ LONGEST_MS: Final = 3.6e6  # longest time of a job, an hour
 ONE_TIME: Final = "mean with or without sd, exponential, samples, or from with or without name"
 MOST_SDS: Final = 1000  # largest standard deviation of a time, as a multiple of its mean
 RUNTIMES: Final = ("ort", "openvino", "qnn", "cuda")
-NAME: Final = rf"^[\w-]{{1,{LONGEST_NAME}}}$"
+NAME: Final = f"^{LETTERS}{{1,{LONGEST_NAME}}}$"
 #: The expected form of a text, by its pattern; for messages.
-FORMS: Final = {NAME: f"at most {LONGEST_NAME} letters, digits, _ and -", FACTORY: "MODULE:FACTORY, such as crop:best"}
+FORMS: Final = {
+    NAME: f"at most {LONGEST_NAME} letters from a to z or A to Z, digits, _ and -",
+    FACTORY: "MODULE:FACTORY, such as crop:best",
+}
 #: NumPy's name of each number type that a port may have.
 TYPES: Final = {
     "u8": "uint8",
@@ -181,7 +184,7 @@ def _ports(value: object) -> object:
         raise UnexpectedValue("an empty table", "a port, such as { boxes = 'f32 32x5' }")
     for name in value:
         if not re.fullmatch(NAME, name):
-            raise UnexpectedValue(f"port {name!r}", f"letters, digits, _ and -, at most {LONGEST_NAME}")
+            raise UnexpectedValue(f"port {name!r}", FORMS[NAME])
     return {name: port_type(each) for name, each in value.items()}
 
 

@@ -349,6 +349,7 @@ def _has_form_of_a_run(config: Any) -> TypeGuard[Mapping[str, Any]]:
     units, scene = config.get("units", {}).values(), config.get("scene", {})
     return (
         all(isinstance(unit, Mapping) and isinstance(unit.get("cores", ()), list | tuple) for unit in units)
+        and all(type(threads := unit.get("threads", 1)) is int and threads > 0 for unit in units)
         and isinstance(scene.get("output", {}), Mapping)
         and isinstance(scene.get("fps", 0), int | float)
         and isinstance(config.get("pipeline", {}).get("run", {}), Mapping)

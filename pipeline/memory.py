@@ -95,12 +95,15 @@ def share_assets(assets: Assets) -> int:
     Raises TrilaneError if there is too little memory, or if an array contains anything but numbers, times and text.
     """
     index, end = _index(assets)
-    free = machine.here.free_bytes()
-    if end > free:
-        raise TrilaneError(f"assets: found {end >> 20} MiB, expected at most {free >> 20} MiB, which are free")
+    try:
+        free = machine.here.free_bytes()
+        if end > free:
+            raise TrilaneError(f"assets: found {end >> 20} MiB, expected at most {free >> 20} MiB, which are free")
+        fd = os.memfd_create("trilane:assets", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    except OSError as error:
+        raise TrilaneError(f"no memory for assets: {reason(error)}") from None
     head = json.dumps(index).encode()
     start = _page_up(_LENGTH_BYTES + len(head))
-    fd = os.memfd_create("trilane:assets", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
     try:
         os.posix_fallocate(fd, 0, start + end)
         os.pwrite(fd, len(head).to_bytes(_LENGTH_BYTES, "little") + head, 0)

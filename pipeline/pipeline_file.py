@@ -565,7 +565,7 @@ def _assigned(tables: Mapping[str, Any], text: str) -> dict[str, Any]:
     try:
         read = tomllib.loads(f"value = {value}")
         new = read["value"] if len(read) == 1 else value
-    except ValueError:
+    except (ValueError, RecursionError):
         new = value.strip()
     return _with_value(tables, parts, new)
 

@@ -76,7 +76,10 @@ class ForkedCall:
             self._reads, self._is_open = self._starter.send_call(self._function), True
             answer = self._answer()
             self.close()
-        return json.loads(answer) if answer else None
+        try:
+            return json.loads(answer)
+        except ValueError:  # empty or cut off
+            return None
 
     def _answer(self) -> bytes:
         """Return the bytes from the pipe, until it is closed, ANSWER_S is over, or the fork server is in trouble."""

@@ -148,7 +148,7 @@ class Core:
         `events`: events since the last step. Those after the finish are ignored.
 
         Raises KeyError for an unknown unit or stage, and UnitLifeError for an event that cannot happen to a unit now.
-        Raises ValueError for a frame that skips where no bypass begins.
+        Raises ValueError for a frame that skips where no bypass begins, and for a rung that the ladder does not have.
         """
         self.now_ns = now_ns
         self.actions = []
@@ -262,6 +262,10 @@ class Core:
         """Return the time in ns from which all inputs of a job were there; None if the job's frame is gone."""
         frame = self.frames.get(job.frame) or self.flow.gone.get(job.frame)
         return None if frame is None else frame.ready_ns[self._stage_named[job.stage].position]
+
+    def deadline_ns(self, job: Job) -> int:
+        """Return the deadline in ns, or NEVER, of the frame of a job that a unit holds."""
+        return (self.frames.get(job.frame) or self.flow.gone[job.frame]).deadline_ns
 
     def _step_work(self, ladder: WorkLadder, stage: StageState, frame: FrameState, service_ns: int) -> None:
         """Give the ladder a measured service time. If the rung changes, set all stages' estimates for the new rung."""

@@ -331,7 +331,11 @@ class WorkLadder:
         """Set a stage's isolated time on `rung`, in ns. Call this for all rungs of a stage, or for none.
 
         `position`: position of the stage.
+
+        Raises ValueError for a rung that the ladder does not have.
         """
+        if not 0 <= rung < self._rungs:
+            raise ValueError(f"rung {rung}, but the ladder has {self._rungs}")
         self._alone[position][rung] = max(service_ns, 1)
 
     def learn(self, position: int, rung: int, service_ns: int) -> None:

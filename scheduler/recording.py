@@ -126,7 +126,7 @@ def read(path: Path) -> Recording:
 def replay(recording: Recording) -> Iterator[str]:
     """Feed the events to a new core, and yield one sentence for every step whose actions differ from the recorded ones.
 
-    Raises BadInputError for events of unknown units or frames, and for events that the unit's state does not allow.
+    Raises BadInputError for events of unknown units or frames, and for events that cannot follow.
     """
     core = Core(recording.graph, recording.settings)
     for now_ns, events, actions in recording.steps:
@@ -134,7 +134,7 @@ def replay(recording: Recording) -> Iterator[str]:
             answer = core.step(now_ns, events).actions
         except KeyError as error:
             raise BadInputError(f"the recording at {now_ns} ns", str(error), "a unit and a frame of the run") from None
-        except UnitLifeError as error:
+        except (UnitLifeError, ValueError) as error:
             raise BadInputError(f"the recording at {now_ns} ns", str(error), "events that can follow") from None
         if answer != actions:
             yield f"at {now_ns} ns: recorded {actions}, replayed {answer}"

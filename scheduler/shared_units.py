@@ -258,6 +258,9 @@ class BesideDriver:
                 raise RuntimeError(f"{action} of pipeline {line.number}: its hang_ns is shorter than a job takes")
         if line.recording is not None:
             line.recording.add(self._now_ns, events, actions, line.core)
+        if line.core.outcome is not None:
+            for unit in line.units.values():
+                unit.queue.clear()
 
     def _end(self, running: _Running) -> None:
         """End a job: free its seat, and give its `Core` a `JobDone`."""
@@ -268,7 +271,7 @@ class BesideDriver:
         unit.is_running, unit.last_end_ns = False, now_ns
         begin_ns, before_ns = running.begin_ns, running.preempted_before_ns
         preempted_ns = now_ns - begin_ns - running.had // ONE
-        if line.recording is not None and job.frame in line.core.frames:
+        if line.recording is not None and not line.core.finished:
             ready_ns = line.core.ready_ns(job) or 0
             cpu_ns = now_ns - begin_ns - preempted_ns
             times = (ready_ns, running.waited.dispatch_ns, begin_ns, now_ns, preempted_ns, 0, before_ns, cpu_ns)
@@ -298,7 +301,7 @@ class BesideDriver:
         for line, unit in those:
             job, order, _ = unit.queue[0]
             behind = (line.number - last - 1) % count
-            found[Waiting(behind, line.core.frames[job.frame].deadline_ns, order)] = line, unit
+            found[Waiting(behind, line.core.deadline_ns(job), order)] = line, unit
         return found[min(found, key=self._turn)]
 
     def _begin(self, line: _Line, unit: _Unit) -> None:

@@ -317,7 +317,8 @@ class SharedCores:
     def run(self) -> list[tuple[int, int]]:
         """Run to the end; return a pair (number, time in ns) for each presented frame, in order.
 
-        Raises RuntimeError if nothing can ever happen again, or if the run ends before its last frame.
+        Raises RuntimeError if nothing can ever happen again, if a job takes longer than the `hang_ns` of the settings,
+        or if the run ends before its last frame.
         """
         core, active, heard = self._core, self._active, self._heard
         self._step(0, tuple(UnitReady(unit) for unit in self._units))
@@ -365,6 +366,9 @@ class SharedCores:
                 if unit.need is None:
                     self._begin(unit, self._needs(action.job.stage, action.job.frame))
                     is_changed = True
+            elif not self._core.finished:
+                # A core kills only a unit that seems to hang, and in virtual time every job ends.
+                raise RuntimeError(f"{action}: hang_ns is shorter than a job takes")
         if is_changed:
             self._set_rates()
 

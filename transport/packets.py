@@ -91,12 +91,15 @@ def create_region(name: str, layout: RegionLayout) -> int:
     """Return a descriptor of new, zeroed shared memory for `layout`. `name` appears in /proc/PID/maps and nowhere else.
 
     All pages are reserved here. Otherwise a later write to a page could end the process by a signal, if memory is
-    short. Raises TrilaneError when there is too little memory.
+    short. Raises TrilaneError when there is too little memory, or when too many files are open.
     """
-    free = machine.here.free_bytes()
-    if layout.total_bytes > free:
-        raise TrilaneError(_too_little(name, layout, f"{free // MIB} MiB are free"))
-    fd = os.memfd_create(f"trilane:{name}"[:MOST_NAME], os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    try:
+        free = machine.here.free_bytes()
+        if layout.total_bytes > free:
+            raise TrilaneError(_too_little(name, layout, f"{free // MIB} MiB are free"))
+        fd = os.memfd_create(f"trilane:{name}"[:MOST_NAME], os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING)
+    except OSError as error:
+        raise TrilaneError(f"no memory for edge {name}: {reason(error)}") from None
     try:
         os.posix_fallocate(fd, 0, layout.total_bytes)
         fcntl.fcntl(fd, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW)

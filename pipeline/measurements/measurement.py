@@ -11,6 +11,7 @@ measured is refused. A refusal names the row and a reason; other rows stay. Noth
 from __future__ import annotations
 
 import math
+from bisect import bisect_left, bisect_right
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -204,11 +205,6 @@ class Measurements:
             raise BadInputError("the file", f"over {MOST_NAMES} names", "fewer")
         self._made.append(replace(measurement, name=measurement.name[:LONGEST_NAME] or UNNAMED))
 
-    def take_back(self, name: str, reason: str) -> None:
-        """Remove the measurement `name`, which `add` has added, and refuse it for `reason`."""
-        self._made = [each for each in self._made if each.name != name]
-        self.refuse(name, reason)
-
     @cached_property
     def measurements(self) -> tuple[Measurement, ...]:
         """All measurements in the order of the file, but sampled ones come first. Use this after the last row only."""
@@ -283,11 +279,24 @@ def falling(values: Sequence[float], slack: float = 0.0) -> list[int]:
     `slack`: largest rise from one value of the subsequence to the next, as a share of the first of the two.
     """
 
-    def weight(series: list[int]) -> tuple[int, float]:
-        return len(series), sum(values[place] for place in series)
-
-    longest: list[list[int]] = []
-    for index, value in enumerate(values):
-        before = [series for series in longest if value <= values[series[-1]] * (1 + slack)]
-        longest.append([*max(before, key=weight, default=[]), index])
-    return max(longest, key=weight, default=[])
+    limits = [-value * (1 + slack) for value in values]  # negative, because bisect needs an order that rises
+    order = sorted(limits)
+    # A Fenwick tree over `order`: length, sum and -index of the last value of the best series so far. Of equal series
+    # the one whose last value comes first is the best.
+    best = [(0, 0.0, 1)] * (len(order) + 1)
+    series, before = [], list[int]()
+    for index, (value, limit) in enumerate(zip(values, limits, strict=True)):
+        found, place = best[0], bisect_right(order, -value)
+        while place:
+            found, place = max(found, best[place]), place & (place - 1)
+        series.append((found[0] + 1, found[1] + value, -index))
+        before.append(-found[2])
+        place = bisect_left(order, limit) + 1
+        while place < len(best):
+            best[place] = max(best[place], series[index])
+            place += place & -place
+    kept, last = list[int](), -max(series, default=(0, 0.0, 1))[2]
+    while last >= 0:
+        kept.append(last)
+        last = before[last]
+    return kept[::-1]

@@ -116,7 +116,7 @@ def _of_table(document: Mapping[str, Any]) -> Measurements | None:
     if "execution_summary" in document or "execution_detail" in document:
         return vendor_files.read_ai_hub(document)
     if "htp_overall_summary" in data:
-        return vendor_files.read_qhas(document)
+        return vendor_files.read_qhas(data)
     if vendor_files.is_mlperf_app(document):
         return vendor_files.read_mlperf_app(document)
     if isinstance(document.get("cases"), list):

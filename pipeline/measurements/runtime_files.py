@@ -11,6 +11,7 @@ The tools write these formats:
 from __future__ import annotations
 
 import re
+from bisect import bisect_left
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -336,7 +337,7 @@ def read_layer_means(document: Sequence[Any]) -> Measurements:
     return found
 
 
-CUT: Final = re.compile(r"^(.*)_at_(-?\d+)$")
+CUT: Final = re.compile(r"^(.*)_at_(-?\d{1,18})$")
 
 
 def read_cut_means(document: Mapping[str, Any]) -> Measurements:
@@ -346,7 +347,8 @@ def read_cut_means(document: Mapping[str, Any]) -> Measurements:
     time that contradicts this is refused.
     """
     found = Measurements("table of times by cut", "the mean for each place at which a network is cut")
-    rests: dict[str, list[tuple[int, float]]] = defaultdict(list)
+    made: dict[str, Measurement] = {}
+    rests: dict[str, list[tuple[int, float, str]]] = defaultdict(list)
     for name, facts in document.items():
         key = next((key for key in ("total_time", "mean_time") if key in facts), "")
         cut = CUT.match(name)
@@ -357,30 +359,35 @@ def read_cut_means(document: Mapping[str, Any]) -> Measurements:
         if time is None:
             continue
         what = "a run with this cut" if key == "mean_time" else "the rest behind the cut"
-        found.add(Measurement(name, "run", "ms", what, mean_ms=time))
+        made[name] = Measurement(name, "run", "ms", what, mean_ms=time)
         if cut and key == "total_time":
-            rests[cut[1]].append((int(cut[2]), time))
-    for stem, points in rests.items():
-        for place, reason in rising_rests(points):
-            found.take_back(f"{stem}_at_{place}", reason)
+            rests[cut[1]].append((int(cut[2]), time, name))
+    for points in rests.values():
+        for name, reason in rising_rests(points):
+            del made[name]
+            found.refuse(name, reason)
+    for each in made.values():
+        found.add(each)
     return found
 
 
-def rising_rests(points: Sequence[tuple[int, float]]) -> Iterator[tuple[int, str]]:
-    """Yield (cut to remove, reason) for each time that must be removed so that times never rise from cut to cut.
+def rising_rests(points: Sequence[tuple[int, float, str]]) -> Iterator[tuple[str, str]]:
+    """Yield (name to remove, reason) for each time that must be removed so that times never rise from cut to cut.
 
     A longest subsequence of times that never rises stays, see `falling`.
 
-    `points`: pairs (number of the layer of the cut, time in ms of the part of the network behind the cut).
+    `points`: (number of the layer of the cut, time in ms of the part of the network behind the cut, name).
     """
     ordered = sorted(points)
-    kept = falling([time for _, time in ordered])
-    for index, (place, time) in enumerate(ordered):
-        if index in kept:
+    kept = falling([time for _, time, _ in ordered])
+    for index, (_, time, name) in enumerate(ordered):
+        at = bisect_left(kept, index)
+        if kept[at : at + 1] == [index]:
             continue
-        lower, upper = next(((index, k) for k in kept if k > index and ordered[k][1] > time), (index - 1, index))
-        (cut, before), (later, after) = ordered[lower], ordered[upper]
-        yield place, f"rest times rise again: {before:g} ms behind cut {cut}, {after:g} ms behind the later cut {later}"
+        is_below = at < len(kept) and time < ordered[kept[at]][1]
+        lower, upper = (index, kept[at]) if is_below else (kept[at - 1], index)
+        (cut, before, _), (later, after, _) = ordered[lower], ordered[upper]
+        yield name, f"rest times rise again: {before:g} ms behind cut {cut}, {after:g} ms behind the later cut {later}"
 
 
 def read_executorch(document: Mapping[str, Any]) -> Measurements:

@@ -220,12 +220,11 @@ def _add_shares(found: Measurements, nodes: Mapping[str, float], counts: Mapping
         )  # fmt: skip
 
 
-def read_qhas(document: Mapping[str, Any]) -> Measurements:
-    """Return the measurements in the summary of a QHAS analysis."""
+def read_qhas(data: Mapping[str, Any]) -> Measurements:
+    """Return the measurements in the summary of a QHAS analysis. `data`: its table `data`, which has all others."""
     found = Measurements(
         "QHAS summary", "the mean time of a run with its traffic; of operators only cycles, which are shares"
     )
-    data = document.get("data", document)
     rows = _rows(data.get("htp_overall_summary"))
     if not rows:
         found.refuse("htp_overall_summary", "no rows")

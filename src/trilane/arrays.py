@@ -34,7 +34,7 @@ Shape = tuple[int, int]
 
 def parse_shape(text: str) -> Shape:
     """Return (height, width) from a text such as `256x128`. Raises UnexpectedValue for another text."""
-    match = re.fullmatch(r"(\d+)x(\d+)", text)
+    match = re.fullmatch(r"(\d{1,9})x(\d{1,9})", text)
     if match is None:
         raise UnexpectedValue(repr(text), "HEIGHTxWIDTH such as 256x256")
     return int(match[1]), int(match[2])
@@ -47,7 +47,7 @@ def shape_buckets(size: str) -> list[Shape]:
     suit a standing body, wide shapes a lying body. Raises UnexpectedValue for another text, and for a side that is not
     a multiple of BUCKET_STEP or is out of range.
     """
-    if re.fullmatch(r"\d+", size):
+    if re.fullmatch(r"\d{1,9}", size):
         return shapes_within(check_side(int(size)) ** 2)
     height, width = parse_shape(size)
     return [(check_side(height), check_side(width))]

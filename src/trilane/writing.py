@@ -34,7 +34,7 @@ def write_atomically(path: Path, remedy: str = "") -> Iterator[Path]:
     draft = path.parent / f"{PREFIX}{secrets.token_hex(8)}{path.suffix}"
     try:
         with _os_errors_about(path, remedy, (path, draft)):
-            if path.exists() and not path.is_file() and not path.is_dir():  # a device, a pipe or a socket
+            if _is_device(path):
                 yield path
             else:
                 yield draft
@@ -46,9 +46,17 @@ def write_atomically(path: Path, remedy: str = "") -> Iterator[Path]:
 
 
 def require_writable(path: Path) -> None:
-    """Raise BadInputError if no file can be made in the folder of `path`; called before long work."""
-    with _os_errors_about(path), tempfile.TemporaryFile(prefix=PREFIX, dir=path.parent):
-        pass
+    """Raise BadInputError if `write_atomically` cannot write to `path`; called before long work."""
+    with _os_errors_about(path):
+        if path.is_dir():
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        if not _is_device(path):
+            tempfile.TemporaryFile(prefix=PREFIX, dir=path.parent).close()
+
+
+def _is_device(path: Path) -> bool:
+    """Return whether `path` is a device, a pipe or a socket."""
+    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 def require_name(path: Path, fd: int) -> None:

@@ -35,7 +35,7 @@ def test_sides_out_of_range(size: str) -> None:
         checked_size(size)
 
 
-@pytest.mark.parametrize("size", ["64 x 64", "64x", "x", "-64", "64x64x64", ""])
+@pytest.mark.parametrize("size", ["64 x 64", "64x", "x", "-64", "64x64x64", "", "9" * 5000 + "x1", "9" * 5000])
 def test_what_is_no_size(size: str) -> None:
     with pytest.raises(UnexpectedValue) as refused:
         shape_buckets(size)

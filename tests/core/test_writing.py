@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from trilane.errors import BadInputError
-from trilane.writing import write_atomically, write_bytes, write_folder
+from trilane.writing import require_writable, write_atomically, write_bytes, write_folder
 
 BIG = 1 << 20
 WRITERS, TIMES = 4, 25
@@ -107,6 +107,19 @@ def test_a_pipe_is_written_and_not_replaced(tmp_path: Path) -> None:
         os.close(reader)
     assert stat.S_ISFIFO(path.stat().st_mode)
     assert names(tmp_path) == ["pipe"]
+
+
+def test_a_place_is_checked_before_long_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No file can be made beside a device, which is written itself."""
+    require_writable(tmp_path / "a.csv")
+    assert names(tmp_path) == []
+    with pytest.raises(BadInputError, match="found is a directory, expected a place that can be written"):
+        require_writable(tmp_path)
+    with pytest.raises(BadInputError, match="found no such file or directory"):
+        require_writable(tmp_path / "none" / "a.csv")
+    monkeypatch.setattr("tempfile.TemporaryFile", lambda **_: pytest.fail("a file beside the pipe"))
+    os.mkfifo(tmp_path / "pipe")
+    require_writable(tmp_path / "pipe")
 
 
 def test_processes_that_write_the_same_file(tmp_path: Path) -> None:

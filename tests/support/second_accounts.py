@@ -19,7 +19,7 @@ from trilane.scheduler.recording import Recording
 from trilane.scheduler.virtual import Simulation, simulate
 
 MS = 1_000_000
-CAUSES = idle_causes(joins=False)
+CAUSES = idle_causes(joins=True)
 EDGES = ("single", "double", "triple", "fifo:1", "fifo:3", "orphan", "orphan:4")
 UNITS = ("a", "b", "c")
 

@@ -335,6 +335,9 @@ def test_coefficients_up_to_the_last_column(tmp_path: Path, body_arrays: Arrays)
         with pytest.raises(BadInputError) as raised:
             body.shape(**wrong)
         assert str(raised.value) == f"{name}: found {found}, expected at most 10 finite numbers"
+    for huge in (1e42, 1e300):
+        with pytest.raises(BadInputError, match=r"^betas and expression: found vertices that are not finite, "):
+            body.shape([huge, -huge])
     with pytest.raises(BadInputError, match=r"poses: found shape \(\), expected \(..., 165\)"):
         body.full_pose(1.0, flat_hand_mean=True)
 

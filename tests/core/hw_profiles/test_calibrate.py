@@ -29,6 +29,7 @@ from trilane.hw_profiles.calibrate import (
     calibrate,
     calibrate_tables,
     error_scale,
+    is_own_table,
     misses,
     on_chip,
     prior_covariance,
@@ -289,6 +290,7 @@ TABLE = "network,ms,precision,runtime\n"
             "line 2: found the columns 'model,time', expected network and ms, and maybe",
         ),
         ("network;ms\n" + "a;1\n" * 2, "separate cells by commas"),
+        ("network,ms,ms\n" + "a,1,2\n" * 2, "line 1: found column 'ms' twice"),
     ],
 )
 def test_wrong_tables_are_refused(text: str, found: str, tmp_path: Path) -> None:
@@ -297,6 +299,17 @@ def test_wrong_tables_are_refused(text: str, found: str, tmp_path: Path) -> None
     with pytest.raises(BadInputError) as caught:
         read_own_rows(path, tmp_path)
     assert found in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "is_own"),
+    [("# own\n\nencoder,norm\n", False), (" \nnetwork,ms\n", True), ("# nothing\n", True)],
+)
+def test_the_header_says_whose_table_it_is(text: str, is_own: bool, tmp_path: Path) -> None:
+    """Blank lines and comments may stand before it."""
+    path = tmp_path / "table.csv"
+    path.write_text(text)
+    assert is_own_table(path) == is_own
 
 
 @pytest.mark.parametrize("header", ["model,time", "network;ms", "ms"])

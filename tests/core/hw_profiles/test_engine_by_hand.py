@@ -95,6 +95,21 @@ def test_a_batch_normalisation_behind_a_convolution_is_part_of_it() -> None:
     assert kinds[-1].amounts == {"operator": 1, "batch_norm": 2 * 128}
 
 
+@pytest.mark.parametrize("activation", ["Relu", "Clip"])
+def test_a_batch_normalisation_behind_an_activation_is_a_layer(activation: str) -> None:
+    """Its factors cannot go into the convolution's weights, which the activation follows."""
+    nodes = [
+        node("Conv", "x w0", "a", kernel_shape=[1, 1]),
+        *(node(activation, "a", "b"), node("BatchNormalization", "b w1 w2 w3 w4", "y")),
+    ]
+    shapes = {
+        **dict.fromkeys("xaby", (1, 8, 4, 4)),
+        "w0": (8, 8, 1, 1),
+        **dict.fromkeys(("w1", "w2", "w3", "w4"), (8,)),
+    }
+    assert [layer.op_type for layer in layers_of_nodes(nodes, shapes)] == ["Conv", "BatchNormalization"]
+
+
 def test_a_batch_in_the_file_has_its_products_as_often() -> None:
     """Four pictures, each of 8x8 places by 9 by 16 by 32 products; the weights are read once."""
     (layer,) = layers_of_nodes(

@@ -24,6 +24,7 @@ from trilane.hw_profiles.engine_study import (
 )
 from trilane.hw_profiles.fit_engines import (
     ALWAYS,
+    COLUMNS,
     FACTORS,
     UNITS_OF_RATES,
     Fitted,
@@ -231,6 +232,35 @@ def test_rows_that_fell_off_the_engine_are_left_out(chips_folder: Path) -> None:
     assert not [row for row in rows if row.network == "deeplabv3_resnet50" and row.engine.startswith("int8")]
     assert len({row.network for row in rows if row.engine == "int8_tflite"}) == 26
     assert sum(row.anchor for row in rows) == 2
+
+
+ROW = "a,8gen1,v69,w8a8,tflite,1.5,,fit"
+
+
+@pytest.mark.parametrize(
+    ("networks", "columns", "row", "said"),
+    [
+        ("name,split", ",".join(COLUMNS), ROW, "networks.csv: found no column family"),
+        ("name,split,family", "network,chip", "a,8gen1", "chip_rows.csv: found no column hexagon, precision"),
+        ("name,split,family", ",".join(COLUMNS), ROW.replace("1.5", "fast"), "chip_rows.csv: line 2: ms: found 'fast'"),
+        ("name,split,family", ",".join(COLUMNS), ROW.replace("1.5", "nan"), "line 2: ms: found 'nan'"),
+        (
+            "name,split,family",
+            ",".join(COLUMNS),
+            ROW.replace("w8a8", "w4"),
+            "line 2: found w4, tflite, expected",
+        ),
+        ("name,split,family", ",".join(COLUMNS), "a,8gen1,v69", "line 2: found , , expected one of w8a8, tflite"),
+    ],
+)
+def test_damaged_tables_of_published_times_are_refused(
+    networks: str, columns: str, row: str, said: str, tmp_path: Path
+) -> None:
+    (tmp_path / "networks.csv").write_text(f"{networks}\na,fit,small\n")
+    (tmp_path / "chip_rows.csv").write_text(f"{columns}\n{row}\n")
+    with pytest.raises(BadInputError) as caught:
+        read_latencies(tmp_path)
+    assert said in str(caught.value)
 
 
 def test_committed_profiles_are_near_the_rows_that_made_them(chips_folder: Path) -> None:

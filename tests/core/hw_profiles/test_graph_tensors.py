@@ -189,6 +189,17 @@ def test_only_little_is_made(nodes: list[Any], weights: dict[str, Any], value: A
     assert found == (None if value is None else {"y": value, "left": []})
 
 
+@pytest.mark.parametrize(
+    "text", ["Where a b c -> y", "Max a b c -> y", "Min a b c a b c -> y", "Add a b -> y", f"Concat {'a ' * 99}-> y"]
+)
+def test_the_size_of_a_result_is_known_before_it_is_made(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All inputs are small: 1024 numbers each, along an axis of their own."""
+    monkeypatch.setattr("trilane.hw_profiles.graph_tensors.ReferenceEvaluator", lambda *_: pytest.fail("it was made"))
+    along = {name: np.ones(np.roll((1, 1, 1024), turn), bool) for turn, name in enumerate("abc")}
+    made = node(text, axis=0) if text.startswith("Concat") else node(text)
+    assert folded([made], **along) is None
+
+
 def test_a_tensor_whose_data_was_forgotten_is_not_reckoned_with() -> None:
     made = model([node("Add a a -> y")], a=[1, 2])
     made.graph.initializer[0].raw_data = b""

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from trilane import machine
-from trilane.hw_profiles.host import RATES, cgroup_quota, host_units, split_cores, usable_cores
+from trilane.hw_profiles.host import RATES, cgroup_quota, host_tables, host_units, split_cores, usable_cores
 from trilane.machine import Machine
 
 
@@ -63,6 +63,16 @@ def test_a_quota_takes_the_last_cores_away(groups: Path, monkeypatch: pytest.Mon
     for quota, cores in (("150000", (2, 3)), ("1", (2,)), ("900000", (2, 3, 5))):
         (groups / "cpu.max").write_text(f"{quota} 100000")
         assert usable_cores() == cores
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 8, 16])
+def test_the_profile_gives_the_network_the_threads_that_a_run_gives_it(
+    count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(machine.here, "cores", lambda: tuple(range(count)))
+    dsp = host_tables()["units"]["dsp"]
+    assert dsp["threads"] == host_units()["dsp"].threads
+    assert dsp["peak_int8_tmac_s"]["source"].startswith(f"{dsp['threads']} cores x ")
 
 
 def test_multiplications_in_a_cycle_follow_from_the_width_of_an_instruction() -> None:

@@ -226,8 +226,8 @@ def test_what_is_said_of_minutes() -> None:
         **{"t_s": 7, "fps": 50.0, "device_c": 37.0, "junction_c": 43.0, "power_w": 2.0},
         "corners": {"cpu": "max", "gpu": "turbo", "dsp": "max"},
     }
-    assert [row["t_s"] for row in timeline_of([moment(t_s, "max") for t_s in range(1100)])] == list(range(0, 1100, 3))
-    assert len(timeline_of([moment(t_s, "max") for t_s in range(719)])) == 719
+    assert [row["t_s"] for row in timeline_of([moment(t_s, "max") for t_s in range(1081)])] == list(range(0, 1081, 4))
+    assert [len(timeline_of([moment(t_s, "max") for t_s in range(count)])) for count in (360, 719)] == [360, 360]
 
 
 def test_a_precision_whose_speed_nobody_states_is_said_and_less_certain() -> None:

@@ -18,13 +18,22 @@ from support.pipeline_files import BRANCHES, CUT, DEPTH, STREET, network, write_
 from support.run_folders import write_run
 from support.run_report import make_report
 from trilane.apps.cli.predict import _digits
+from trilane.errors import BadInputError
 from trilane.hw_profiles.application import Plan, Variant, simulated, stage_times_ms
-from trilane.hw_profiles.pipeline_prediction import given_price, predict_file, prices_of, steady_ms
+from trilane.hw_profiles.pipeline_prediction import (
+    MeasuredStages,
+    given_price,
+    measured_price,
+    predict_file,
+    prices_of,
+    steady_ms,
+)
 from trilane.hw_profiles.profile_files import load_runnable
 from trilane.hw_profiles.rates import FrameInterval, holding
 from trilane.hw_profiles.reference_networks import NetworkSpec, reference_network
 from trilane.hw_profiles.schema import corners_of
 from trilane.pipeline.file_graph import edge_rules, graph_of
+from trilane.pipeline.file_keys import StageTime
 from trilane.pipeline.pipeline_file import checked_tables, read_pipeline
 from trilane.scheduler.events import Settings
 from trilane.scheduler.virtual import simulate
@@ -504,6 +513,16 @@ def test_measured_times_are_those_of_a_run_and_on_a_chip_times_their_scale(
     assert "stages.depth: found python without a time" in error
     assert "scale = { snapdragon-8-gen-3 = ... }" in error
     command("predict", tmp_path / "pipeline.toml", "--measured", tmp_path / "none", code=2)
+
+
+def test_a_scale_that_makes_a_time_too_long_is_refused(tmp_path: Path) -> None:
+    file = read_pipeline(
+        write_file(tmp_path, '[stages]\na = { python = "m:f", unit = "b", scale = { snapdragon-888 = 2 } }')
+    )
+    measured = MeasuredStages({"a": StageTime(mean=3e6)}, "run", "snapdragon-888")
+    said = r"stages.a.scale.snapdragon-888: found 2 times 3e\+06 ms, expected a time of at most 3.6e\+06 ms$"
+    with pytest.raises(BadInputError, match=said):
+        measured_price(file, "a", measured)
 
 
 def test_here_a_job_takes_its_unit_from_the_moment_it_is_handed_over(documents: Predict, tmp_path: Path) -> None:

@@ -262,6 +262,7 @@ def test_a_journal_of_before_jobs_had_their_cpu_time_is_read() -> None:
     "config",
     [
         *(5, {"units": 5}, {"units": {"cpu": 5}}, {"units": {"cpu": {"cores": 5}}}, {"scene": {"fps": "x"}}),
+        *({"units": {"cpu": {"threads": "x"}}}, {"units": {"cpu": {"threads": 0}}}),
         *({"scene": {"output": 5}}, {"pipeline": 5}, {"pipeline": {"run": 5}}, {"scene": None}),
     ],
     ids=str,

@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from itertools import combinations, pairwise
 from pathlib import Path
 from random import Random
+from time import perf_counter
 
 import pytest
 
 from support.mutations import mutated
 from trilane.errors import BadInputError
-from trilane.pipeline.measurements.measurement import Measurements
+from trilane.pipeline.measurements.measurement import Measurements, falling
 from trilane.pipeline.measurements.read_file import OWN_COLUMNS, chosen, read_measurements
 
 #: usefulsensors/qc_npu_benchmark, npu_quant_profile.csv; the second run is of tezheng/winml-cli, optrace_resnet50.csv.
@@ -261,6 +263,44 @@ def test_rest_times_that_rise_again(read: Callable[[str], Measurements]) -> None
     )
 
 
+@pytest.mark.parametrize("seed", range(40))
+def test_a_longest_series_of_falling_times_is_kept(seed: int) -> None:
+    """Against all subsequences, by length and then by sum; equal times and times within the slack may follow."""
+    draw = Random(seed)
+    values = [draw.choice([1.0, 2.0, 2.1, 3.0, draw.uniform(1, 3)]) for _ in range(draw.randint(0, 10))]
+    slack = draw.choice([0.0, 0.06])
+    kept = falling(values, slack)
+    fit = [
+        series
+        for size in range(len(values) + 1)
+        for series in combinations(range(len(values)), size)
+        if all(values[after] <= values[before] * (1 + slack) for before, after in pairwise(series))
+    ]
+    assert tuple(kept) in fit
+    best = max((len(series), sum(values[place] for place in series)) for series in fit)
+    assert (len(kept), sum(values[place] for place in kept)) == pytest.approx(best)
+
+
+def test_a_table_of_many_cuts_is_read_at_once(read: Callable[[str], Measurements]) -> None:
+    """Every second time is too short: half of 4000 are refused."""
+    times = {f"net_at_{cut}": {"total_time": 1e5 - cut if cut % 2 else 1.0 + cut / 1e5} for cut in range(4000)}
+    begun = perf_counter()
+    found = read(json.dumps(times))
+    assert perf_counter() - begun < 20
+    assert (len(found.measurements), found.refused_count) == (2000, 2000)
+
+
+def test_a_refused_cut_has_the_name_that_is_in_the_file(read: Callable[[str], Measurements]) -> None:
+    """The reason names the last time before it that stays."""
+    rest = {"01": 7, "02": 6, "03": 5, "04": 9, "05": 8, "06": 5}
+    found = read(json.dumps({f"net_at_{cut}": {"total_time": ms} for cut, ms in rest.items()}))
+    assert [each.name for each in found.measurements] == [f"net_at_0{cut}" for cut in (1, 2, 3, 6)]
+    assert [(each.row, each.reason) for each in found.refused] == [
+        ("net_at_04", "rest times rise again: 5 ms behind cut 3, 9 ms behind the later cut 4"),
+        ("net_at_05", "rest times rise again: 5 ms behind cut 3, 8 ms behind the later cut 5"),
+    ]
+
+
 Change = tuple[str, str, str, str]
 #: format -> what is replaced, by what, the refused row, a word of the reason.
 BROKEN: dict[str, list[Change]] = {
@@ -413,6 +453,8 @@ def test_a_broken_row_is_named_and_the_others_stay(
         ("[1, 2, 3]", "no known tool"),
         ('{"results": [{"loadgen_scenario": "SingleStream"', "no JSON"),
         ("7", "text that begins with '7'"),
+        (f'{{"net_at_{"9" * 5000}": {{"total_time": 1}}}}', "no known tool"),
+        ('{"data": [], "htp_overall_summary": {"data": []}}', "no usable time in the QHAS summary"),
         ('{"execution_summary": {"estimated_inference_time": ' + "9" * 5000 + "}}", "finite"),
         (
             "Msg Timestamp,Message,Time,Unit of Measurement,Timing Source,Event Level,Event Identifier\n",
@@ -421,7 +463,7 @@ def test_a_broken_row_is_named_and_the_others_stay(
         ("Msg Timestamp,Message,Time\n0,BACKEND,5\n", "without the column 'Unit of Measurement'"),
         ("name\0", "NUL byte"),
     ],
-    ids=range(12),
+    ids=range(14),
 )
 def test_what_no_tool_wrote_is_refused(text: str, reason: str, read: Callable[[str], Measurements]) -> None:
     with pytest.raises(BadInputError, match=reason):

@@ -134,6 +134,8 @@ def test_other_values_are_a_variant_of_the_file(tmp_path: Path) -> None:
     assert file.stages["seg"].unit == "c"
     with pytest.raises(BadInputError, match=r"stages.seg.uni: found the unknown key 'uni'.*did you mean 'unit'"):
         file.changed(["stages.seg.uni=b"])
+    with pytest.raises(BadInputError, match=r"stages.depth.time_ms: found '\[\[.*, expected a time in ms"):
+        file.changed([f"stages.depth.time_ms={'[' * 5000}"])
     with pytest.raises(BadInputError, match=r"--set: found 'seg=b', expected KEY=VALUE"):
         file.changed(["seg=b"])
 

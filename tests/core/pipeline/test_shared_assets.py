@@ -125,3 +125,12 @@ def test_a_page_that_the_kernel_holds_for_a_moment_does_not_end_the_run(
     with pytest.raises(PermissionError):
         os.pwrite(fd, b"x", 0)
     os.close(fd)
+
+
+def test_too_many_open_files_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(errno.EMFILE, "Too many open files")
+
+    monkeypatch.setattr(os, "memfd_create", full)
+    with pytest.raises(TrilaneError, match=r"^no memory for assets: too many open files$"):
+        share_assets({"a": np.zeros(3)})

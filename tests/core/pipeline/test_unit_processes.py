@@ -363,6 +363,16 @@ def test_a_call_is_made_once_more_where_the_fork_server_has_ended(starter_with: 
     starter.close()
 
 
+@pytest.mark.parametrize(("answer", "result"), [(b'{"a": 1}', {"a": 1}), (b'{"a": "b', None), (b'"\xc3', None)])
+def test_an_answer_that_is_cut_off_is_none(starter_with: Starter, answer: bytes, result: object) -> None:
+    starter, _ = starter_with(FakeServer(None))
+    reads, writes = os.pipe()
+    os.write(writes, answer)
+    os.close(writes)
+    assert unit_starter.ForkedCall(starter, "os:getcwd", reads).result() == result
+    starter.close()
+
+
 def test_a_call_that_is_not_answered_in_time_is_none(starter_with: Starter, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(unit_starter, "ANSWER_S", 0.01)
     starter, _ = starter_with(FakeServer(None))

@@ -8,13 +8,14 @@ from typing import Any
 
 import pytest
 
+from support import plain_graph_scheduler
 from support.plain_scheduler import drawn, service_of, skips_of, with_bypass
 from support.second_accounts import largest_difference, second_accounts
-from trilane.scheduler.events import NEVER, SetDuty, Settings, Stop, chain
+from trilane.scheduler.events import NEVER, Abort, Graph, Input, SetDuty, Settings, StageSpec, Stop, chain
 from trilane.scheduler.ledger import JobRecord
 from trilane.scheduler.recording import replay
 from trilane.scheduler.shared_units import ONE, TURNS, BesideDriver, Member, Runs, Waiting, simulate_beside
-from trilane.scheduler.virtual import simulate
+from trilane.scheduler.virtual import Simulation, simulate
 from trilane.unexpected_value import UnexpectedValue
 
 MS = 1_000_000
@@ -175,6 +176,26 @@ def test_a_stop_ends_each_pipeline_with_its_frames_in_flight() -> None:
     assert a.report["frames"]["requested"] == 3
 
 
+def test_an_abort_takes_the_waiting_jobs_of_its_pipeline_off_the_seat() -> None:
+    """A waits from 0 with one job in the seat's line and is aborted at 2 ms; B goes on as if A were not there."""
+    times = {"infer": 3 * MS}
+    a = Member(ALONE, Settings(9), lambda stage, *_: times[stage], inputs=((2 * MS, Abort()),))
+    done = simulate_beside([a, member(ALONE, Settings(3), infer=5)], turns="deadline", keep=True)
+    assert rows(done[1].jobs) == [(0, 3, 8), (1, 8, 13), (2, 13, 18)]
+
+
+def test_a_frame_that_was_dropped_while_it_waited_for_a_seat_keeps_its_deadline() -> None:
+    """c holds each frame past its deadline while b waits for the seat that the second pipeline takes, 20 ms a job."""
+    fork = [("a", ()), ("b", ("a",)), ("c", ("a",)), ("d", ("b", "c"))]
+    stages = tuple(StageSpec(name, f"unit_{name}", tuple(map(Input, read))) for name, read in fork)
+    paced = Settings(40, "deadline", period_ns=8 * MS, deadline_ns=35 * MS)
+    times = {"a": 2 * MS, "b": 8 * MS, "c": 25 * MS, "d": MS}
+    a = Member(Graph(stages, ("double",) * 3, "d"), paced, lambda stage, *_: times[stage], {"unit_b": "dsp"})
+    done = simulate_beside([a, member(ALONE, Settings(40), infer=20)], turns="deadline", keep=True)
+    check_accounts(done)
+    assert done[0].report["frames"]["dropped"]
+
+
 @pytest.mark.parametrize("name", TURNS)
 def test_each_rule_of_turns_takes_one_of_those_that_wait(name: str) -> None:
     waiting = [Waiting(2, 30, 1), Waiting(0, NEVER, 2), Waiting(1, 20, 3)]
@@ -219,13 +240,7 @@ def test_the_accounts_and_the_turns_of_drawn_pipelines_hold(seed: int, turns: st
     draw = random.Random(seed)
     members = [member_of(1000 * seed + number, bypassed=draw.random() < 0.5) for number in range(draw.randint(2, 4))]
     done = simulate_beside(members, turns=turns, keep=True)
-    for each in done:
-        assert each.recording is not None
-        assert list(replay(each.recording)) == []
-        assert largest_difference(each.report["units"], second_accounts(each.recording, each.jobs)) < 1e-12
-        for row in each.report["units"].values():
-            assert row["busy"] + sum(row["idle"].values()) == pytest.approx(1, abs=1e-12)
-            assert min(row["idle"].values()) >= 0
+    check_accounts(done)
     for unit in ("cpu", "gpu", "dsp"):
         jobs = sorted(
             ((job, number) for number, each in enumerate(done) for job in each.jobs if job.unit == unit),
@@ -234,6 +249,27 @@ def test_the_accounts_and_the_turns_of_drawn_pipelines_hold(seed: int, turns: st
         check_unit(jobs)
         if turns == "round-robin":
             check_turns(jobs)
+
+
+@pytest.mark.parametrize("turns", TURNS)
+@pytest.mark.parametrize("seed", range(12))
+def test_the_accounts_of_drawn_graphs_on_shared_seats_hold(seed: int, turns: str) -> None:
+    members = []
+    for number in range(3):
+        graph, settings, *_ = plain_graph_scheduler.drawn(3 * seed + number, yields=True)
+        members.append(Member(graph, settings, service_of(seed), dict.fromkeys(graph.units, "dsp")))
+    check_accounts(simulate_beside(members, turns=turns, keep=True))
+
+
+def check_accounts(done: list[Simulation]) -> None:
+    """Each recording gives the same run again, and each unit's shares add up to 1 and to the second accounts."""
+    for each in done:
+        assert each.recording is not None
+        assert list(replay(each.recording)) == []
+        assert largest_difference(each.report["units"], second_accounts(each.recording, each.jobs)) < 1e-12
+        for row in each.report["units"].values():
+            assert row["busy"] + sum(row["idle"].values()) == pytest.approx(1, abs=1e-12)
+            assert min(row["idle"].values()) >= 0
 
 
 def check_unit(jobs: list[tuple[JobRecord, int]]) -> None:

@@ -65,6 +65,12 @@ def test_a_message_delays_a_unit_that_has_nothing_else_to_do() -> None:
     assert frame_ms(TWO, {"one": ON_0, "two": ON_1}, {"a": (2, 0), "b": (3, 0)}, 0.5) == pytest.approx(3)
 
 
+def test_a_job_longer_than_its_core_waits_for_one_is_a_defect_of_the_caller() -> None:
+    run = SharedCores(graph_of(TWO), Settings(1), {"one": ON_0, "two": ON_1}, lambda *_: Need(11_000 * MS))
+    with pytest.raises(RuntimeError, match=r"Kill\(unit='one'\): hang_ns"):
+        run.run()
+
+
 def test_a_core_that_becomes_idle_pulls_the_unit_that_floats() -> None:
     """Both cores do 16 ms a frame together. One core at most idles until the next tick, once a frame."""
     stages = {"a": "one", "b": "two", "c": "three"}

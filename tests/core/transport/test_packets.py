@@ -97,6 +97,16 @@ def test_memory_that_is_just_there_is_taken_and_a_byte_more_is_refused(monkeypat
         create_region("pose->raster", layout)
 
 
+@pytest.mark.parametrize("call", ["os.memfd_create", "psutil.virtual_memory"])
+def test_too_many_open_files_are_told(call: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> None:
+        raise OSError(24, "Too many open files")
+
+    monkeypatch.setattr(call, full)
+    with pytest.raises(TrilaneError, match=r"^no memory for edge e: too many open files$"):
+        create_region("e", RegionLayout(1, SlotLayout(header_dtype(), 1)))
+
+
 def test_memory_that_cannot_be_reserved_leaves_no_file(monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: int) -> None:
         raise OSError(28, "No space left on device")

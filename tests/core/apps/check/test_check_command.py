@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -333,7 +334,15 @@ WRONG: dict[str, tuple[str, ...]] = {
     ),
     "a unit with a space": (
         STAGES.replace('"u"', '"a unit"'),
-        *("stages.a.unit", "'a unit', expected at most 40 letters, digits, _ and -"),
+        *("stages.a.unit", "'a unit', expected at most 40 letters from a to z or A to Z, digits, _ and -"),
+    ),
+    "a unit whose socket would have too long a path": (
+        STAGES.replace('"u"', '"' + "漢" * 40 + '"'),
+        *("stages.a.unit", "expected at most 40 letters from a to z"),
+    ),
+    "a stage that is no key of TOML": (
+        STAGES.replace("a =", '"überlagerung" =').replace('"a"', '"überlagerung"'),
+        *("stages", "the name 'überlagerung', expected at most 40 letters from a to z"),
     ),
     "no cores": (STAGES + "[units]\nu = { cores = [] }", "units.u.cores", "at least 1 item;"),
     "means of two channels": (
@@ -556,6 +565,7 @@ def test_a_description_with_forks_joins_and_edges_of_its_own_is_written_as_the_s
     tables = tables_of(pipeline, {}, {"a": 1.5})
     path = tmp_path / "made.toml"
     path.write_text(file_text(tables, ["one", "two"]), encoding="utf-8")
+    assert tomllib.loads(file_text({"t": {"a": "\x7f \0 ü 😀"}})) == {"t": {"a": "\x7f \0 ü 😀"}}
     file = read_pipeline(path)
     assert file == checked_tables(tables, path)
     rules = edge_rules(file)
