@@ -102,7 +102,7 @@ def level_facts(level: MeshLevel, side: int) -> dict[str, Any]:
     `triangles`: number of triangles.
     `vertices`: number of vertices.
     `rest_mm`: largest distance at rest from the surface of the level to the surface of the whole mesh.
-    `seam_texels`: largest shift of the texture at the seams.
+    `seam_texels`: largest distance between the seams of the level and of the whole mesh, in texels.
     """
     return {
         "triangles": len(level.faces),
@@ -348,8 +348,8 @@ def remade_avatar(name: str, options: RunOptions) -> tuple[Path, str]:
     The variant is made, or found in the cache. If `options` change nothing, the folder is the avatar's own.
     `name`: avatar, by name or folder.
     `options`: options of the run, which may have a width, a number of channels and a calibration.
-    Raises BadInputError if the avatar's float network is needed but missing, MissingPartError without PyTorch. Raises
-    TrilaneError if the cache cannot be written.
+    Raises BadInputError if the avatar's float network is needed but missing, MissingPartError without PyTorch or
+    OpenGL, and TrilaneError if the cache cannot be written.
     """
     bundle = load_bundle(name)
     recipe = _recipe(bundle, options)
@@ -500,7 +500,7 @@ class Calibrations:
         """Return `checked` with the network that `method` calibrates.
 
         `method`: a name in CALIBRATION_METHODS; `AS_IT_IS` keeps the network.
-        Raises BadInputError without the float network, MissingPartError without PyTorch.
+        Raises BadInputError without the float network, MissingPartError without PyTorch or OpenGL.
         """
         if method == AS_IT_IS:
             return checked

@@ -249,9 +249,9 @@ def _pairs(stack: ExitStack, sizes: tuple[int, ...]) -> tuple[dict[tuple[str, in
 
 
 def _through_pipeline(size: int, frames: int) -> Times:
-    """Run `handoff_pipeline` with slots of `size` KiB. Return the times from raster's end, in µs.
+    """Run `handoff_pipeline` with slots of `size` KiB. Raises TrilaneError if it does not present all `frames`.
 
-    They are (times from raster's end to infer's begin, times from raster's end to infer's end).
+    Return (times from raster's end to infer's begin, times from raster's end to infer's end), in µs.
     """
     result = run_pipeline(handoff_pipeline(size * 1024), frames, policy="sequential")
     if result.interrupted:

@@ -293,7 +293,7 @@ def idle_between_jobs(jobs: Sequence[JobRecord]) -> dict[str, float]:
 
 
 def latencies_ns(recording: Recording, jobs: Sequence[JobRecord]) -> list[int]:
-    """Return the latency of each presented frame of a run, in ns.
+    """Return the latency of each presented frame that has one, in ns.
 
     `recording`: recording of the run. `jobs`: all jobs of the run.
     """
@@ -372,7 +372,7 @@ class AvatarProcess:
         self._pipe.send(policy)
 
     def result(self) -> Ran:
-        """Wait until the begun run ends, and return its result. Raises TrilaneError if the run failed."""
+        """Wait until the begun run ends, and return its result. Raises TrilaneError if it fails or exceeds `RUN_S`."""
         jobs, seats = self.receive(RUN_S)
         return Ran(tuple(JobRecord(*job) for job in jobs), seats)
 
@@ -397,7 +397,8 @@ def avatar_processes(asked: Sequence[Asked]) -> Iterator[list[AvatarProcess]]:
 def serve(pipe: Connection, asked: Asked) -> None:
     """Run the process: report that it is ready, and do a run for each policy that it receives, until `pipe` closes.
 
-    The answer to a policy is (jobs as tuples, seats of `Ran`), or an error message.
+    The answer to a policy is (jobs as tuples, seats of `Ran`), or an error message if the run fails, which ends the
+    process.
     """
     try:
         checked = _config(asked.avatar, asked.size, asked.cores, asked.frames, asked.runtime, asked.video)

@@ -236,7 +236,7 @@ def _interval(prefix: str, values: Sequence[float]) -> dict[str, float]:
 
 
 def _virtual(checked: Checked, avatar: str, count: int) -> Mapping[str, Any]:
-    """Return a row of `virtual` in `measure`: computed frame times on `count` equal cores without siblings."""
+    """Return a row of `virtual` in `measure`: computed frame times on `count` equal physical cores."""
     shape = min(checked.config.buckets, key=lambda shape: (abs(shape[0] - shape[1]), shape))
     work = painting(networks_of(checked.assets), shape, {"avatar": avatar})
     profile, plan = load_profile(HOST), Plan(work, "dsp", Variant(POLICY, EDGE))

@@ -245,8 +245,8 @@ def by_frame(
     camera of the scene.
     The entry of a plan has the keys of `psnr_of_frames`, over the frames with a visible avatar, and `worst_frame`, the
     number of the worst frame. The entry of `planned` has two further keys. `changes`: number of frames whose tensor
-    has another shape than in the previous frame. `worst_change_db`: least PSNR of these frames; None if the shape never
-    changes. If no frame shows an avatar, the result is None.
+    has another shape than in the previous frame, if both show an avatar. `worst_change_db`: least PSNR of these frames;
+    None without such frames. If no frame shows an avatar, the result is None.
     """
     errors: dict[str, dict[int, float]] = {plan: {} for plan in chains}
     tensors: dict[int, str] = {}
@@ -283,8 +283,8 @@ def _frame_ms(checked: Checked, what: str, starter: UnitStarter) -> float:
 def sheet(moment: _Moment) -> U8:
     """Return one picture (2 h, 3 w, 3) uint8 that shows the pictures of `moment`, each (h,w,3), in two rows.
 
-    The upper row has `full`, `fixed` and `planned`. The lower row has the true picture, and `SHOWN` times the
-    differences of `fixed` and `planned` from `full`, around grey. If the truth is unknown, grey is in its place.
+    The upper row has `full`, `fixed` and `planned`. The lower row has the true picture (grey if unknown), and `SHOWN`
+    times the differences of `fixed` and `planned` from `full`, around grey.
     """
     above = [moment.full, *moment.plans.values()]
     below = [np.full_like(moment.full, 128) if moment.true is None else moment.true]
@@ -295,7 +295,10 @@ def sheet(moment: _Moment) -> U8:
 
 
 def _write(folder: Path, name: str, sheets: Sequence[tuple[int, U8]]) -> None:
-    """Write each of `sheets`, (frame number, picture), to `folder` as `NAME-FRAME.png`. Raises BadInputError."""
+    """Write each of `sheets`, (frame number, picture), to `folder` as `NAME-FRAME.png`.
+
+    Raises BadInputError if the folder cannot be written.
+    """
     from PIL import Image
 
     with write_folder(folder) as draft:

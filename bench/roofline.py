@@ -26,7 +26,7 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from trilane import machine
-from trilane.bench.lib.interleaved_processes import ProcessVariant, runners
+from trilane.bench.lib.interleaved_processes import KINDS, ProcessVariant, runners
 from trilane.errors import reason
 from trilane.scheduler.stats import median_interval
 from trilane.stages.dsp.runtime import installed
@@ -104,7 +104,7 @@ def instruction_peak(flags: Sequence[str], threads: int) -> dict[str, Any]:
 
 
 def _int8_rows(threads: int) -> list[dict[str, Any]]:
-    names = [name for name in installed() if name != "qnn"]
+    names = [name for name in installed() if name in KINDS]
     with tempfile.TemporaryDirectory(prefix="trilane-roofline-") as folder:
         variants, work = {}, {}
         for side, channels, kernel in INT8_LAYERS:

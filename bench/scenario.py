@@ -132,7 +132,7 @@ def run_scenario(
 
 @dataclass(eq=False)
 class _Player(threading.Thread):
-    """A thread that does `work` once the queue `requests` is open; `errors` has the errors that `work` raised."""
+    """A thread that does `work` once the queue `requests` is open. `errors` has a TrilaneError that `work` raised."""
 
     requests: FrameRequestQueue
     work: Callable[[], None]
@@ -281,7 +281,10 @@ class Queries:
                 raise TrilaneError(self.why or "the run ended before every query was answered")
 
     def warm_up(self, requests: FrameRequestQueue) -> None:
-        """Ask `WARM_UP` queries that do not count, and wait for their answers. `requests`: queue of the run."""
+        """Ask `WARM_UP` queries that do not count, and wait for their answers. Raises the errors of `wait`.
+
+        `requests`: queue of the run.
+        """
         self.ask(requests, WARM_UP)
         self.wait()
         self.restart()
@@ -330,9 +333,9 @@ def _poisson(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
 
 
 def _all_at_once(load: Load, requests: FrameRequestQueue, queries: Queries) -> None:
-    """Ask as many queries at once as the pipeline answers in `load.seconds`, but no more than a run has frames.
+    """Ask all queries at once: 10 % more than the pipeline answers in `load.seconds`, and enough for the percentile.
 
-    A few earlier queries show its rate.
+    A run has at most MAX_FRAMES queries. A few earlier ones, which do not count, show how many it answers in a second.
     """
     few = queries_needed(load.percentile)
     queries.ask(requests, few)
@@ -474,7 +477,7 @@ class LoadGenPlayer:
     def play(self, requests: FrameRequestQueue) -> None:
         """Warm the pipeline up, and let LoadGen ask until LoadGen has enough answers. `requests`: queue of the run.
 
-        Raises TrilaneError if the run ends first, or if a frame was dropped or lost.
+        Raises the errors of `Queries.wait`, and MissingPartError without LoadGen.
         """
         lg = load_generator()
         self.queries.warm_up(requests)

@@ -164,7 +164,7 @@ def _determinism(seeds: int) -> dict[str, int]:
 
 
 def _service(seed: int, frames: int) -> Service:
-    """Return a function that gives the service time of each job, in ns, from times that are computed here."""
+    """Return a function that gives each job's service time in ns: random, 0.5 to 1.5 times its stage's `SERVICE_MS`."""
     rng = np.random.default_rng(seed)
     table = {name: (ms * MS * rng.uniform(0.5, 1.5, frames)).astype(int).tolist() for name, ms in SERVICE_MS.items()}
     return lambda stage, _unit, frame, _begin_ns: table[stage][frame]
@@ -336,7 +336,7 @@ class LeanPipeline:
         self._fill(self._chain[0][1])
 
     def _fill(self, unit: str) -> None:
-        """Hand jobs to `unit` until it holds `HELD_JOBS` jobs, or until no further job can run."""
+        """Hand jobs to `unit` until it holds `HELD_JOBS` jobs, or until no waiting frame can get a slot."""
         while self._held[unit] < HELD_JOBS:
             for position in self._positions[unit]:
                 if self._waiting[position] and (position == self._last or self._free[position]):

@@ -163,7 +163,8 @@ class _CrowdFixture:
 def _views(fixture: _CrowdFixture, avatars: int, views: int, size: str, margin: int) -> Iterator[_View]:
     """Yield moments, evenly spread over the default motion, at which all avatars are in view.
 
-    `margin`: tensor pixels between two avatars.
+    `views`: number of moments to examine; moments with an avatar out of view are left out. `avatars`: number of
+    avatars. `size`: tensor size, as the option `--size`. `margin`: tensor pixels between two avatars.
     """
     specs = tuple(
         AvatarSpec(position=((k - (avatars - 1) / 2) * STEP_M, 0.0, -BACK_M * (k % 2))) for k in range(avatars)

@@ -292,7 +292,6 @@ def _trial_table(pairs: Sequence[TrialPair]) -> Table:
 
 
 def _table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
-    """Return a table with the column `titles` and `rows` of cells."""
     from rich.table import Table
 
     table = Table(*titles)

@@ -167,7 +167,7 @@ def _head(run: ExplainedRun) -> Iterator[str]:
 
 
 def _efficiency(run: ExplainedRun) -> Iterator[str]:
-    """Yield lines on the bound and the efficiencies of the run."""
+    """Yield a line on the bound of the run and a line on its efficiencies. Unknown facts have no line."""
     if bound := run.figures["bound"]:
         from trilane.apps.explain.reasons import bound_text
 
@@ -409,7 +409,7 @@ def _image(image: ImageSize) -> str:
 def _modelled(rows: Sequence[ModelledAvatar]) -> str:
     """Return a text with a line for each level of detail among the avatars of a phase.
 
-    The line ends with the largest bound of these avatars' errors and the largest measured error, both in pixels.
+    Each line ends with the largest bound on its avatars' errors and the largest measured error, both in pixels.
     """
     lines = []
     for modelled in dict.fromkeys(_model(row) for row in rows):

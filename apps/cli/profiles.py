@@ -170,7 +170,7 @@ def fit(
 
 
 def _next_command(result: ProfileFit | Calibrated, profile: Path, networks: Path) -> list[str]:
-    """Return a line with the command that predicts the network of the first measured row, as a list of one line.
+    """Return a list with one line: the command that predicts the network of the first measured row.
 
     The list is empty if the rows are of the reference networks. `result`: result of the fit. `profile`: file of the
     fitted profile. `networks`: folder of the networks.

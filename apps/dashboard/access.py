@@ -159,7 +159,7 @@ def headers(port: int) -> dict[str, str]:
 
 
 def refusal_of_head(scope: Mapping[str, Any]) -> Refusal | None:
-    """Return why a request is refused: for the size of its head, a body, or its HTTP version. None if it is allowed.
+    """Return why a request is refused: for a large head, a body, or a wrong HTTP version. None if it is allowed.
 
     `scope`: ASGI scope of the request.
     """
@@ -174,6 +174,7 @@ def refusal_of_head(scope: Mapping[str, Any]) -> Refusal | None:
 class Guard:
     """ASGI middleware that refuses requests, counts the refusals, and adds `headers` to every answer.
 
+    An answer of `app` with a status from 400 to 499, except NOT_FOUND, counts as a refusal too.
     `app`: application that answers the allowed requests.
     `port`: port of the server.
     `token`: token that secret paths need.

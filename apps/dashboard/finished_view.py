@@ -63,7 +63,7 @@ PIECE_ROWS = 4096
 
 
 class FinishedView:
-    """The `RunView` of the finished run in `folder`. Raises BadInputError for a missing or broken journal."""
+    """The `RunView` of the finished run in `folder`. The constructor raises the errors of `_read_run`."""
 
     def __init__(self, folder: Path) -> None:
         self._run = _read_run(folder)
@@ -118,7 +118,7 @@ class FinishedView:
 
 
 def _read_run(folder: Path) -> _FinishedRun:
-    """Return the finished run in `folder`. Raises BadInputError for a missing or broken journal."""
+    """Return the finished run in `folder`. Raises BadInputError for a broken report, or a missing or broken journal."""
     journal = journal_in(folder)
     if journal is None:
         raise BadInputError(folder, f"no {NAME}", "the folder of a run", "`trilane run` writes one into runs/")
@@ -266,7 +266,6 @@ class _RunPictures:
         return None
 
     def close(self) -> None:
-        """Close the video."""
         if self._container is not None:
             self._container.close()
 

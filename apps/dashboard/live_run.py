@@ -110,8 +110,9 @@ class _Runs:
     def run_all(self, first: Prepared) -> RunOutcome:
         """Run `first`, followed by each run that the page requests. Return the outcome of the last run.
 
-        A run that ends early is the last run. If a run presents no frame, the requested run follows. Without a request,
-        the previous configuration runs again. Raises TrilaneError if there is no previous configuration either.
+        A run that ends early is the last run. If a run leaves no folder, such as a run without a presented frame, the
+        requested run follows. Without a request, the configuration before it runs again. Raises TrilaneError if there
+        is no such configuration, or if that run leaves no folder either.
         """
         now, before = first, None
         while True:

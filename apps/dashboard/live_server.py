@@ -345,7 +345,8 @@ class LiveView:
     def _steer(self, name: str, value: Value) -> None:
         """Steer the camera by `value` of the control `name`; the control `recentre` undoes all steering.
 
-        The picture follows a drag: a drag to the right moves the camera to the left, and a drag down lifts the camera.
+        `value`: (right, down) in degrees for a drag, or the new zoom. The picture follows a drag: a drag to the right
+        moves the camera to the left, and a drag down lifts the camera.
         """
         azimuth, elevation, zoom = self._steering
         if isinstance(value, list):

@@ -80,7 +80,7 @@ class Client:
             self._drop()
 
     async def send_all(self) -> None:
-        """Send the queued messages until the server drops the client or the task is cancelled."""
+        """Send the queued messages until the client disconnects, the server drops it, or the task is cancelled."""
         sender = asyncio.ensure_future(self._send())
         dropped = asyncio.ensure_future(self._dropped.wait())
         try:
@@ -242,7 +242,7 @@ class RunView(Protocol):
     async def picture(self, client: Client) -> bytes | None:
         """Return the newest picture in the form of `shown`, and update `client.had_frame`.
 
-        None is returned if `client` has had the newest picture, or if there is no picture yet.
+        None is returned if `client` has had the newest picture, or if no picture can be sent now.
         """
 
     def control(self, asked: ControlSaid) -> str:

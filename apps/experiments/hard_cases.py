@@ -136,7 +136,7 @@ def make_case(pair: NetworkPair, case: str) -> Case:
 def error_of(case: Case, runtime: str) -> float:
     """Return the mean absolute error of `runtime`'s picture, in steps of 1/255.
 
-    The error is NaN if the float network's picture contains NaN.
+    The error is NaN if the float network's picture contains NaN. Raises MissingPartError without the runtime.
     """
     image = np.zeros(case.wanted.shape, np.uint8)
     session = load_runtime(runtime).load(case.pair.quantised.network, RuntimeOptions())

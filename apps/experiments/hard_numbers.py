@@ -101,7 +101,7 @@ def hard_numbers() -> Iterator[dict[str, Any]]:
 
 
 def kept_going(kind: str, cases: Iterable[HardNumber]) -> Iterator[HardNumber]:
-    """Yield `cases`. If the tested code raises an error, a failed row that names the error takes the place of the rest.
+    """Yield `cases`. After a BadInputError, ArithmeticError or ValueError, a failed row with its text ends the rows.
 
     `kind`: name of the kind of cases.
     """

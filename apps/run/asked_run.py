@@ -102,7 +102,7 @@ def _with_remade_avatar(options: RunOptions) -> tuple[RunOptions, tuple[str, ...
     """Return (options, notes): `options` with the variant of the avatar that they request, and notes on the variant.
 
     Raises BadInputError for a scene of several avatars, for a check of an untrained network, and for a variant that
-    cannot be made. Raises MissingPartError without PyTorch.
+    cannot be made. Raises MissingPartError without PyTorch or OpenGL.
     """
     from trilane.apps.avatar_files import is_untrained, remade_avatar
     from trilane.avatars.bundle import load_bundle

@@ -91,8 +91,8 @@ def compare(
 ) -> PaceComparison:
     """Compare a run at a chip's pace with the same run in virtual time.
 
-    `pace`, `policy`, `frames`, `edge`: pace, policy, number of frames and edge of the run. `jobs`: jobs of the run.
-    `fps`: rate of the scene, in frames a second.
+    `pace`, `policy`, `frames`, `edge`: pace, policy, number of frames and rule of the edges of the run. `jobs`: jobs of
+    the run. `fps`: rate of the scene, in frames a second.
     """
     late = [job for job in jobs if job.end_ns - job.begin_ns > pace.stage_ns[job.stage] + SLACK_NS]
     late_frames = sorted({job.frame for job in late})
@@ -155,7 +155,7 @@ def _in_time(jobs: Sequence[JobRecord], late_frames: Sequence[int]) -> list[tupl
 
 
 def _median_ms(jobs: Sequence[JobRecord], late_frames: Sequence[int] = ()) -> float | None:
-    """Return the median of `_in_time` in ms; None if no frame is left."""
+    """Return the median of the times that `_in_time` returns, in ms; None if no frame is left."""
     kept = _in_time(jobs, late_frames)
     return float(np.median([interval for _, interval in kept])) / 1e6 if kept else None
 

@@ -191,7 +191,7 @@ def avatar_report(
 
 
 def config_facts(config: RunConfig, policy: str, edge: str) -> dict[str, Any]:
-    """Return the block `config` of the report of a run of avatars. `policy`, `edge`: policy and edge of the run."""
+    """Return the block `config` of the report of a run of avatars. `policy`: policy. `edge`: rule of the edges."""
     return {**config.model_dump(mode="json", exclude={"out_dir", "window", "kept"}), "policy": policy, "edge": edge}
 
 

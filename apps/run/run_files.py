@@ -115,7 +115,7 @@ def join_folder(
 
     `video` is None if no segment contains a frame. `error` says that files were removed during the run; it is None if
     no file is missing. Numbers of frames reveal missing files. Each encoded frame has a line in a digest file, and its
-    picture is in the segment beside this file. Only the last picture may be missing, if a kill interrupted its writing.
+    picture is in the segment beside this file. Only a segment's last picture may be missing, if a kill interrupted it.
     `fps`: frames a second of the scene. `frames`: least number of frames that were encoded.
     Raises UnwrittenError if the disk is full.
     """

@@ -132,8 +132,8 @@ class LateFrames(NamedTuple):
     """The numbers of frames that were not in time.
 
     `due`: number of frames that had to be in time. `late`, `dropped`, `lost`: numbers of frames that were presented
-    late, dropped and lost. `replaced`: number of frames that newer frames replaced, in a run whose frames no fixed rate
-    releases; these frames do not count as dropped.
+    late, dropped and lost. `replaced`: number of frames that newer frames replaced, which do not count as dropped. It
+    is 0 if a fixed rate or random arrivals release the frames.
     """
 
     due: int
@@ -323,7 +323,7 @@ def _times(facts: Facts) -> str:
 
 
 def _bound(facts: Facts) -> str:
-    """Return a text on the bound: its name, its ms on the critical path, and the cost if its jobs take longer."""
+    """Return a text on the bound: its name, its ms on the path, its cost if known, and units that may bound as much."""
     bound = facts.bound
     if bound is None:
         return UNKNOWN

@@ -145,8 +145,9 @@ def _lateness(presented: int, late: int, dropped: Mapping[str, int], lost: int, 
 def _named_bound(
     bound: Bound | None, stages: Mapping[str, StageTimes | StageFigures], frame_ms: float | None
 ) -> NamedBound | None:
-    """Return `bound` with each stage's ms on the critical path; None without a bound.
+    """Return `bound` with ms on the critical path by stage; None without a bound.
 
+    The stages are the one that bounds, and those of the bounding unit with a share of LEAST_NAMED or more.
     `stages`: figures of all stages, by name. `frame_ms`: mean frame time, ms; None or 0 if unknown.
     """
     if bound is None:
@@ -212,10 +213,13 @@ def _tries(
     target: float,
     folder: str,
 ) -> Iterator[str]:
-    """Yield proposals that follow from the run's figures, the most useful first.
+    """Yield proposals, the most useful first. Every run gets the last one, `trilane explain`.
 
-    `run`, `config`, `folder`: see `facts_of`. `baseline`: figures with one frame at a time. `bound`: bound of the run.
-    `target`: rate to hold, in frames a second.
+    The first is to end other programs that take more than MOST_OTHERS. A run that is paced or below `target` gets the
+    proposals of `_shorter`.
+    A run that holds `target` may get late latching (see MUCH_LATER) or, for a scene, a larger picture (see MUCH_LEFT).
+    `run`, `config`, `folder`: see `facts_of`. `baseline`: figures with one frame at a time; None if unknown.
+    `bound`: bound of the run; None if unknown. `target`: rate to hold, in frames a second.
     """
     if run.other_programs is not None and run.other_programs > MOST_OTHERS:
         yield f"end other programs ({percent(run.other_programs)}) and run again"
@@ -233,8 +237,8 @@ def _tries(
 def _shorter(run: RunMetrics, config: Mapping[str, Any], bound: NamedBound | None) -> Iterator[str]:
     """Yield proposals to shorten the frame time.
 
-    For a run with one frame at a time, the first proposal is a policy under which the units work at once. If a unit
-    bounds the run, another proposal concerns the stage that bounds.
+    A run with one frame at a time on several units gets a policy under which the units work simultaneously. If a unit
+    bounds the run, the stage that bounds gets less work. In a pipeline file, it gets another unit if there is one.
     `run`, `config`, `bound`: see `_tries`.
     """
     if works_on_one_frame(run.policy) and len(run.units) > 1:

@@ -306,7 +306,7 @@ class RunLook(NamedTuple):
 def looks(run: FollowedRun, pause: Callable[[], None]) -> Generator[RunLook]:
     """Yield a look at `run` now, and after every call of `pause` until the run has ended.
 
-    Raises BadInputError if the run has ended and its journal has no record.
+    Raises BadInputError for a broken journal or report, or if the run has ended and its journal has no record.
     """
     figures: LiveFigures | None = None
     while True:
@@ -329,7 +329,7 @@ def looks(run: FollowedRun, pause: Callable[[], None]) -> Generator[RunLook]:
 def _as_reported(figures: MomentFigures, folder: Path) -> MomentFigures:
     """Return `figures` with the verdict of the report in `folder`, because a report has more facts than a journal.
 
-    If `folder` has no report, return `figures` unchanged.
+    If `folder` has no report, return `figures` unchanged. Raises BadInputError for a report that cannot be read.
     """
     if not (folder / "report.json").is_file():
         return figures

@@ -28,11 +28,12 @@ class CastView:
     """One visible avatar in one frame.
 
     `index`: number of the avatar in the scene. `folder`: folder of the avatar's bundle.
-    `pose`, `translation`: pose (55,3) and translation (3,) from `Mover.sample`. `world`: matrix (4,4) from the body's
-    space to the world.
+    `pose` (55,3): axis-angle vectors, radians. `translation` (3,): translation of the root in the body's space, metres.
+    `world`: matrix (4,4) from the body's space to the world.
     `joints`: skinning matrices (55,3,4), as the pose stage computes them.
     `box`: rectangle of the picture around the avatar and its clothes; it may reach beyond the picture.
-    `depth`: camera z of the pelvis. `view`: view matrix (4,4). `projection`: matrix (4,4) of the projection to the box.
+    `depth`: z of the pelvis in the camera's space, metres; negative in front of the camera.
+    `view`: view matrix (4,4). `projection`: matrix (4,4) of the projection to the box.
     """
 
     index: int
@@ -147,7 +148,7 @@ class Box(NamedTuple):
 class RasterLayer:
     """A layer of a picture.
 
-    `box`: pixels of the picture that the layer covers. `depth`: camera z; the farthest layer has the least value.
+    `box`: pixels of the picture that the layer covers. `depth`: as in `CastView`, least for the farthest layer.
     `light`: array (h,w,4) in 0..1: linear light of three colours times alpha, and alpha.
     """
 

@@ -114,7 +114,7 @@ def tensor(image: ReferenceImage, texture: F64, scale: float, zero_point: int) -
 
 
 def _target_corners(world: F64, clip: F64, shape: tuple[int, int]) -> F64:
-    """Return the vertices (N,4) as (column * w, row * w, z, w): place in the picture in pixels, clip coordinates.
+    """Return (column * w, row * w, z, w) of each vertex, (N,4): z and w in clip space, column and row in pixels.
 
     `world`: vertices (N,3). `clip`: matrix projection @ view (4,4).
     """
@@ -150,7 +150,7 @@ def _fragments(
 def _boxes(corners: F64, shape: tuple[int, int]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return (first column and row (F,2), side (F,)) of a square around each triangle, in pixels.
 
-    Side 0: the triangle is outside the picture.
+    A side of 0 means that the triangle covers no pixel of the picture.
     """
     limit = np.array([shape[1], shape[0]])
     w = corners[..., 3]
