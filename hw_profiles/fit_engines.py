@@ -171,7 +171,10 @@ class Latency(NamedTuple):
 
 
 def read_latencies(folder: Path) -> list[Latency]:
-    """Return the rows of `chip_rows.csv` whose networks ran on the engine. Raises BadInputError."""
+    """Return the rows of `chip_rows.csv` whose networks ran on the engine, without the split `extra` of `networks.csv`.
+
+    Raises BadInputError if a table cannot be read or lacks columns.
+    """
     families = {row["name"]: row["family"] for row in _table(folder / "networks.csv") if row["split"] != "extra"}
     rows = _table(folder / "chip_rows.csv")
     if not rows or set(COLUMNS) - rows[0].keys():
@@ -201,7 +204,7 @@ def _table(path: Path) -> list[dict[str, str]]:
 
 @lru_cache(maxsize=128)
 def layers_in(folder: Path, network: str) -> Layers:
-    """Return the layers of a network in `folder`/networks."""
+    """Return the layers of a network in `folder`/networks. Raises BadInputError for a file that cannot be read."""
     return read_graph(folder / "networks" / f"{network}.onnx").work.layers
 
 
@@ -438,7 +441,9 @@ def folds(networks: Sequence[str]) -> Iterator[frozenset[str]]:
 def cross_validate(
     rows: Sequence[Latency], layers: Mapping[str, Layers], start: Numbers, parts: Sequence[frozenset[str]] | None = None
 ) -> list[LeftOut]:
-    """Return all rows whose network some fit left out, each with its prediction by that fit.
+    """Return the rows whose network some fit left out, each with its prediction by that fit.
+
+    A row is missing if its chip has no rows of other networks in that fit.
 
     `rows`: rows of one engine.
     `layers`: layers of each network, by name.
