@@ -65,7 +65,7 @@ class Plan:
     `most_fps`: largest rate of shown frames, as if a display had this rate; None for the display of the profile.
     `stretch`: factor on the network's expected time.
     `avatars`: number of avatars in view; they share one tensor.
-    `meshes`: vertices of all avatars in view divided by those of one whole mesh; None for whole meshes.
+    `meshes`: vertices of all avatars in view, counted in whole meshes; None if every avatar has its whole mesh.
 
     Raises BadInputError for a value outside its range.
     """
@@ -179,9 +179,9 @@ class Steady:
     `latency_ms`: mean latency; None if no frame is presented.
     `capped`: whether the display, or its rate in the plan, limits the rate.
     `unit_of`: unit of each stage.
-    `stages_ms`: time of a job of each stage.
+    `stages_ms`: time of a job of each stage in ms.
     `busy`: share of the time in which each unit works.
-    `idle`: shares of the rest of the time by cause, for each unit.
+    `idle`: share of the time in which each unit is idle, by unit and cause.
     `dropped`: share of the frames that are not shown.
     """
 
@@ -249,7 +249,7 @@ def _simulated(times: StageTimes, variant: Variant, settings: Settings, *, keep:
 def simulated(profile: Profile, plan: Plan, corners: Corners) -> Simulation:
     """Return the run in virtual time from which `steady` takes its figures, with its recording and its jobs.
 
-    `profile`, `plan`, `corners`: as in `steady`.
+    The parameters and the errors are as in `steady`.
     """
     times, display_ns = _rounded(profile, plan, corners), _display_ns(profile, plan)
     _, held = _settled(times, plan.variant, display_ns, quick=False)
@@ -282,6 +282,8 @@ def steady(profile: Profile, plan: Plan, corners: Corners, *, quick: bool = Fals
     `corners`: constant corner of each unit.
     `quick`: whether to simulate a short run if that is possible. The frame time of a short run is right to a hundredth;
     its shares of time include the filling and emptying of the pipeline.
+
+    Raises BadInputError for an unknown edge.
     """
     times, worker = stage_times_ms(profile, plan, corners), workers_of(profile)
     batch, display = plan.variant.batch, _display_ms(profile, plan)

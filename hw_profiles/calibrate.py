@@ -180,7 +180,7 @@ def read_own_rows(path: Path, folder: Path) -> list[OwnRow]:
 
     `folder`: folder that the networks' paths are relative to; no path may lead out of it.
 
-    Raises BadInputError.
+    Raises BadInputError if the table or a network cannot be read, or if the table has a wrong cell.
     """
     numbered = numbered_lines(read_text(path, "a table of measured rows"))
     if not LEAST_ROWS <= len(numbered) - 1 <= MOST_ROWS:
@@ -241,7 +241,10 @@ def network_file(place: str, name: str, folder: Path, remedy: str = "--networks 
 
 
 def on_chip(profile: Profile, row: OwnRow) -> Profile:
-    """Return `profile` with the row's unit in the row's precision, and its tensor engine under the row's runtime."""
+    """Return `profile` with the row's unit in the row's precision, and its tensor engine under the row's runtime.
+
+    Raises BadInputError if the unit has tensor engines, but none for this precision and runtime.
+    """
     chip = in_precision(profile, row.unit, "not said", row.precision)
     return under_runtime(chip, row.unit, row.runtime) if chip.units[row.unit].engines else chip
 
@@ -291,7 +294,7 @@ def misses(left_out: Sequence[CheckedRow], of: CheckedRow | UnitName) -> list[fl
 
 
 def error_scale(told: Sequence[float]) -> float:
-    """Return the factor by which the stated error must grow or shrink. `told`: misses in units of the stated error."""
+    """Return the factor on the stated error, at most MOST_ERROR_SCALE. `told`: misses in units of the stated error."""
     freedom = STATED_ROWS + len(told)
     scale = math.sqrt((STATED_ROWS + sum(miss**2 for miss in told)) / freedom)
     return min(scale * student_quantile(freedom, SHARE) / SIGMAS, MOST_ERROR_SCALE)
@@ -470,9 +473,9 @@ class NamedRow(NamedTuple):
 
 
 def fit_row(table: Path, network: str | None, unit: str | None, precision: str | None, runtime: str | None) -> NamedRow:
-    """Return the checked cells of a new row of `table`. None stands for a missing column.
+    """Return the checked cells of a new row of `table`. For None, the usual word of WORDS is taken.
 
-    Raises BadInputError, also for a network file that cannot be read.
+    Raises BadInputError for a wrong cell, no `network`, or a network's file that cannot be read.
     """
     if not network:
         raise BadInputError("--network", "nothing", "the network that was measured", "a path beside the table")

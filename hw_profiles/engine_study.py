@@ -1,9 +1,9 @@
 """The whole fit of tensor engines: the numbers of every chip, their cross-validation, and tables and pictures of both.
 
 Every stated error comes from rows whose network was left out of the fit. A chip without rows of an engine gets the
-numbers of a related chip, times a ratio. It is the ratio of the two chips' numbers on another engine that both have.
-Such numbers are `assumed`. The head of a chip's profile, the part before MARK, is written by hand and stays. This
-module writes everything from MARK on.
+numbers of a related chip, times the ratio of the two chips' numbers on another engine. Such numbers are `assumed`. The
+head of a chip's profile, the part before MARK, is written by hand and stays. This module writes everything from MARK
+on.
 """
 
 from __future__ import annotations

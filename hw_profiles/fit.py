@@ -89,7 +89,7 @@ class ProfileFit:
         return tuple(dict.fromkeys(r.column for r in self.residuals))
 
     def median_error(self, column: str, *, left_out: bool = False) -> float:
-        """Return the median absolute relative error of `column`.
+        """Return the median absolute relative error of `column`; 0 without measurements.
 
         `left_out`: whether each error comes from a fit without its measurement.
         """
@@ -177,7 +177,7 @@ def _from_residuals(residuals: Sequence[Residual], rows: Sequence[ConfigurationR
 
 
 def _solve(data: Mapping[str, Any], path: Path, step: Step, measured: Sequence[TableCell]) -> tuple[F64, F64]:
-    """Return (factors on the priors in `data` of `step.free`, spread of each factor after a fit to `measured`)."""
+    """Fit to `measured`. Return (factor on each group of keys `step.free` in `data`, spread of each factor)."""
     try:
         from scipy.optimize import least_squares
     except ImportError:

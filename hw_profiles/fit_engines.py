@@ -172,7 +172,10 @@ class Latency(NamedTuple):
 
 
 def read_latencies(folder: Path) -> list[Latency]:
-    """Return the rows of `chip_rows.csv` whose networks ran on the engine. Raises BadInputError."""
+    """Return the rows of `chip_rows.csv` whose networks ran on the engine, without the split `extra` of `networks.csv`.
+
+    Raises BadInputError if a table cannot be read, lacks columns or has a damaged row.
+    """
     networks = _table(folder / "networks.csv", ("name", "split", "family"))
     families = {row["name"]: row["family"] for _, row in networks if row["split"] != "extra"}
     return [
@@ -212,7 +215,7 @@ def _table(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str, str]
 
 @lru_cache(maxsize=128)
 def layers_in(folder: Path, network: str) -> Layers:
-    """Return the layers of a network in `folder`/networks."""
+    """Return the layers of a network in `folder`/networks. Raises BadInputError for a file that cannot be read."""
     return read_graph(folder / "networks" / f"{network}.onnx").work.layers
 
 
@@ -449,7 +452,9 @@ def folds(networks: Sequence[str]) -> Iterator[frozenset[str]]:
 def cross_validate(
     rows: Sequence[Latency], layers: Mapping[str, Layers], start: Numbers, parts: Sequence[frozenset[str]] | None = None
 ) -> list[LeftOut]:
-    """Return all rows whose network some fit left out, each with its prediction by that fit.
+    """Return the rows whose network some fit left out, each with its prediction by that fit.
+
+    A row is missing if its chip has no rows of other networks in that fit.
 
     `rows`: rows of one engine.
     `layers`: layers of each network, by name.

@@ -203,7 +203,7 @@ class Governor:
         self.due_ns = 0
 
     def begin(self, now_ns: int) -> list[SetDuty]:
-        """Return the duties that the performance profile requests. `now_ns`: time at which the run begins."""
+        """Return the duties that the performance profile requests, except full ones. `now_ns`: time of the start."""
         self._start_ns = self._last_ns = now_ns
         self.due_ns = now_ns + self._poll_ns
         return self._changed()

@@ -1,8 +1,8 @@
 """Checks the tensors and connections of a graph from a stranger's file, and gives every tensor a static shape.
 
 A tensor's data must have the length that its shape states. Only small data is kept, such as sizes and axes, from which
-shapes are inferred. Data outside the file is never opened. Every tensor must be made exactly once, before an operator
-reads it, and the operators must form no circle.
+shapes are inferred. Data outside the file is never opened. Every tensor must be made exactly once, and the operators
+must form no circle; they are sorted if a tensor is read before it is made.
 
 A shape is inferred; for an operator that ONNX does not know, the file states it. A shape that stays unknown is an error
 that names the first operator whose result has it. Exporters compute sizes and axes by chains of operators, for a
@@ -93,7 +93,8 @@ def forget_data(tensor: TensorProto, folder: Path) -> None:
     `tensor`: tensor of the file; it is changed in place.
     `folder`: folder of the file.
 
-    Raises UnexpectedValue if the data has another length than the shape states, or is stored outside the folder.
+    Raises UnexpectedValue for a negative or too large shape, for data of another length than the shape states, or for
+    data outside the folder.
     """
     what = f"tensor {tensor.name!r}"
     shape = tuple(tensor.dims)
@@ -147,7 +148,11 @@ def called(node: onnx.NodeProto) -> str:
 
 
 def check_structure(graph: onnx.GraphProto) -> None:
-    """Raise UnexpectedValue if an operator contains a graph, or if a tensor is missing or made several times."""
+    """Raise UnexpectedValue if parts of the graph cannot be predicted.
+
+    Errors are: an operator that contains a graph, sparse weights, no outputs, an input or output that is no tensor, and
+    a tensor that is missing or made several times.
+    """
     _check_kinds(graph)
     made = Counter(_made(graph))
     twice = [name for name, times in made.items() if times > 1]

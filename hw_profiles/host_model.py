@@ -147,6 +147,9 @@ def error_of(took: Sequence[float]) -> float:
 def with_network(profile: Profile, work: Work, ms: Mapping[int, float], error: float, said: str) -> Profile:
     """Return `profile` with the measured times of a network on the unit for networks.
 
+    The unit keeps its number of threads, or takes the least measured one if its own was not measured. The
+    application's share of the memory's bandwidth becomes 0, because the stages were measured beside each other.
+
     `work`: work of the network.
     `ms`: measured time of a job in ms, by number of threads.
     `error`: relative error of these times, from `error_of`.

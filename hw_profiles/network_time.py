@@ -185,8 +185,8 @@ def in_precision(profile: Profile, unit: UnitName, numbers: NumberFormat, asked:
     """Return `profile` with the unit computing in the network's precision.
 
     `unit`: unit that runs the network.
-    `numbers`: number format of the file. A float network runs in FP16 on a unit for integers. Any other network runs in
-    the unit's own precision, because a file without weights does not say its precision.
+    `numbers`: number format of the file. A float network runs in FP16 on a unit whose own precision is INT8. In all
+    other cases, the unit keeps its own precision.
     `asked`: int8, fp16 or fp32, which replaces this choice; None keeps it.
     """
     own = profile.units[unit].precision
@@ -258,7 +258,7 @@ def predict_network(
     `governor`: name in GOVERNORS; None for the profile's governor.
     `wanted`: rate to judge, and limit of power.
 
-    Raises BadInputError for an unknown name or a time out of range.
+    Raises BadInputError for an unknown performance profile, and, unless `minutes` is 0, as `warm_up` does.
     """
     work, corners = graph.work, corners_of(profile, performance_profile)
     time = price(profile, work, unit, corners)

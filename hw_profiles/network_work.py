@@ -160,7 +160,8 @@ def count_work(model: Any) -> Work:
     An operator whose results depend only on constants and shapes costs nothing. An operator without a rule counts only
     the movement of its elements, and has `ruled` False.
 
-    Raises BadInputError for a tensor without a static shape, or a convolution whose tensors do not fit.
+    Raises BadInputError for a tensor without a static shape, shapes that contradict each other, or a convolution whose
+    tensors do not fit.
     """
     shapes = _shapes(model)
     graph = model.graph

@@ -162,7 +162,7 @@ def prices_of(
     corners_of_chip: Callable[[Profile], Corners],
     measured: MeasuredStages = NOTHING_MEASURED,
 ) -> dict[str, StagePrice]:
-    """Return the time of every stage: from the file, from a measured run, or from its network.
+    """Return the time of every stage: the first known one of key `time_ms`, a measured run, the block, the network.
 
     `graphs`: graphs of the networks, by the stage's name.
     `chip_for`: function that returns the chip in the precision of a network.
@@ -223,6 +223,7 @@ def bound_of(file: PipelineFile, prices: Mapping[str, StagePrice]) -> tuple[Grap
 class Drawn:
     """A function for the virtual clock that returns the time of each job in ns.
 
+    `prices`: time of each stage, by name. `seed`: seed of the random numbers.
     `factors`: factor on the time of each stage, by name; 1 for a stage that is not listed.
     """
 

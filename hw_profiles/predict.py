@@ -83,7 +83,8 @@ def predict(
     `governor`: name in GOVERNORS; None for the profile's governor.
     `wanted`: rate that limits the application, and limit of power.
 
-    Raises BadInputError for an unknown name or a time out of range.
+    Raises BadInputError for an unknown performance profile or edge, or a wanted rate out of range. Unless `minutes` is
+    0, it also raises as `over_time` does.
     """
     profile, plan, corners, placed = _settled_on(profile, plan, performance_profile, wanted)
     now = steady(profile, plan, corners)
@@ -155,7 +156,7 @@ def predicted_run(
 ) -> Simulation:
     """Return the run in virtual time, at constant temperature, by which `predict` divides time into busy and idle.
 
-    Parameters and errors are those of `predict`.
+    The parameters and the errors are as in `predict` without minutes.
     """
     profile, plan, corners, _ = _settled_on(profile, plan, performance_profile, wanted)
     return simulated(profile, plan, corners)
@@ -175,7 +176,7 @@ def what_if(
     `performance_profile`: one of PERFORMANCE_PROFILES.
     `fps`: rate in frames a second; None for no rate.
 
-    Raises BadInputError for an unknown performance profile.
+    Raises BadInputError for an unknown performance profile or a rate out of range.
     """
     corners = corners_of(profile, performance_profile)
     if fps is not None:
@@ -196,7 +197,9 @@ def predict_table(
     variant: Variant = REFERENCE,
     on_row: Callable[[int], None] = lambda _count: None,
 ) -> Iterator[dict[str, Any]]:
-    """Yield for each row its cells, and the predicted `bench_*_ms`, `app_*_ms` with their ranges, and `confidence`.
+    """Yield for each row its cells and predictions.
+
+    Predictions are `bench_*_ms`, `app_*_ms` with their ranges, `expected_error_*` and `confidence`.
 
     `profile`: hardware profile of the chip.
     `rows`: rows of a table of configurations.
@@ -307,7 +310,7 @@ def _cells(row: ConfigurationRow) -> dict[str, Any]:
 
 
 def held_to(plan: Plan, fps: float | None) -> Plan:
-    """Return `plan` at the rate `fps`, or unchanged if `fps` is None.
+    """Return `plan` at the rate `fps`, or unchanged if `fps` is None. Raises BadInputError for a rate out of range.
 
     A policy that releases frames at a rate uses `fps`. For any other policy, `fps` limits the rate of shown frames.
     """

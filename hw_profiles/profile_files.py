@@ -80,7 +80,7 @@ def merged_tables(path: Path, seen: tuple[Path, ...] = ()) -> dict[str, Any]:
 
     `seen`: files that extend `path`, directly or through other files.
 
-    Raises BadInputError for a cycle or an unreadable file.
+    Raises BadInputError for a cycle, more than MAX_DEPTH files in a row, or a file that is missing or cannot be read.
     """
     path = path.resolve()
     if path in seen:

@@ -96,7 +96,7 @@ def holding(fps: float, times: FrameInterval, dropped: int = 0, late: int = 0, f
 def wanted_drops(dropped: Mapping[str, int]) -> int:
     """Return the number of dropped frames, apart from those that the key `every` of a pipeline file leaves out.
 
-    `dropped`: numbers of dropped frames by place and cause, as in report.json.
+    `dropped`: numbers of dropped frames by edge and cause, as in report.json.
     """
     return sum(count for cause, count in dropped.items() if not cause.endswith(f":{DropCause.EVERY.value}"))
 
@@ -126,9 +126,9 @@ def _short(ms: float) -> str:
 class FrameLoad(NamedTuple):
     """A load, as functions of the corners of the units.
 
-    `work_ms`: function that returns the busy time of each working unit for a frame.
-    `frame_ms`: function that returns the least time between frames. This function may run a simulation, so it is called
-    only where its result matters.
+    `work_ms`: function that returns the busy time of each working unit for a frame, ms.
+    `frame_ms`: function that returns the least time between frames, ms. This function may run a simulation, so it is
+    called only where its result matters.
     """
 
     work_ms: Callable[[Corners], Mapping[UnitName, float]]
@@ -290,7 +290,7 @@ def device_power(
     `profile`: hardware profile of the chip.
     `busy`: share of the time in which each unit works.
     `corners`: corner of each unit.
-    `busy_error`: relative error of these shares; 0 for a unit that is missing.
+    `busy_error`: relative error of these shares; it counts as 0 for a missing unit, and for a unit that always works.
     """
     base = profile.thermal.base_power_w
     spreads = {

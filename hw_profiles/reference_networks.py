@@ -172,7 +172,7 @@ class ConfigurationRow:
 def read_table(path: Path) -> list[ConfigurationRow]:
     """Return the rows of `path`; lines that begin with `#` are comments.
 
-    Raises BadInputError if the file is unreadable or too large, or lacks a column of KEYS.
+    Raises BadInputError if the file is unreadable or too large, lacks rows or a column of KEYS, or has a wrong cell.
     """
     try:
         if path.stat().st_size > MAX_BYTES:
@@ -234,12 +234,12 @@ def spec_of(cells: dict[str, str], place: str) -> NetworkSpec:
 
 
 def encode(b: GraphBuilder, x: TensorRef, encoder: str) -> list[TensorRef]:
-    """Return the features of `x` at strides 2, 4, 8, 16 and 32 by `encoder`, one of ENCODERS."""
+    """Append `encoder`, one of ENCODERS, to the graph of `b`. Return features of `x` at strides 2, 4, 8, 16 and 32."""
     return resnet18(b, x) if encoder == "resnet18" else _inverted_encoder(b, x, MOBILE_ENCODERS[encoder])
 
 
 def resnet18(b: GraphBuilder, x: TensorRef) -> list[TensorRef]:
-    """Return the features of `x` by ResNet18 at strides 2, 4, 8, 16 and 32."""
+    """Append ResNet18 to the graph of `b`. Return features of `x` at strides 2, 4, 8, 16 and 32."""
     x = b.unit(x, RESNET18_STEM, 7, stride=2)
     features = [x]
     pooled = (RESNET18_STEM, x.height // 2, x.width // 2)

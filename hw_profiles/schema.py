@@ -304,7 +304,7 @@ class Unit(ProfileTable):
 
     @property
     def peak_mac_s(self) -> float:
-        """The peak of multiply-accumulates per second at the unit's precision."""
+        """The peak of multiply-accumulates per second at the unit's precision; 1e11 if unknown."""
         return self.peak.or_else(0.1) * 1e12
 
     @property

@@ -209,7 +209,7 @@ def predict_beside(
     `governor`: name in GOVERNORS; None for the profile's governor.
     `turns`: name in TURNS, the rule that chooses whose job a unit takes if several wait.
 
-    Raises BadInputError for an unknown performance profile or governor, or a time out of range.
+    Raises BadInputError for an unknown performance profile, and, unless `minutes` is 0, as `warm_up` does.
     """
     corners = corners_of(profile, performance_profile)
     at = cache(lambda where: together(profile, tenants, where, turns))

@@ -73,7 +73,7 @@ class Tenant:
     `variant`: how the stages are connected and scheduled.
     `is_bare`: whether it consists only of the network, whose result is due when the next frame comes.
     `avatars`: number of avatars in view for each of `networks`; empty for one avatar each.
-    `meshes`: for each of `networks`, the vertices in view divided by those of one whole mesh; empty for whole meshes.
+    `meshes`: for each of `networks`, the vertices in view, counted in whole meshes; empty if all meshes are whole.
     `computes`: precision and runtime of the networks.
 
     Raises BadInputError for a unit or a rate out of range.
@@ -164,6 +164,8 @@ class Tenant:
         `corners`: corner of each unit of the chip.
         `end`: expected times, or one end of their intervals.
         `always`: share of the memory's bandwidth that is taken all the time, 0 to 1.
+
+        Raises BadInputError if the chip has no tensor engine for the requested precision and runtime.
         """
         return _AvatarJobs(self, self.computes.on(profile, self.unit), corners, end, always)
 
@@ -248,7 +250,7 @@ class FileTenant:
     `graphs`: graphs of its networks, by the stage's name.
     `precision`: int8, fp16 or fp32 for networks whose stage states none; None: the network and its unit decide.
 
-    Raises BadInputError for a file without a rate.
+    Raises BadInputError for a file without a rate, or with a rate out of range.
     """
 
     name: str

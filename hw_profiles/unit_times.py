@@ -289,7 +289,7 @@ def layer_times(
 ) -> EngineTime:
     """Return the time of each layer on the engine of `unit`, which is 0 for a layer that runs on the CPU instead.
 
-    The parameters are those of `time_on`.
+    The parameters are as in `time_on`.
     """
     assert unit.engine is not None
     left = 1 - (memory.application_use_fraction.or_else(0.0) if contended else 0.0)

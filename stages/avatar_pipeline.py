@@ -47,7 +47,7 @@ def avatar_pipeline(config: RunConfig, assets: Assets, edge: str = DEFAULT_EDGE)
 
 
 def edge_bytes(config: RunConfig, assets: Assets) -> dict[str, int]:
-    """Return the payload bytes of each edge, for the largest tensors of the run, in the order of the edges."""
+    """Return the payload bytes of each edge by its name, such as `pose->raster`, for the largest tensors of the run."""
     output, names = config.scene.output, config.infer_names
     pixels = config.max_tensor_pixels * (len(set(config.networks)) or 1)
     crossings = crossing_bytes(config, only_network_of(assets)) if config.cuts else []
@@ -180,7 +180,7 @@ def tried(
 def _thrown_away(checked: Checked) -> Iterator[RunConfig]:
     """Yield the configuration of `checked` with one tensor shape and a run folder that is removed afterwards.
 
-    A single shape is prepared faster than many. The other shapes of a size have at most 25/16 of this shape's area.
+    A single shape is prepared faster than many. The other shapes have less than twice this shape's area.
     """
     with tempfile.TemporaryDirectory(prefix="trilane-rehearsal-") as folder:
         height, width = one_shape(checked.config)

@@ -50,10 +50,10 @@ AVATAR_DTYPE = np.dtype(
 
 
 def pose_dtype(avatars: int) -> np.dtype[Any]:
-    """Return the layout of the header of a packet with `avatars` avatars.
+    """Return the layout of the header of a packet with `avatars` avatars. Its fields:
 
     `avatar_count`: number of avatars.
-    `work`: a number of `FrameWork`.
+    `work`: value of `FrameWork`.
     `picture`: number of the frame whose picture of the avatars is shown; -1 if none is.
     `repeats`: 0 for a composited frame that was drawn; otherwise 1 + the number of the drawn frame with the same bytes.
     `media_time_s`: time in motion and camera.
@@ -78,7 +78,7 @@ def pose_dtype(avatars: int) -> np.dtype[Any]:
 
 
 def posed_vertices(payload: U8, counts: Sequence[int]) -> list[F32]:
-    """Return a view (V,3) float32 into the payload of the pose edge for each avatar: its skinned vertices.
+    """Return the skinned vertices of each avatar as a view (V,3) float32 of `payload`, a payload of the pose edge.
 
     The vertices are in the body's order, in metres, in world space. A level of the mesh has fewer vertices than the
     whole mesh, and fills the beginning of its view.

@@ -71,8 +71,8 @@ def requested_scene(options: RunOptions) -> Scene:
     """Return the scene of the scene file, changed by the options. Raises BadInputError.
 
     An option that is a key of the scene replaces its value. The options `motion` and `avatar` change the first avatar.
-    The scene's keys for the format of its motion or camera do not hold for a new file. For a built-in camera, all keys
-    about the scene's camera file are left out.
+    For a new motion or camera file, the scene's keys about the old file's format are left out. For a built-in camera,
+    all keys about the scene's camera file are left out.
     """
     values = load_scene(find_scene(options.scene))
     here, camera = Path.cwd(), values["camera"]

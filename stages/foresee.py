@@ -5,8 +5,8 @@ are close enough to each other, the changes of the tensor's shape are foreseen t
 
 A tensor has the number of pixels that its network was trained for, or fewer if the scene allows it. Under a policy that
 releases frames at a rate, a run may step down to smaller tensors so that frames are in time. An error budget in dB
-limits the smallest size, by the avatars' measured errors. Under other policies the smallest size within the budget is
-used.
+limits the smallest size, by the avatars' measured errors. Other policies use the smallest size within the budget, or
+the full size without a budget.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ def tensor_works(scene: Scene, policy: str, losses: Sequence[SizeLoss]) -> tuple
     """Return (`RunConfig.works` of a scene under `policy`, note for a person, which may be empty).
 
     `losses`: loss of PSNR of each avatar in tensors below full size; without figures if it was not measured.
-    Raises BadInputError if the scene has an error budget and an avatar has no measured errors.
+    Raises BadInputError if the scene has an error budget and an avatar has no measured errors, UnexpectedValue for an
+    unknown policy.
     """
     if not scene.plans_tensor:
         return (ALL_WORK,), ""
@@ -232,7 +233,7 @@ def _foreseen(
 def foreseen_rects(
     scene: Scene, staged: Staged, bodies: Sequence[ShapedBody], frames: Sequence[int]
 ) -> Iterator[Mapping[int, Rect]]:
-    """Yield the rectangles of the visible avatars by number, for each frame. `frames`: numbers of the frames."""
+    """Yield for each of the numbers `frames` the rectangles (NDC) of visible avatars with finite poses, by avatar."""
     distinct = {id(body): MeshBounds(body, standoff_m=CLOTHES_STANDOFF_M) for body in bodies}
     skeletons = [Skeleton(body.joints, body.body.parents) for body in bodies]
     for frame in frames:

@@ -99,7 +99,7 @@ def gl_facts() -> dict[str, Any] | None:
 
 
 def runtime_facts() -> dict[str, Any]:
-    """Return, by package of an installed runtime, the devices or providers on which it can run."""
+    """Return the providers of ONNX Runtime and, if it is installed, the devices of OpenVINO, by package."""
     import onnxruntime
 
     facts: dict[str, Any] = {"onnxruntime": list(onnxruntime.get_available_providers())}
@@ -111,7 +111,7 @@ def runtime_facts() -> dict[str, Any]:
 
 
 def machine_facts(gl: dict[str, Any] | None = None) -> dict[str, Any]:
-    """Return all facts that stand beside a measurement. `gl`: result of `gl_facts`; None if it was not called."""
+    """Return all facts that stand beside a measurement. `gl`: result of `gl_facts`; None if it is missing."""
     packages = {name: package_version(name) for name in (*PACKAGES, *OPTIONAL_PACKAGES)}
     return {
         "system": machine.here.system(),

@@ -181,7 +181,8 @@ class NetworkStage(PortedStage):
 
     Its keys are `onnx`, `runtime`, and `inputs`, the type of each input of the network by name, in the network's order.
 
-    Raises BadInputError for a network that the runtime does not load, MissingPartError for an absent runtime.
+    Raises BadInputError if the runtime does not load the network, or no conversion of a picture fits an input. Raises
+    MissingPartError for an absent runtime.
     """
 
     def __init__(self, settings: Mapping[str, Any], options: RuntimeOptions) -> None:
@@ -277,13 +278,13 @@ def calls_of(
     Equal calls that were measured before come from a cache.
 
     `shapes`: shapes of inputs by name, in place of the file's shapes.
-    `runtime`: runtime of an avatar's integer network if `shapes` is empty; other networks run in ONNX Runtime.
+    `runtime`: runtime of a stage, and of an avatar's integer network if `shapes` is empty; others run in ONNX Runtime.
     `counts`: numbers of threads to measure.
     `cores`: numbers of the cores to use; a call with n threads runs on the last n of them.
     `say`: function that is called before a measurement, which takes seconds.
-    `as_stage`: whether the network is a stage of a pipeline file, which always runs in `runtime`.
+    `as_stage`: whether the network is a stage of a pipeline file.
 
-    Raises BadInputError for a file that cannot be read, TrilaneError if the network cannot run.
+    Raises OSError if `path` cannot be read, TrilaneError if a unit cannot load or run the network.
     """
     is_avatar = not as_stage and not shapes and _integers(path) is not None
     runs = runtime if as_stage or is_avatar else ORT
@@ -331,7 +332,7 @@ def _digest(path: Path) -> str:
 
 
 class CallStage:
-    """A `trilane.pipeline.stage.Stage`. Frame n is a call with input n modulo the number of inputs."""
+    """A `trilane.pipeline.stage.Stage`. Frame n calls function n modulo their number. `calls`: functions to call."""
 
     def __init__(self, calls: Sequence[Callable[[], object]]) -> None:
         self._calls = calls
@@ -362,7 +363,7 @@ def build_calls(settings: Mapping[str, Any], unit: UnitContext) -> CallStage:
 def _calls(path: Path, shapes: Shapes, runtime: str, options: RuntimeOptions) -> list[Callable[[], object]]:
     """Return functions that each call the network in `path` on random inputs, and throw its outputs away.
 
-    Raises BadInputError for a graph that the runtime cannot load, or with an input that has no numbers or fixed shape.
+    Raises BadInputError if the runtime cannot load the graph, or an input has no fixed shape or type of `NUMBERS`.
     """
     graph = parse_network(path).graph
     held = {each.name for each in graph.initializer}

@@ -41,7 +41,8 @@ OUT, SKIPS, FORGET = "out", "skips", "forget"
 class OwnCode(PortedStage):
     """A stage that calls the user's own code.
 
-    Raises BadInputError for a module or factory that does not exist, or for a factory that returns no callable.
+    Raises BadInputError for an absent module or factory, or a factory that returns no callable. Raises TrilaneError if
+    the user's module or factory fails.
     """
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
@@ -142,7 +143,7 @@ def build(settings: Mapping[str, Any], unit: UnitContext) -> OwnCode:  # noqa: A
 
 
 class Busy(PortedStage):
-    """Uses `load_ms` milliseconds of CPU time for each frame, and writes zeros.
+    """Uses `load_ms` milliseconds of CPU time for each frame. Nothing is written to the outputs, which stay zeros.
 
     If the file states a bypass, the frames that its `share` or `pattern` selects take it.
     """

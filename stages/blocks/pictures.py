@@ -3,7 +3,7 @@
 The block `prepare` writes a picture in a network's size, layout and numbers. The number for a byte b of channel c is
 ((b / 255 - mean[c]) / sd[c]) / step + zero_point; for an integer type it is rounded and clipped. Without keys, mean is
 0 and sd is 1. The step is 1 for floats and 1/255 for bytes, so that bytes do not change. The zero point is 0, but -128
-for signed bytes.
+for signed bytes without a given step.
 
 The block `overlay` draws these outputs on a picture:
 
@@ -11,8 +11,8 @@ The block `overlay` draws these outputs on a picture:
 of several channels is the class, and channel 0 is the background. A pixel of a single float channel belongs to the mask
 if it is above 0.5. A single integer channel contains classes.
 - `depth`: one channel, drawn from its least number (blue) to its largest (red).
-- `boxes`: rows of x0, y0, x1, y1 and maybe a score. Places are in pixels of the picture; if none is above 1, they are
-shares of its sides. A box whose score is not above 0 is not drawn.
+- `boxes`: rows of x0, y0, x1, y1 and maybe a score. Coordinates are in pixels of the picture; if none is above 1, they
+are shares of the picture's sides. A box whose score is not above 0 is not drawn.
 
 Mask and depth are stretched over the picture.
 """
@@ -45,7 +45,7 @@ class Preparation:
     `keys`: fit, layout, mean, sd, step and zero_point of the block, as far as they are given.
     `where`: place of the stage in its file, for errors.
 
-    Raises BadInputError if the keys and the type do not fit each other.
+    Raises BadInputError if keys and types do not fit each other, or if integers of several bytes have no `step`.
     """
 
     def __init__(self, wanted: PortType, keys: Mapping[str, Any], where: str) -> None:
@@ -131,7 +131,7 @@ def _each(values: Sequence[float] | None, channels: int, other: float, where: st
 
 
 def _layout(wanted: PortType, asked: str | None, where: str) -> tuple[str, tuple[int, int, int]]:
-    """Return (layout of a network's input, (height, width, channels) of the picture in it)."""
+    """Return (layout of a network's input, (height, width, channels) of the picture in it). Raises BadInputError."""
     shape = wanted.shape[-3:]
     if len(wanted.shape) not in (3, 4):
         expected = "one that reads pictures, 1xCxHxW or 1xHxWxC"
@@ -178,7 +178,7 @@ CLASSES: Final = 256
 
 
 def class_colours() -> U8:
-    """Return a colour for each class (CLASSES, 3), distinct for neighbouring classes; class 0 is never drawn."""
+    """Return RGB bytes for each class (CLASSES, 3), distinct for neighbouring classes; class 0 is never drawn."""
     hues = np.arange(CLASSES) * 0.618034 % 1  # the golden ratio spreads them
     waves = [np.clip(np.abs((hues * 6 + shift) % 6 - 3) - 1, 0, 1) for shift in (0, 4, 2)]
     return np.asarray(np.stack(waves, axis=1) * STEPS, np.uint8)
@@ -188,7 +188,7 @@ DRAW_YOURSELF: Final = "a stage with python before it can bring them into this f
 
 
 class Overlay(PortedStage):
-    """Writes a picture with the outputs of networks on it. Raises BadInputError for an input of another form."""
+    """Draws mask, depth and boxes on a picture. Raises BadInputError if one of them has a shape that does not fit."""
 
     def __init__(self, settings: Mapping[str, Any]) -> None:
         super().__init__(settings)

@@ -1,9 +1,9 @@
 """The blocks of video files: `video` reads a video, and `encode` writes one.
 
 The block `video` writes the pictures of a video file, or of a folder of pictures, scaled and cropped to one size. Frame
-n of a video is the picture that is shown n / rate seconds after the video's begin. The rate is the run's, or else the
-file's. Frame n of a folder is picture n. After its end a video or folder begins again. A frame is found by its number,
-so a unit that was started again goes on at the right frame.
+n of a video is the picture that is shown n / rate seconds after the video's start. The rate is the run's, or else the
+file's, or else 30. Frame n of a folder is picture n. After its end a video or folder begins again. A frame is found by
+its number, so a unit that was started again goes on at the right frame.
 
 The block `encode` writes pictures to a video. They go to a segment below the run's folder. If the unit is killed, its
 segment is complete except for the last frames. After the run the segments are joined to the video. If somebody watches
@@ -44,7 +44,7 @@ class FoundPictures(NamedTuple):
 
 
 def footage(path: Path) -> FoundPictures:
-    """Return the number and rate of the pictures of a video file or a folder. Raises BadInputError."""
+    """Return number and rate of the pictures of a video or a folder. Raises BadInputError if `path` has no pictures."""
     if not path.exists():
         raise BadInputError(path, "no such file", EXPECTED, "put it there, or change `path`")
     if path.is_dir():

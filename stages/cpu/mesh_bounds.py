@@ -117,8 +117,8 @@ class Level:
     """The P patches of one level of patches, the coarse or the fine one.
 
     `centres`: index of each patch's centre, a vertex (P,).
-    `size`, `give`: (P,) and (P,54), metres. They give the radius of the sphere about a patch's posed centre: size +
-    sum_b give_b 2 sin(t_b / 2), where t_b is the angle of joint b = 1..54.
+    `size`, `give`: (P,) and (P,54), metres. Without blend shapes, the sphere about a patch's posed centre has a radius
+    of size + sum_b give_b 2 sin(t_b / 2), where t_b is the angle of joint b = 1..54.
     `blend`: largest distance by which the pose blend shapes of each joint move a vertex (P,54), metres per unit of
     |R - I|.
     `parts`: for each patch, the indices of its patches in the next level; in the last level, of its vertices.
@@ -240,7 +240,7 @@ class _Extent:
             np.maximum(self.high, high.max(axis=0), out=self.high)
 
     def widened_by(self, low: F64, high: F64) -> Mask:
-        """Return a mask (N,) of the boxes from `low` to `high` (N,2), NDC, that move a side which is on the screen."""
+        """Return a mask (N,) of boxes `low` to `high` (N,2), NDC, that reach beyond a side that is on the screen."""
         return np.asarray(
             (((low < self.low) & (self.low > -1.0)) | ((high > self.high) & (self.high < 1.0))).any(axis=1)
         )

@@ -159,7 +159,7 @@ class ModelledBody:
     def see(
         self, posed: Posed, clip: F64, output: Shape, vertices: F32 | None, moved: ByteCounter, choice: DetailChoice
     ) -> SeenAvatar | None:
-        """Skin the body, and return its place on the screen; None if nothing of it is visible.
+        """Skin the body, and return its rectangle and levels; None if nothing of it is visible.
 
         `posed`: pose of the frame.
         `clip`: projection @ view (4,4).
@@ -298,9 +298,9 @@ class PoseStage:
 
         With a fixed plan, all frames need full work.
 
-        The metrics are `visible`, the number of visible avatars, and the bytes moved. A full frame also has the largest
-        `level` and `error_px` of all avatars, the sum of their `triangles`, and the `density` of a planned tensor. The
-        least bytes are the samples of motions and camera, the header, and the vertices of skinned avatars.
+        The metrics are `visible`, the number of visible avatars, and the bytes moved. A full frame with visible avatars
+        also has their largest `level` and `error_px`, their sum of `triangles`, and a planned tensor's `density`. The
+        least bytes are the samples of motions and camera, the header, and what skinning reads and writes.
 
         Raises ValueError without `slot_out`, TrilaneError if a number of the frame is not finite.
         """
@@ -421,7 +421,7 @@ class PoseStage:
         frame: int,
         clip: NDArray[np.float64],
     ) -> SeenAvatar | None:
-        """Fill one avatar's part of the header, and return its place on the screen; None if it is not visible.
+        """Fill one avatar's part of the header, and return what is seen of it; None if it is not visible.
 
         An avatar that is far off the screen is not posed. If the last computed frame did not show the avatar, it is
         skinned only if its coarse patches may be on the screen.

@@ -97,7 +97,7 @@ class Segment:
 
         `repeats`: whether the pixels equal the last call's pixels, whose digest is then used.
 
-        Raises UnwrittenError if the disk is full or fails, or if the video file was removed.
+        Raises UnwrittenError if the disk is full or fails, or if somebody removed the file of digests.
         """
         if not repeats:
             self._digest = hashlib.sha256(pixels.data).hexdigest()
@@ -173,7 +173,7 @@ class PresentStage:
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:  # noqa: ARG002
         """Present `inputs[slot_in]` as frame `frame`, and return metrics.
 
-        Raises ValueError if `slot_in` is None, UnwrittenError as `Segment.digest` does.
+        Raises ValueError if `slot_in` is None, UnwrittenError as `Segment.digest` and `Segment.add` do.
         """
         if slot_in is None:
             raise ValueError("the present stage needs an input slot")
@@ -196,7 +196,7 @@ class PresentStage:
         return {"digest_ms": (digested - start) * MS, "encode_ms": encode_ms, **self._segment.moved.figures()}
 
     def close(self) -> None:
-        """Complete the segment's video file and file of digests, if frames are recorded. Raises UnwrittenError."""
+        """Complete the video file and the file of digests, if frames are recorded. Raises as `Segment.close` does."""
         if self._segment is not None:
             self._segment.close()
             self._segment = None

@@ -29,7 +29,7 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
 
     `options`: its `device` has settings of the CUDA provider.
 
-    Raises BadInputError if a node of the network does not run on the GPU, MissingPartError if no GPU works.
+    Raises BadInputError if a layer has no integers or a node does not run on the GPU, MissingPartError if no GPU works.
     """
     _check_gpu()
     check_integer_layers(network)
@@ -43,7 +43,7 @@ def gpu_session(where: str, model: str | bytes, device: Mapping[str, str]) -> on
     `model`: path of the network's file, or the bytes of the file.
     `device`: settings of the CUDA provider.
 
-    Raises as `load` does.
+    Raises BadInputError if a node does not run on the GPU, MissingPartError if no GPU works.
     """
     _check_gpu()
     settings = onnxruntime.SessionOptions()

@@ -1,8 +1,8 @@
 """The infer stage: it runs the avatar's integer network, or a part of it, from the input slot to the output slot.
 
-`bind` makes all sessions and bindings. A frame allocates nothing. If nobody is in view, no network runs. The tensors
-that cross a cut of the network are in the slot in the order of the cut, each on its own cache lines. All processes with
-the same configuration use the same offsets.
+`bind` makes all sessions and bindings, so that a frame makes none. If nobody is in view, no network runs. The tensors
+that cross a cut of the network lie one after the other in the slot, each on its own cache lines. All processes with the
+same configuration use the same offsets.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def _from_arrays(arrays: Arrays, where: str) -> list[NetworkPart]:
 
 
 def crossing_bytes(config: RunConfig, network: NetworkFile) -> list[int]:
-    """Return the most bytes that cross each cut of `network`, over all tensor shapes. Raises BadInputError."""
+    """Return the most bytes that cross each cut, over all tensor shapes. Raises BadInputError for an unknown cut."""
     if not config.cuts:
         return []
     shapes = [[part.crossing_out for part in parts_for(config, network, shape)[:-1]] for shape in config.buckets]
@@ -198,7 +198,7 @@ class InferStage:
 
         With nobody in view, transparent pictures are written. The metrics are `inferred`, the number of inferences, and
         the bytes moved. The least bytes are the networks' inputs and outputs, and their weights if these do not fit
-        into the last-level cache.
+        into the last-level cache. Raises BadInputError for a tensor shape that `bind` did not prepare.
         """
         assert slot_in is not None and slot_out is not None
         pose, picture, moved = self._inputs[slot_in].header, self._outputs[slot_out].payload, self._moved

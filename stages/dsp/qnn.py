@@ -32,7 +32,7 @@ DEFAULTS = {**SOCS["sm8350"], "htp_performance_mode": "burst"}
 def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
     """Return `network` compiled for the HTP, from the cache if it was compiled before.
 
-    Raises BadInputError if a node of the network does not run on the HTP in integers.
+    Raises BadInputError if a node does not run on the HTP in integers, MissingPartError without an HTP.
     """
     check_integer_layers(network)
     device = {**DEFAULTS, **options.device}
@@ -49,7 +49,8 @@ def load(network: IntegerNetwork, options: RuntimeOptions) -> OrtSession:
 def write_context(network: NetworkFile, soc: str, path: Path) -> None:
     """Write `network`, compiled for `soc`, as an ONNX file at `path` that embeds the HTP's context binary.
 
-    Raises BadInputError for an unknown `soc` or a network that does not run on the HTP in integers.
+    Raises BadInputError for an unknown `soc`, a file that cannot be written, or a network that does not run on the HTP
+    in integers. Raises MissingPartError without an HTP.
     """
     if soc not in SOCS:
         raise BadInputError("soc", repr(soc), f"one of {', '.join(SOCS)}")
@@ -86,7 +87,7 @@ def htp_session(where: str, model: str | bytes, device: Mapping[str, str], entri
     `device`: settings of the QNN provider.
     `entries`: further entries of the session's configuration.
 
-    Raises BadInputError if a node does not run on the HTP.
+    Raises BadInputError if a node does not run on the HTP, MissingPartError without an HTP.
     """
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = ERRORS_ONLY

@@ -1,8 +1,8 @@
 """Backgrounds from the user's files: a picture, a folder of pictures, or a video, each examined before a run.
 
-Every frame covers the output: `cover` scales the picture until no border is left, and crops both sides equally. Videos
-and folders start again when they end; photos that belong to the camera's views are shown with these views. The EXIF tag
-of a picture says by how many quarter turns it is shown, but a caller may choose another number. A picture that Pillow
+Every picture covers the output: `cover` scales it until no border is left, and crops both sides equally. Videos and
+folders start again when they end; photos that belong to the camera's views are shown with these views. The EXIF tag of
+a picture says by how many quarter turns it is shown, but a caller may choose another number. A picture that Pillow
 would show wrongly is converted to eight bits, or refused.
 
 `survey` returns size, rate and range of a background. Rule: all pictures that the run will show are opened before the
@@ -127,9 +127,10 @@ class Background(Protocol):
 
 
 def open_background(path: Path, shape: Shape, fps: float, camera: CameraPath | None = None) -> Background:
-    """Return the opened background in `path`; a folder's pictures follow each other at `fps`. Raises BadInputError.
+    """Return the opened background in `path`. Raises BadInputError.
 
     `shape`: (height, width) of its pictures.
+    `fps`: pictures of a folder a second; ignored if the names of the pictures are times.
     `camera`: camera of the scene, to whose views the pictures may belong; None if they belong to no views.
     """
     turned = () if camera is None else camera.optics.turned
@@ -219,7 +220,7 @@ EIGHT_BITS = 8
 def survey(path: Path, fps: float) -> Footage:
     """Return the facts of the background in `path`: size, rate and range. Raises BadInputError.
 
-    `fps`: rate at which a folder's pictures follow each other.
+    `fps`: pictures of a folder a second; ignored if the names of the pictures are times.
     """
     if path.is_dir():
         return _folder(path, fps)
@@ -233,7 +234,7 @@ def survey(path: Path, fps: float) -> Footage:
 def check_pictures(path: Path, fps: float, frames: int, camera: CameraPath) -> None:
     """Decode each picture of `path` that a run shows. Raises BadInputError naming a picture that cannot be decoded.
 
-    `fps`: rate at which a folder's pictures follow each other, and the frames of the run.
+    `fps`: frames of the run a second, and pictures of a folder a second unless their names are times.
     `frames`: number of frames of the run.
     `camera`: camera of the scene, to whose views the pictures may belong.
     """
@@ -301,7 +302,7 @@ def _video(path: Path) -> Footage:
 
 
 def _times(container: Any, path: Path) -> list[float]:
-    """Return the times of the frames in seconds, ascending, not decoded. Raises BadInputError for a cut-off file."""
+    """Return the frames' times in seconds, ascending, without decoding. Raises BadInputError for a cut-off file."""
     stream = video_stream(container, path)
     times, count = set(), 0
     for packet in container.demux(stream):

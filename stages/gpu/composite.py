@@ -233,7 +233,6 @@ class CompositeStage:
         self._outputs: Sequence[Packet] = ()
 
     def bind(self, inputs: Sequence[Packet], outputs: Sequence[Packet]) -> None:
-        """Keep the slots."""
         self._inputs, self._outputs = inputs, outputs
 
     def run(self, frame: int, slot_in: int | None, slot_out: int | None) -> Mapping[str, float]:
@@ -246,7 +245,8 @@ class CompositeStage:
         - `copied`: the frame was copied from an equal frame in a slot, not drawn.
 
         The least bytes are new pictures, and the frame if no slot had it. New pictures are the background's, and the
-        networks' in the `tensor_rect`s of visible avatars. Raises UnitLostError if the context was lost.
+        networks' in the `tensor_rect`s of visible avatars. Raises ValueError without a slot, BadInputError for a
+        background that cannot be decoded, and as `opengl.check` does.
         """
         if slot_in is None or slot_out is None:
             raise ValueError("composite needs an input and an output slot")

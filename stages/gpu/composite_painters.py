@@ -132,7 +132,7 @@ def wall_texture() -> U8:
 def paint_texture() -> U8:
     """Return a texture of the wall's paint (512,128,4), uint8 sRGB, which repeats in both directions.
 
-    Half of the wall's resolution is enough for paint, which is read without interpolation.
+    Half of the wall's resolution is enough, because the paint is so smooth that no texel shows.
     """
     rows, columns = WALL_SHAPE
     return _bytes(_paint().reshape(rows // 2, 2, columns // 2, 2, 3).mean(axis=(1, 3)))
@@ -248,6 +248,8 @@ _RADIUS, _STRENGTH, _FADE = np.array([numbers for _, *numbers in DISCS]).T
 
 def floor_discs(joints: NDArray[np.floating[Any]], rest: F64) -> NDArray[np.float32]:
     """Return the contact shadows of a body: x, z, radius in metres, and strength 0 to 1 of each disc (N,4) float32.
+
+    Discs that are not stronger than FAINTEST are left out.
 
     `joints`: skinning matrices (55,3,4), metres, world space.
     `rest`: rest joints (55,3), metres.

@@ -181,7 +181,7 @@ def fence() -> int:
 
 
 def wait_fence(sync: int) -> None:
-    """Wait for the fence `sync` and delete it. Raises TrilaneError if the GPU does not reach it within a second."""
+    """Wait for the fence `sync` and delete it. Raises TrilaneError if that fails or takes over a second."""
     result = function("glClientWaitSync")(sync, SYNC_FLUSH_COMMANDS, int(NS_PER_S))
     function("glDeleteSync")(sync)
     if result in (TIMEOUT_EXPIRED, WAIT_FAILED):

@@ -251,7 +251,8 @@ class PackedAvatar:
         `texture`: neural texture (H,W,C).
         `levels`: smaller levels of the texture, packed by `pack_levels`; None without any, as in every deferred pass.
         `coarser`: levels of the mesh, numbers 1, 2, ...
-        Raises BadInputError if a texture has a number beyond FP16, or C is not the pass's number of channels.
+        Raises BadInputError if a texture has a number beyond FP16, if C is not the pass's number of channels, or if a
+        deferred pass gets `levels`.
         """
         check_texture(texture, packed.channels)
         smaller = split_levels(levels, texture.shape[1])
@@ -338,7 +339,7 @@ class RasterStage:
         """Write the tensor (h,w,C) uint8 of each network, empty if the network paints nobody in view. Return metrics.
 
         The metrics are the bytes moved. The least bytes are the pose of the drawn mesh of each visible avatar, and the
-        drawn tensors. Raises TrilaneError if a joint is not a finite number, UnitLostError if the context was lost.
+        drawn tensors. Raises ValueError without a slot, TrilaneError for an infinite joint, else as `opengl.check`.
         """
         if slot_in is None or slot_out is None:
             raise ValueError("raster needs an input and an output slot")

@@ -103,9 +103,9 @@ def mesh_arrays(
 
 
 def is_closed(vertices: Floats, faces: Ints) -> bool:
-    """Return whether `faces` (F,3) enclose a volume and wind outward; the share `MAX_OPEN` of edges may be open.
+    """Return whether `faces` (F,3) of `vertices` (V,3) enclose a volume and wind outward.
 
-    Bodies have small openings that no camera sees, such as the backs of the eyes.
+    MAX_OPEN of the edges may be open, because bodies have small openings that no camera sees, such as behind eyes.
     """
     edges = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).astype(np.int64)
     there, back = edges @ [1 << 32, 1], edges @ [1, 1 << 32]
@@ -235,7 +235,7 @@ class Mesh:
     `vertex_shader`: file of `trilane.shaders`.
     `defines`: preprocessor definitions of the vertex shader, except K.
     `batches`: pairs of a number of skin weights and the index buffer of the triangles that are drawn with it.
-    `pose_bytes`: size of a frame's pose. A number that is uploaded several times counts once.
+    `pose_bytes`: size of a frame's pose in bytes. A number that is uploaded several times counts once.
     """
 
     vertex_shader: str
