@@ -421,8 +421,8 @@ def ranked(cores: Sequence[CpuCore], times: Times, rules: Rules, fixed: Placemen
 def chosen(found: Sequence[Ranked], rule: Ranked) -> Ranked:
     """Return the placement of `found` to use.
 
-    If no placement is shorter than `rule` by more than WORTH, `rule` is used. Otherwise the placement with the fewest
-    shared cores is used, among the placements within WORTH of the shortest.
+    If no frame time is shorter than the one of `rule` by more than WORTH, `rule` is used. Otherwise the placement with
+    the fewest shared cores is used, among the placements whose frame times are within WORTH of the shortest.
 
     `found`: placements in the order of `ranked`.
     `rule`: default placement, which suits any run.
@@ -436,8 +436,8 @@ def chosen(found: Sequence[Ranked], rule: Ranked) -> Ranked:
 def worth_trying(found: Sequence[Ranked], rule: Ranked) -> list[Ranked]:
     """Return at most MOST_TRIED placements that may be the best.
 
-    The placement that `chosen` returns comes first, and then `rule`, if it differs. The others follow in the order of
-    `found`.
+    The placement that `chosen` returns comes first, and then `rule`, if it differs. The others are within
+    UNCERTAIN of the shortest prediction, in the order of `found`.
 
     `found`, `rule`: as for `chosen`.
     """
