@@ -49,8 +49,8 @@ _CHUNK_ITEMS = 1 << 18
 def read_pose_blend(path: Path, shape: tuple[int, int, int]) -> NDArray[np.float32] | None:
     """Return the array `posedirs` of the npz file at `path`: float32 of `shape`, read-only; None when it is all zero.
 
-    Raises BadInputError for a file that cannot be read. Raises it also for an array that is missing, misshapen, pickled,
-    too large, truncated or not finite.
+    Raises BadInputError for a file that cannot be read, and for an array that is missing, misshapen, pickled, too
+    large, truncated or not finite.
     """
     try:
         with zipfile.ZipFile(path) as archive:

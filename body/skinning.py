@@ -312,7 +312,6 @@ class FrameSkinner:
     """
 
     def __init__(self, shaped: ShapedBody, detail: Detail = EVERYTHING) -> None:
-        """Prepare the blocks for `shaped` at the level of detail `detail`."""
         body = shaped.body
         count = len(body.weights)
         blocks = -(-count // _BLOCK_ROWS)

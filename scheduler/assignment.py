@@ -77,7 +77,6 @@ class Choice:
     """Answers questions about the present state of the stages, the source and the frames of a `Core`."""
 
     def __init__(self, settings: Settings, policy: Policy, source: Source, flow: Flow) -> None:
-        """Keep the run's settings and policy, its source and its frames in flight (`flow`)."""
         self._policy, self._source, self._flow = policy, source, flow
         self._stages, self._frames, self._bypass = flow.stages, flow.frames, flow.bypass
         self._stage_named, stages = flow.stage_named, flow.stages
@@ -152,10 +151,7 @@ class Choice:
         return end_ns > waiting.deadline_ns
 
     def account_without_job(self, unit: UnitState, now_ns: int) -> int:
-        """Return the ledger's account (STARVED, BLOCKED, ...) of a unit with an empty queue: why it has no job.
-
-        The account of a unit that is not ready is ASSIGNED.
-        """
+        """Return the ledger's account that says why an idle unit has no job; ASSIGNED if the unit is not ready."""
         if unit.life != READY:
             return ASSIGNED
         account = STARVED
@@ -300,10 +296,7 @@ class Assignment:
         dirty.clear()
 
     def _feed(self, now_ns: int) -> None:
-        """Put released frames in flight, up to the limit; they wait in the lines of the stages without inputs.
-
-        If the policy takes the newest frame, all older released frames are dropped instead.
-        """
+        """Put released frames in flight, up to the limit. If the policy takes the newest frame, drop all others."""
         while self._source.queue and not self._choice.is_full():
             if self._newest:
                 self._source.keep_newest()

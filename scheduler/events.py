@@ -219,7 +219,7 @@ class FrameRequest(NamedTuple):
 
 
 class Hold(NamedTuple):
-    """Release `frames` more frames now, and no others until the next `Hold`; -1 ends the hold.
+    """Release `frames` more frames now, and no others until the next `Hold` or `FrameRequest`; -1 ends the hold.
 
     Frames that were released before go on. A rate goes on from the moment at which the hold ends.
     """
@@ -455,7 +455,7 @@ def chain(stages: Iterable[tuple[str, str]], edge: str, latency_to: str) -> Grap
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings of a run. All times are in ns. Where the default is 0, 0 means that there is none.
+    """The settings of a run. All times are in ns. For a time or limit whose default is 0, 0 means that there is none.
 
     `frames`: number of frames of the run.
     `policy`: name of the scheduling policy.

@@ -366,7 +366,7 @@ class Flow:
         return producer
 
     def drop(self, frames: list[int], behind: StageState, cause: DropCause, before: StageState | None = None) -> None:
-        """Drop frames that waited behind a stage, and count them. Side work only leaves a frame out, and this does not count.
+        """Drop and count frames that waited behind a stage. A frame that only side work awaits is just left out there.
 
         `behind`: stage that wrote the frames.
         `before`: stage for which the frames waited; None: all readers of the stage `behind`.

@@ -162,14 +162,13 @@ def period_bound(
     source_ns: int = 0,
     shares: Mapping[str, Fraction] = NO_SHARES,
 ) -> PeriodBound:
-    """Return the least period of `graph`. Raises ValueError for an unknown rule of an edge.
-
-    With `shares`, or more than MOST_JOBS jobs in a hyperperiod, slots do not count.
+    """Return the least period of `graph`. With `shares`, or more than MOST_JOBS jobs a hyperperiod, slots do not count.
 
     `times_ns`: time of a job of each stage, in ns.
     `in_flight`: limit of frames in flight; 0: none.
     `source_ns`: period of the source in ns; 0: the source is always ready.
     `shares`: share (0 to 1) of the frames that do not skip a stage, by the names of the stages that some frames skip.
+    Raises ValueError for an unknown rule of an edge.
     """
     return _bound(_Waits(graph, times_ns, in_flight), _slots(graph), source_ns, shares)
 
@@ -255,7 +254,7 @@ def _circle(arcs: Sequence[_Arc], before: Sequence[int]) -> list[_Arc]:
 def fewest_slots(
     graph: Graph, times_ns: Mapping[str, int], given: Collection[str] = (), in_flight: int = 0
 ) -> list[int]:
-    """Return the fewest slots of each stream, at least two, with which the period is as short as with any number.
+    """Return the fewest slots of each stream, at least two, with which the period is as short as possible.
 
     The numbers are in the order of `graph.edges`. With one slot fewer in any stream of more than two slots, the period
     would be longer. If even MAX_SLOTS slots are too few for a stream, the period stays longer.

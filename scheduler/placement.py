@@ -241,10 +241,7 @@ class Rules(NamedTuple):
 
 
 def frame_ns(placement: Placement, cores: Sequence[CpuCore], times: Times, rules: Rules) -> int:
-    """Return the predicted frame time of `placement` in ns.
-
-    `cores`: cores of the run. `times`: work of each unit. `rules`: properties of the run.
-    """
+    """Return the predicted frame time in ns of `placement` on `cores`, by the units' `times` and the run's `rules`."""
     model = _Model(placement, cores, times, rules)
     return model.sum_ns() if rules.sequential else model.pipelined_ns()
 

@@ -128,7 +128,7 @@ DEADLINE_PERIODS = 3  # from a frame's release until it must be presented
 
 
 def run_settings(policy: str, frames: int, scene_period_ns: int, forced_period_ns: int = 0, **others: Any) -> Settings:
-    """Return the settings of a run of `frames` frames. A frame has DEADLINE_PERIODS periods until its deadline.
+    """Return the settings of a run of `frames` frames. With a period, the deadline is DEADLINE_PERIODS periods.
 
     `scene_period_ns`: period of the scene's rate in ns. Under `latest` and `deadline`, which need a rate, it is the
     period of releases. Under other policies a frame is released as soon as it can be taken.
@@ -328,10 +328,7 @@ class WorkLadder:
         self._since_up = MOST_PATIENCE
 
     def set_alone(self, position: int, rung: int, service_ns: int) -> None:
-        """Set a stage's isolated time on `rung`, in ns. Call this for all rungs of a stage, or for none.
-
-        `position`: position of the stage.
-        """
+        """Set the isolated time in ns of the stage at `position` on `rung`. Call this for all rungs, or for none."""
         self._alone[position][rung] = max(service_ns, 1)
 
     def learn(self, position: int, rung: int, service_ns: int) -> None:

@@ -189,10 +189,7 @@ def _parse(row: Sequence[Any], forms: dict[str, tuple[Any, dict[str, Any]]]) -> 
 
 
 def graph_of(data: Mapping[str, Any]) -> Graph:
-    """Return the graph that `Graph.written` gave as `data`.
-
-    Raises KeyError, TypeError, IndexError or ValueError for other data.
-    """
+    """Return the graph that `Graph.written` gave as `data`. Raises LookupError, TypeError or ValueError for others."""
     bypass = data["bypass"]
     ends = None if bypass is None else (bypass[0], bypass[1])
     stages = tuple(_stage_of(stage) for stage in data["stages"])

@@ -210,7 +210,6 @@ class Samples:
         return self.total / self.count if self.count else 0.0
 
     def add(self, value: int) -> None:
-        """Add one value."""
         if value > self.largest or not self.count:
             self.largest = value
         self.count += 1
