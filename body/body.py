@@ -49,7 +49,8 @@ _CHUNK_ITEMS = 1 << 18
 def read_pose_blend(path: Path, shape: tuple[int, int, int]) -> NDArray[np.float32] | None:
     """Return the array `posedirs` of the npz file at `path`: float32 of `shape`, read-only; None when it is all zero.
 
-    Raises BadInputError when the array is missing, misshapen, pickled, too large, truncated or not finite.
+    Raises BadInputError for a file that cannot be read, and for an array that is missing, misshapen, pickled, too
+    large, truncated or not finite.
     """
     try:
         with zipfile.ZipFile(path) as archive:
@@ -228,9 +229,10 @@ class ShapedBody:
         return moved.part(np.arange(vertices), body.faces[:faces], body.uv_faces[:faces])
 
     def part(self, used: Ints, faces: I32, uv_faces: I32) -> ShapedBody:
-        """Return the person with only the vertices `used` (N,) and the triangles `faces`, `uv_faces` (G,3).
+        """Return the person with only some vertices and triangles.
 
-        `faces`: indices of `used`. `uv_faces`: indices of the body's texture coordinates.
+        `used`: indices (N,) of the kept vertices. `faces`: triangles (G,3), as indices into `used`.
+        `uv_faces`: the same triangles (G,3), as indices into the body's texture coordinates.
         """
         body = self.body
         smaller = replace(

@@ -111,7 +111,7 @@ class Posed:
 class Skeleton:
     """The joint chain of one shaped body.
 
-    World transforms come from pointer jumping: after round k, each joint holds the product of the 2^k transforms that
+    World transforms come from pointer jumping: after k rounds, each joint holds the product of the 2^k transforms that
     end at that joint. A tree of depth 11 then takes four batched products instead of 55 steps.
     """
 
@@ -140,7 +140,7 @@ class Skeleton:
         `pose` (J * 3,): axis-angle, radians.
         `translation` (3,): translation of the root in body space, metres; None for no translation.
         `world` (4,4): transform from body space to the world; None for the identity.
-        Raises BadInputError when a number is not finite, or when the norm of the pose or place is above MAX_VALUE.
+        Raises BadInputError when the norm of `pose` or of the root's transform is not finite, or above MAX_VALUE.
         """
         self._angles.reshape(-1)[:] = np.asarray(pose, np.float64).reshape(-1)
         _require_finite(self._angles, "pose", "joint angles below 1e6 rad")

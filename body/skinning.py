@@ -67,6 +67,8 @@ def largest_weights(weights: F32, k: int) -> TopWeights:
 def weight_error_bound(shaped: ShapedBody, weight_count: int) -> F64:
     """Return a bound (V,), metres, on each vertex's error, in any pose, with only its `weight_count` largest weights.
 
+    The bound holds without pose blend shapes. Raises BadInputError as `largest_weights` does.
+
     Proof. Let joint j alone move the rest vertex p to y_j, and let e_j be the change of its weight; the e_j sum to 0.
     Joint b and its parent both move p rigidly, and both move the centre c_b of b to the same point. Therefore y_b and
     y_parent lie on one sphere about that point: |y_b - y_parent| <= 2 |p - c_b|. If each y_j is written as the root's y
@@ -74,7 +76,7 @@ def weight_error_bound(shaped: ShapedBody, weight_count: int) -> F64:
 
         sum_j e_j y_j = sum_b E_b (y_b - y_parent),   E_b the sum of e_j over b and the joints below it,
 
-    and the vertex moves by at most sum_b |E_b| 2 |p - c_b|. With pose blend shapes, p is the vertex after them.
+    and the vertex moves by at most sum_b |E_b| 2 |p - c_b|. With pose blend shapes, p would be the vertex after them.
     """
     largest = largest_weights(shaped.body.weights, weight_count).dense()
     change = branch_sums(shaped.body.parents, largest.astype(np.float64) - shaped.body.weights)
@@ -282,6 +284,7 @@ class CpuSkinner:
 
     `weight_count`: number of skinning weights per vertex, 4, 8 or 12; None for all.
     `pose_blend`: whether pose blend shapes are applied, if the body has them.
+    Raises BadInputError for another `weight_count`.
     """
 
     def __init__(self, shaped: ShapedBody, weight_count: int | None = None, pose_blend: bool = True) -> None:
@@ -309,7 +312,6 @@ class FrameSkinner:
     """
 
     def __init__(self, shaped: ShapedBody, detail: Detail = EVERYTHING) -> None:
-        """Prepare the blocks for `shaped` at the level of detail `detail`."""
         body = shaped.body
         count = len(body.weights)
         blocks = -(-count // _BLOCK_ROWS)
@@ -357,7 +359,7 @@ def posed_vertices(shaped: ShapedBody, poses: ArrayLike, translation: ArrayLike 
 
     `poses` (T,165): axis-angle, radians, with absolute hand poses, as `Body.full_pose` returns them.
     `translation` (3,): translation of the root, metres, the same for all poses.
-    Raises BadInputError when a number is not finite.
+    Raises BadInputError as `Skeleton.pose` does.
     """
     skeleton = Skeleton(shaped.joints, shaped.body.parents)
     skinner = CpuSkinner(shaped)

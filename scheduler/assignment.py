@@ -35,13 +35,13 @@ def earliest_completion_ns(
     todo: int,
     bypass: Bypass | None = None,
 ) -> int:
-    """Return the earliest end of the last stage of `frame`, in ns.
+    """Return the earliest time in ns at which `frame` can end its last stage, by the estimates of service times.
 
     A stage ends its work on the frame at max(end of the stages before it, end of its older work) + its own time.
 
     `now_ns`: present time in ns.
     `frame`: number of the frame; frames with smaller numbers are older.
-    `stages`: all stages, with the estimates of service times.
+    `stages`: all stages in the order of the graph, with their estimates.
     `frames`: frames in flight, by number.
     `todo`: bits of the stages that the frame has yet to do.
     `bypass`: bypass that is assumed for all frames that have not reached its beginning; None: they take no bypass.
@@ -66,7 +66,7 @@ def earliest_completion_ns(
 
 
 def _done_of_running(now_ns: int, stage: StageState) -> int:
-    """Return how long the stage's job has run in ns, at most the estimated service time; 0 if no job of it runs."""
+    """Return for how many ns the stage's job has run, at most the estimated service time; 0 if the stage has no job."""
     queue = stage.unit.queue
     if not queue or queue[0].stage != stage.name:
         return 0
@@ -77,7 +77,6 @@ class Choice:
     """Answers questions about the present state of the stages, the source and the frames of a `Core`."""
 
     def __init__(self, settings: Settings, policy: Policy, source: Source, flow: Flow) -> None:
-        """Keep the run's settings and policy, its source and its frames in flight (`flow`)."""
         self._policy, self._source, self._flow = policy, source, flow
         self._stages, self._frames, self._bypass = flow.stages, flow.frames, flow.bypass
         self._stage_named, stages = flow.stage_named, flow.stages
@@ -86,7 +85,10 @@ class Choice:
         self.latches = settings.latch_ns > 0 and len(stages) > 1
 
     def can_begin(self, stage: StageState, now_ns: int) -> bool:
-        """Return whether the stage has a frame to take and an output slot to write to."""
+        """Return whether the stage has a frame to take and an output slot to write to.
+
+        The source gives no frame while the limit of frames in flight is reached, or before `latch_from_ns`.
+        """
         source, sink = stage.input, stage.output
         if source is None:
             if self._source.is_empty or self.is_full() or (self.latches and now_ns < self.latch_from_ns(now_ns)):
@@ -104,7 +106,10 @@ class Choice:
         return sink.can_claim(lambda frame: self._flow.must_stay(stage, frame))
 
     def slot_to_take(self, stage: StageState) -> int:
-        """Return the slot of the stage's next waiting frame, numbered as in `Job.slot_in`; -1: no frame waits."""
+        """Return the slot, on the stage's first input, of the next frame that all its inputs have; -1: no such frame.
+
+        If a bypass ends at the stage, the slot is numbered as in `Job.slot_in`.
+        """
         if stage.bypassed is not None:
             return next_slot(stage, self._frames)
         return stage.waiting[0] if stage.waiting and all(stage.others) else -1
@@ -114,7 +119,7 @@ class Choice:
         return self._stages[self._policy.choose([self._candidate(stage, now_ns) for stage in runnable]).position]
 
     def is_full(self) -> bool:
-        """Return whether the number of frames in flight has reached its limit."""
+        """Return whether the number of frames in flight has reached its limit; presented frames do not count."""
         return 0 < self._in_flight <= len(self._frames) - self._flow.aside
 
     def latch_from_ns(self, now_ns: int) -> int:
@@ -134,7 +139,7 @@ class Choice:
         return free_ns - first.estimate_ns - self._latch_ns
 
     def is_late(self, stage: StageState, now_ns: int) -> bool:
-        """Return whether the frame that the stage would do next can no longer meet its deadline."""
+        """Return whether the stage's next frame can no longer meet its deadline; False without a deadline."""
         waiting = self._candidate(stage, now_ns)
         if waiting.deadline_ns == NEVER:
             return False
@@ -146,7 +151,7 @@ class Choice:
         return end_ns > waiting.deadline_ns
 
     def account_without_job(self, unit: UnitState, now_ns: int) -> int:
-        """Return the ledger's account (STARVED, BLOCKED, ...) that says why a unit with an empty queue has no job."""
+        """Return the ledger's account that says why an idle unit has no job; ASSIGNED if the unit is not ready."""
         if unit.life != READY:
             return ASSIGNED
         account = STARVED
@@ -190,7 +195,7 @@ class _LateFrames:
         self._policy, self._flow, self._source, self._choice = policy, flow, source, choice
 
     def drop(self, stage: StageState, now_ns: int) -> None:
-        """Drop the frames that wait for the stage and are stale or can no longer be in time."""
+        """Drop frames that wait for the stage: stale and late ones, each only if the policy drops such frames."""
         edge = stage.input
         if edge is None:
             if not self._choice.is_full():
@@ -291,7 +296,7 @@ class Assignment:
         dirty.clear()
 
     def _feed(self, now_ns: int) -> None:
-        """Put released frames in flight, up to the limit; they wait in the lines of the stages without inputs."""
+        """Put released frames in flight, up to the limit. If the policy takes the newest frame, drop all others."""
         while self._source.queue and not self._choice.is_full():
             if self._newest:
                 self._source.keep_newest()

@@ -93,7 +93,7 @@ from trilane.scheduler.state import (
 
 
 class Core:
-    """The state machine of one run.
+    """The state machine of one run. `books`: settings of the ledger; None: the default settings.
 
     Raises ValueError for an unknown policy or edge, and for settings that do not fit the policy or the graph.
     """
@@ -259,7 +259,7 @@ class Core:
         self.flow.pass_on(stage, job, end_ns)
 
     def ready_ns(self, job: Job) -> int | None:
-        """Return the time in ns from which all inputs of a job were there; None if the job's frame is gone."""
+        """Return the time in ns from which a job had all inputs; None if its frame is not in flight or in `gone`."""
         frame = self.frames.get(job.frame) or self.flow.gone.get(job.frame)
         return None if frame is None else frame.ready_ns[self._stage_named[job.stage].position]
 

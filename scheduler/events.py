@@ -21,7 +21,7 @@ from trilane.unexpected_value import UnexpectedValue
 class OutcomeKind(StrEnum):
     """How a run ended.
 
-    - DONE: every frame went through.
+    - DONE: every frame was presented, dropped or lost.
     - STOPPED: `Stop` was asked for.
     - ABORTED: `Abort` was asked for.
     - GAVE_UP: a unit failed too often.
@@ -46,7 +46,8 @@ class Outcome(NamedTuple):
 class LossKind(StrEnum):
     """What ended a frame in flight.
 
-    - DIED, HUNG, GAVE_UP: its unit died, hung, or was given up.
+    - DIED, HUNG: the unit that had the frame died, or hung.
+    - GAVE_UP: a unit was given up, which ends the run.
     - FAILED: its stage raised an error.
     - ABORTED: the run was aborted.
     """
@@ -59,7 +60,7 @@ class LossKind(StrEnum):
 
 
 class Loss(NamedTuple):
-    """Why a frame in flight was lost. `where`: name of the unit; of the stage for FAILED; empty for ABORTED."""
+    """Why a frame in flight was lost. `where`: name of the unit, or of the stage for FAILED; empty for ABORTED."""
 
     kind: LossKind
     where: str = ""
@@ -143,7 +144,7 @@ class JobDone(NamedTuple):
 
     `job`: number of the job, `Job.id`.
     `t_begin_ns`, `t_end_ns`: times of the job's begin and end.
-    `t_sampled_ns`: time at which the stage sampled the frame; 0 from a stage that waits for other stages.
+    `t_sampled_ns`: time at which the stage sampled the frame; it counts only from a stage without inputs.
     `preempted_ns`: time within the job in which the unit had no core.
     `asleep_ns`: time within the job in which the unit slept and no device of its own worked.
     `preempted_before_ns`: time between the unit's last job and this one in which the unit had no core.
@@ -218,7 +219,7 @@ class FrameRequest(NamedTuple):
 
 
 class Hold(NamedTuple):
-    """Release `frames` more frames now, and no others until the next `Hold`; -1 ends the hold.
+    """Release `frames` more frames now, and no others until the next `Hold` or `FrameRequest`; -1 ends the hold.
 
     Frames that were released before go on. A rate goes on from the moment at which the hold ends.
     """
@@ -348,7 +349,7 @@ class Graph:
     `from_release`: whether the latency begins with the frame's release. If not, it begins when the first stage samples
     the frame.
 
-    Raises UnexpectedValue for stages, edges or a bypass that do not fit together.
+    Raises UnexpectedValue for stages, edges, `latency_to` or a bypass that do not fit together.
     """
 
     stages: tuple[StageSpec, ...]
@@ -372,7 +373,7 @@ class Graph:
             self._check_bypass(names, self.bypass)
 
     def _check_inputs(self) -> None:
-        """Raise UnexpectedValue for unknown, later, repeated or too many inputs, and for an `every` below 1."""
+        """Raise UnexpectedValue for missing, unknown, later, repeated or too many inputs, and an `every` below 1."""
         known: set[str] = set()
         for stage in self.stages:
             if stage.inputs is None:
@@ -404,14 +405,14 @@ class Graph:
 
     @property
     def bypassed(self) -> tuple[str, ...]:
-        """The stages that a frame on the bypass skips."""
+        """The names of the stages that a frame on the bypass skips; empty without a bypass."""
         if self.bypass is None:
             return ()
         names = [stage.name for stage in self.stages]
         return tuple(names[names.index(self.bypass[0]) + 1 : names.index(self.bypass[1])])
 
     def inputs_of(self, index: int) -> tuple[Input, ...]:
-        """Return the inputs of the stage at `index`; in a chain, the only input is the stage before it."""
+        """Return the inputs of the stage at `index`; in a chain, only the stage before it, and none for the first."""
         given = self.stages[index].inputs
         if given is not None:
             return given
@@ -454,7 +455,7 @@ def chain(stages: Iterable[tuple[str, str]], edge: str, latency_to: str) -> Grap
 
 @dataclass(frozen=True)
 class Settings:
-    """The settings of a run. Names in `_ns` are durations; a duration or limit of 0 means that there is none.
+    """The settings of a run. All times are in ns. For a time or limit whose default is 0, 0 means that there is none.
 
     `frames`: number of frames of the run.
     `policy`: name of the scheduling policy.
@@ -472,7 +473,8 @@ class Settings:
     `queue_timeout_ns`: longest wait of a released frame before the first stage; then it is dropped.
     `hang_ns`: longest time of a job, and longest time for which an idle unit may leave a ping unanswered.
     `start_ns`: longest time of a unit's start.
-    `max_failures`: number of failures in a row, with no finished job between them, after which a unit is given up.
+    `max_failures`: most failures in a row that a unit may have, with no finished job between them. After one more, the
+    unit is given up.
     """
 
     frames: int
@@ -492,5 +494,5 @@ class Settings:
     max_failures: int = 5
 
     def due_from_ns(self, release_ns: int) -> int:
-        """Return the deadline of a frame that was released at `release_ns`, or NEVER."""
+        """Return the deadline in ns of a frame that was released at `release_ns`; NEVER if frames have none."""
         return release_ns + self.deadline_ns if self.deadline_ns else NEVER

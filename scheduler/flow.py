@@ -42,7 +42,7 @@ class Bypass:
     """The bypass of a chain, from the stage `begin` to the stage `end`.
 
     `edge`: output edge of `begin`; it has the slots of the frames on the bypass.
-    `must_be_fresh`: whether the next job of `begin` must be fresh (glossary).
+    `must_be_fresh`: whether the next job of `begin` must be fresh (`Job.fresh`).
     `was_taken`: whether the last frame that `begin` has done took the bypass.
     """
 
@@ -81,7 +81,7 @@ def _is_on_way(stage: StageState, older: int, newer: int, frames: Mapping[int, F
 
 
 def own_slots(stage: StageState) -> int:
-    """Return the number of slots of the stage's input edge; `Job.slot_in` numbers the other edge's slots from there."""
+    """Return the number of slots of the stage's input edge; in `Job.slot_in`, the bypass's slots begin there."""
     assert isinstance(stage.input, EdgeSlots)
     return len(stage.input.state)
 
@@ -113,7 +113,7 @@ def stale_slot(stage: StageState, frames: Mapping[int, FrameState]) -> int:
 
 
 class Flow:
-    """Stages, units, edges and the frames in flight. Raises ValueError for an unknown edge.
+    """Stages, units, edges and the frames in flight. Raises ValueError as `build` does.
 
     `dirty`: units that a step must look at, in the order in which they were marked; a unit may appear twice.
     `bypass`: bypass of the chain, or None.
@@ -246,7 +246,10 @@ class Flow:
         return bool(self.frames[frame].begun & self.main & ~before.before)
 
     def pass_on(self, stage: StageState, job: Job, end_ns: int) -> None:
-        """Note that the job is done: its frame waits for the next stages, or is presented."""
+        """Note that the job is done at `end_ns`: its frame waits for the next stages, or is presented.
+
+        If the frame was dropped or lost meanwhile, only free the job's slots.
+        """
         self.dirty.append(stage.unit)
         state = self.frames.get(job.frame)
         if state is None:
@@ -363,7 +366,7 @@ class Flow:
         return producer
 
     def drop(self, frames: list[int], behind: StageState, cause: DropCause, before: StageState | None = None) -> None:
-        """Drop frames that waited behind a stage, and count them.
+        """Drop and count frames that waited behind a stage. A frame that only side work awaits is just left out there.
 
         `behind`: stage that wrote the frames.
         `before`: stage for which the frames waited; None: all readers of the stage `behind`.
@@ -374,7 +377,10 @@ class Flow:
             self.mark_roots_dirty()
 
     def drop_waiting(self, stage: StageState, slot_in: int, cause: DropCause) -> None:
-        """Drop the frame that waits for the stage in `slot_in` (numbered as in `Job.slot_in`), and count the drop."""
+        """Drop the frame that waits for the stage in `slot_in` (numbered as in `Job.slot_in`), and count the drop.
+
+        A stage of side work only leaves the frame out, which does not count as a drop.
+        """
         edge, slot = side_of(stage, slot_in)
         if self.is_chain:
             assert isinstance(edge, EdgeSlots)

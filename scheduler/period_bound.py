@@ -162,12 +162,13 @@ def period_bound(
     source_ns: int = 0,
     shares: Mapping[str, Fraction] = NO_SHARES,
 ) -> PeriodBound:
-    """Return the least period of `graph`.
+    """Return the least period of `graph`. With `shares`, or more than MOST_JOBS jobs a hyperperiod, slots do not count.
 
-    `times_ns`: time of a job of each stage.
+    `times_ns`: time of a job of each stage, in ns.
     `in_flight`: limit of frames in flight; 0: none.
     `source_ns`: period of the source in ns; 0: the source is always ready.
     `shares`: share (0 to 1) of the frames that do not skip a stage, by the names of the stages that some frames skip.
+    Raises ValueError for an unknown rule of an edge.
     """
     return _bound(_Waits(graph, times_ns, in_flight), _slots(graph), source_ns, shares)
 
@@ -253,13 +254,13 @@ def _circle(arcs: Sequence[_Arc], before: Sequence[int]) -> list[_Arc]:
 def fewest_slots(
     graph: Graph, times_ns: Mapping[str, int], given: Collection[str] = (), in_flight: int = 0
 ) -> list[int]:
-    """Return the fewest slots of each stream, at least two, that do not make the period longer.
+    """Return the fewest slots of each stream, at least two, with which the period is as short as possible.
 
     The numbers are in the order of `graph.edges`. With one slot fewer in any stream of more than two slots, the period
-    would be longer.
+    would be longer. If even MAX_SLOTS slots are too few for a stream, the period stays longer.
 
     `times_ns`, `in_flight`: as in `period_bound`.
-    `given`: names of the streams whose rule stays as it is in `graph`.
+    `given`: names of the streams whose rule, and number of slots, stays as it is in `graph`.
     """
     waits, held = _Waits(graph, times_ns, in_flight), _slots(graph)
     rules = {name: edge_rule(rule).slots for name, rule in zip(graph.streams, graph.edges, strict=True)}

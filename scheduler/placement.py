@@ -241,10 +241,7 @@ class Rules(NamedTuple):
 
 
 def frame_ns(placement: Placement, cores: Sequence[CpuCore], times: Times, rules: Rules) -> int:
-    """Return the predicted frame time of `placement` in ns.
-
-    `cores`: cores of the run. `times`: work of each unit. `rules`: properties of the run.
-    """
+    """Return the predicted frame time in ns of `placement` on `cores`, by the units' `times` and the run's `rules`."""
     model = _Model(placement, cores, times, rules)
     return model.sum_ns() if rules.sequential else model.pipelined_ns()
 
@@ -421,8 +418,8 @@ def ranked(cores: Sequence[CpuCore], times: Times, rules: Rules, fixed: Placemen
 def chosen(found: Sequence[Ranked], rule: Ranked) -> Ranked:
     """Return the placement of `found` to use.
 
-    If no placement is shorter than `rule` by more than WORTH, `rule` is used. Otherwise the placement with the fewest
-    shared cores is used, among the placements within WORTH of the shortest.
+    If no frame time is shorter than the one of `rule` by more than WORTH, `rule` is used. Otherwise the placement with
+    the fewest shared cores is used, among the placements whose frame times are within WORTH of the shortest.
 
     `found`: placements in the order of `ranked`.
     `rule`: default placement, which suits any run.
@@ -436,8 +433,8 @@ def chosen(found: Sequence[Ranked], rule: Ranked) -> Ranked:
 def worth_trying(found: Sequence[Ranked], rule: Ranked) -> list[Ranked]:
     """Return at most MOST_TRIED placements that may be the best.
 
-    The placement that `chosen` returns comes first, and then `rule`, if it differs. The others follow in the order of
-    `found`.
+    The placement that `chosen` returns comes first, and then `rule`, if it differs. The others are within
+    UNCERTAIN of the shortest prediction, in the order of `found`.
 
     `found`, `rule`: as for `chosen`.
     """

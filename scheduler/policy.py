@@ -128,14 +128,14 @@ DEADLINE_PERIODS = 3  # from a frame's release until it must be presented
 
 
 def run_settings(policy: str, frames: int, scene_period_ns: int, forced_period_ns: int = 0, **others: Any) -> Settings:
-    """Return the settings of a run of `frames` frames.
+    """Return the settings of a run of `frames` frames. With a period, the deadline is DEADLINE_PERIODS periods.
 
     `scene_period_ns`: period of the scene's rate in ns. Under `latest` and `deadline`, which need a rate, it is the
     period of releases. Under other policies a frame is released as soon as it can be taken.
     `forced_period_ns`: period of releases in ns under every policy; 0: `scene_period_ns` decides.
     `others`: further fields of Settings.
 
-    Raises UnexpectedValue for an unknown policy.
+    Raises UnexpectedValue for an unknown policy, if `forced_period_ns` is 0.
     """
     period_ns = forced_period_ns or (scene_period_ns if policy_named(policy).paced else 0)
     return Settings(frames, policy, period_ns=period_ns, deadline_ns=DEADLINE_PERIODS * period_ns, **others)
@@ -145,8 +145,8 @@ class Source:
     """The source of frames 0..n-1. A released frame waits in `queue` until it is taken or dropped.
 
     Without a rate (no period, no arrivals, no requests) a frame counts as released at the moment when it can be taken.
-    While frames are held, `hold` alone releases them, a few at a time. After the hold the next frame is due at once,
-    and the frames after it follow at their usual distances.
+    While frames are held, only `hold` and `request` release them. After the hold the next frame of a rate is due at
+    once, and the frames after it follow at their usual distances.
 
     `drop`: function that is called with each frame that is dropped here, its release time in ns and the cause.
     `queue`: waiting frames as pairs (frame, release time in ns), the oldest first.
@@ -216,14 +216,14 @@ class Source:
         return changed
 
     def request(self, count: int, now_ns: int) -> None:
-        """Release `count` frames, or all that are left if they are fewer."""
+        """Release `count` frames now, or all frames that are left if they are fewer."""
         for frame in range(self._next, min(self._next + count, self._end)):
             self._admit(frame, now_ns)
             self._next += 1
         self._set_due()
 
     def hold(self, frames: int, now_ns: int) -> None:
-        """Release `frames` frames now, and no others until the next call; -1 ends the hold."""
+        """Release `frames` frames now, and no others until the next call or `request`; -1 ends the hold."""
         if frames >= 0:
             self._held = True
             self.request(frames, now_ns)

@@ -67,7 +67,7 @@ class Recording:
                 self.accounts.append((unit.account_ns, unit.name, unit.account))
 
     def write(self, path: Path) -> None:
-        """Write the recording as JSON lines (`header_line`, `step_line`)."""
+        """Write the recording as JSON lines (`header_line`, `step_line`). Raises OSError."""
         with path.open("w", encoding="utf-8") as file:
             file.write(header_line(self.graph, self.settings))
             for now_ns, events, actions in self.steps:
@@ -95,7 +95,7 @@ def _fields_of(item: Any) -> dict[str, Any]:
 
 
 def read(path: Path) -> Recording:
-    """Return the recording at `path`. Raises BadInputError, which names the first wrong line."""
+    """Return the recording at `path`. Raises BadInputError for an unreadable file, or for its first wrong line."""
     number = 0
     try:
         with path.open(encoding="utf-8") as file:
@@ -150,12 +150,12 @@ def row_of(item: Event | Action) -> list[Any]:
 
 
 def events_of(rows: Iterable[Sequence[Any]]) -> tuple[Event, ...]:
-    """Return the events that were written as `rows`. Raises UnexpectedValue for a row that is no event."""
+    """Return the events that were written as `rows`. Raises ValueError for a row that is no event."""
     return tuple(_parse(row, _EVENTS) for row in rows)
 
 
 def actions_of(rows: Iterable[Sequence[Any]]) -> tuple[Action, ...]:
-    """Return the actions that were written as `rows`. Raises UnexpectedValue for a row that is no action."""
+    """Return the actions that were written as `rows`. Raises ValueError for a row that is no action."""
     return tuple(_parse(row, _ACTIONS) for row in rows)
 
 
@@ -188,7 +188,7 @@ def _parse(row: Sequence[Any], forms: dict[str, tuple[Any, dict[str, Any]]]) -> 
 
 
 def graph_of(data: Mapping[str, Any]) -> Graph:
-    """Return the graph that `Graph.written` gave as `data`. Raises KeyError or TypeError for other data."""
+    """Return the graph that `Graph.written` gave as `data`. Raises LookupError, TypeError or ValueError for others."""
     bypass = data["bypass"]
     ends = None if bypass is None else (bypass[0], bypass[1])
     stages = tuple(_stage_of(stage) for stage in data["stages"])

@@ -199,7 +199,7 @@ class BesideDriver:
     def run(self) -> list[Outcome]:
         """Run until every `Core` finishes, and return how each ended, in the order of the members.
 
-        Raises RuntimeError if nothing can ever happen again.
+        Raises RuntimeError if nothing can ever happen again, or if a job takes longer than its pipeline's `hang_ns`.
         """
         while not all(line.core.finished for line in self.lines):
             self._advance(self._next_ns())

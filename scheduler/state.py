@@ -313,8 +313,8 @@ class FrameState:
     `position`: in a chain, the position of its next stage.
     `release_ns`, `deadline_ns`: times of its release and of its deadline (or NEVER).
     `ready_ns`: times from which the inputs of each stage were there, by the stage's position.
-    `sampled_ns`: time of its sampling; -1 until it is known.
-    `latency_ns`: time from its sampling to the end of the stage at which the latency ends; -1 until it is known.
+    `sampled_ns`: time of its sampling, or of its release for `Graph.from_release`; -1 until it is known.
+    `latency_ns`: time from `sampled_ns` to the end of the stage at which the latency ends; -1 until it is known.
     `skips`: whether it takes the bypass.
     `rung`: rung of its work.
     `number`: how many frames were put in flight before it.

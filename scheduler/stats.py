@@ -210,7 +210,6 @@ class Samples:
         return self.total / self.count if self.count else 0.0
 
     def add(self, value: int) -> None:
-        """Add one value."""
         if value > self.largest or not self.count:
             self.largest = value
         self.count += 1
@@ -325,7 +324,7 @@ class Lateness:
     """How late frames were, by `due_ns`.
 
     `count`: number of frames with a due time.
-    `missed`: number of frames that came after their deadline.
+    `missed`: number of frames that came after their due time.
     """
 
     def __init__(self) -> None:
@@ -333,14 +332,14 @@ class Lateness:
         self._score = 0.0
 
     def add(self, late_ns: int) -> None:
-        """Add a frame that came `late_ns` after its deadline; below 0: before its deadline."""
+        """Add a frame that came `late_ns` after its due time; below 0: before it."""
         self.count += 1
         self.missed += late_ns > 0
         self._score += 1 / (1 + exp(min(SCORE_PER_MS * late_ns / NS_PER_MS, LARGEST_EXPONENT)))
 
     @property
     def real_time_score(self) -> float | None:
-        """The mean score of the frames, from 1 (long before the deadline) to 0 (late); None without a frame.
+        """The mean score of the frames, from 1 (long before the due time) to 0 (late); None without a frame.
 
         The score of a frame is 1 / (1 + e^(15 l)), where l is its lateness in ms (Kwon et al., XRBench, MLSys 2023,
         section 3).

@@ -152,7 +152,10 @@ class VirtualDriver:
                 gc.enable()
 
     def wait(self, deadline_ns: int) -> tuple[int, tuple[Event, ...]]:
-        """Return (time in ns, the next valid event). If the core's deadline comes first, return it with no event."""
+        """Return (time in ns, the next valid event). If the core's deadline comes first, return it with no event.
+
+        Raises RuntimeError if nothing can ever happen again.
+        """
         heap = self._heap
         while heap and heap[0][0] <= deadline_ns:
             at_ns, _, _, event, epoch = heappop(heap)
@@ -286,7 +289,7 @@ class _Unit:
 class SharedCores:
     """Runs one `trilane.scheduler.core.Core` on simulated cores. Equal inputs give equal runs.
 
-    A job begins as soon as the scheduler has handed it over and its unit is free.
+    A job begins as soon as the scheduler has handed it over and its unit is free. Raises ValueError as `Core` does.
 
     `places`: cores and threads of every unit.
     `needs`: function that returns the needs of a job.

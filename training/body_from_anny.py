@@ -413,7 +413,7 @@ def align(a: F64, b: F64) -> F64:
 
 
 def about(axis: F64, angle: float) -> F64:
-    """Return the rotation (3, 3) by `angle` radians about `axis` (of any length); the identity if the axis is zero."""
+    """Return the right-handed rotation (3, 3) by `angle` radians about `axis`, of any length; the identity for zero."""
     length = np.linalg.norm(axis)
     if length == 0.0:
         return np.eye(3)

@@ -82,9 +82,10 @@ class SampleSource(Protocol[One]):
 
 
 def clothed_source(body: Path, name: str, offsets: F32 | None) -> SampleRenderer:
-    """Return a new renderer, on one thread, of a clothed body. Raises BadInputError.
+    """Return a new renderer, on one thread, of a clothed body.
 
     `body`: body file. `name`: name of the look. `offsets`: offsets (V,3) that the body is drawn with; None for none.
+    Raises BadInputError for a wrong body file or an unknown look, MissingPartError without OpenGL.
     """
     look = look_named(name)
     shaped = load_body(body).shape(look.betas)
@@ -339,7 +340,7 @@ def is_whole(batch: Batch) -> bool:
 def zoom(group: ShapeGroup) -> NDArray[np.float64]:
     """Return the zoom (N,) of each sample: the number of tensor pixels over which u or v would change by 1.
 
-    The zoom is 1 / the median distance in UV between neighbouring pixels of a row.
+    The zoom is 1 / the median distance in UV between neighbouring pixels of a row; 1 for a sample without such pixels.
     """
     rows = group.uv[:, ::ROW_STEP].astype(np.int64)
     shown = group.covered[:, ::ROW_STEP] > 0

@@ -106,10 +106,7 @@ def head_on(uv: NDArray[np.float64], covered: NDArray[np.bool_], side: int) -> N
 
 
 def used_texels(body: BodyArrays, side: int, margin: int) -> NDArray[np.bool_]:
-    """Return which texels (side, side) a bilinear sample on the body can read, grown by `margin` texels.
-
-    `side`: side of the texture in texels.
-    """
+    """Return which texels (side, side) a bilinear sample on the body can read, grown by `margin` texels."""
     _, known = lay_out(np.zeros((len(body.vertices), 1)), body.faces, body.uv, body.uv_faces, side)
     return np.asarray(binary_dilation(known, iterations=margin)) if margin else known
 

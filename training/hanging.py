@@ -55,7 +55,8 @@ class _Sheet:
 def dressed_body(body: Path, look: str, folder: Path) -> Path:
     """Return the file of the body in `look`: `body` itself, or a file in `folder` with the garments that hang.
 
-    A file that is there is replaced, because it may be of another body or look. Raises BadInputError.
+    A file that is there is replaced, because it may be of another body or look. Raises BadInputError for an unknown
+    look, a wrong body file, a texture without room for a garment, or a file that cannot be written.
 
     `body`: file of the body without garments. `look`: name of a look.
     """

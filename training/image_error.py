@@ -57,7 +57,7 @@ class ImageError:
 
 
 def image_error(picture: U8, truth: U8) -> ImageError | None:
-    """Return the error of `picture` against `truth`, both (h,w,4) uint8, straight alpha; None if `truth` is empty."""
+    """Return the error of `picture` against `truth`, both (h,w,4) uint8, straight alpha; None if `truth` has nobody."""
     mask, true_mask = picture[..., 3] >= HALF, truth[..., 3] >= HALF
     if not true_mask.any():
         return None
@@ -89,11 +89,9 @@ def over(image: U8, behind: NDArray[np.floating]) -> F64:
 
 
 def regions(alpha: U8) -> tuple[Mask, Mask, Mask]:
-    """Return three masks (h,w): (inside, edge, outside) of the person.
+    """Return three masks (h,w): (inside, edge, outside) of the person with the true `alpha` (h,w).
 
     Beyond the picture, alpha is assumed to continue with the values at the border.
-
-    `alpha`: alpha (h,w) of the ground truth.
     """
     near = [np.pad(alpha, EDGE_PX, mode="edge")]
     for axis in (0, 1):

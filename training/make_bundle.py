@@ -106,7 +106,7 @@ def integer_network(avatar: TrainableAvatar, groups: list[ShapeGroup], seed: int
 
 
 def kept_network(avatar: str) -> Quantised:
-    """Return the quantised network of the bundle `avatar`, a name or a folder, unchanged. Raises BadInputError."""
+    """Return the quantised network of `avatar`, a bundle's name or folder. Raises BadInputError for a wrong bundle."""
     bundle = load_bundle(avatar)
     return Quantised(bundle.read_network(), bundle.manifest.quantisation, {})
 
@@ -161,7 +161,7 @@ def write_avatar(
     provenance: dict[str, Any],
     names: dict[str, str],
 ) -> None:
-    """Write the bundle of an avatar. Raises BadInputError.
+    """Write the bundle of an avatar. Raises BadInputError if its parts do not fit together; then nothing is written.
 
     `folder`: folder of the bundle.
     `person`: person whom the avatar shows.
@@ -228,9 +228,9 @@ SEED = 17
 
 
 def float_model(bundle: Bundle, weights: Path) -> onnx.ModelProto:
-    """Return the float network of `bundle` for inputs of `CALIBRATION_SHAPE`. Raises BadInputError.
+    """Return the float network of `bundle` for inputs of `CALIBRATION_SHAPE`.
 
-    `weights`: file that `save_network` wrote.
+    `weights`: file that `save_network` wrote. Raises BadInputError for another file.
     """
     return export_onnx(float_network_of(bundle, weights), *CALIBRATION_SHAPE)
 

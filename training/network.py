@@ -75,12 +75,7 @@ class ResidualBlock(nn.Module):
     """
 
     def __init__(self, c_in: int, c_out: int, stride: int, norm: Norm) -> None:
-        """Build a block.
-
-        `c_in`, `c_out`: number of channels of the input and of the output.
-        `stride`: stride of the first convolution.
-        `norm`: function that makes a normalisation for a number of channels.
-        """
+        """Build a block from `c_in` to `c_out` channels. `stride`: the first convolution's. `norm`: see `Norm`."""
         super().__init__()
         self.body = nn.Sequential(
             nn.Conv2d(c_in, c_out, 3, stride, 1, bias=False),
@@ -149,12 +144,9 @@ class InvertedResidual(nn.Module):
     """
 
     def __init__(self, c_in: int, row: MobileBlock, scale: Scale, norm: Norm) -> None:
-        """Build the block of one row of an encoder's table.
+        """Build the block of `row`, a row of an encoder's table.
 
-        `c_in`: number of channels of the input.
-        `row`: row of the table.
-        `scale`: function that scales a channel count by the network's width.
-        `norm`: function that makes a normalisation for a number of channels.
+        `c_in`: number of channels of the input. `scale`, `norm`: see `Scale` and `Norm`.
         """
         super().__init__()
         inner, c_out = scale(row.expanded), scale(row.channels)
@@ -187,9 +179,7 @@ class MobileFeatures(nn.Module):
     def __init__(self, spec: MobileEncoder, c_in: int, scale: Scale, norm: Norm) -> None:
         """Build the encoder of the table `spec`.
 
-        `c_in`: number of channels of the input.
-        `scale`: function that scales a channel count by the network's width.
-        `norm`: function that makes a normalisation for a number of channels.
+        `c_in`: number of channels of the input. `scale`, `norm`: see `Scale` and `Norm`.
         """
         super().__init__()
         before = scale(spec.stem)
@@ -275,8 +265,8 @@ class UNet(nn.Module):
 
         `encoder`: a name of `ENCODERS`.
         `norm`: a name of `NORMS`.
-        `width`: 64 is the full network; every channel count is scaled by `width` / 64 and rounded to a multiple of 4.
-        `channels`: number of channels of the input.
+        `width`: 1 to 256; every channel count is scaled by `width` / 64 and rounded to a multiple of 4, at least 4.
+        `channels`: number of channels of the input, 1 to 64.
         `input_skip`: whether the last decoder level also reads the network's input, the only tensor of full resolution.
         The paper's network does not.
 
@@ -374,7 +364,7 @@ def add_activation_noise(network: nn.Module, steps: float) -> None:
 
 
 def add_dropout(network: UNet, probability: float) -> None:
-    """Make each level of `network` set a channel to 0 with `probability` in training mode.
+    """Make each level of the encoder and decoder set a channel to 0 with `probability` in training mode.
 
     The other channels are scaled up, so that the mean stays the same.
     """

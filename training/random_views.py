@@ -70,7 +70,7 @@ class View:
 
 
 def random_view(rng: np.random.Generator, band: str, joints: F64) -> View:
-    """Return a random camera of `band` for a body with `joints` (55,3) in world metres.
+    """Return a random camera of `band` that aims near a joint of a body with `joints` (55,3), in world metres.
 
     `band`: a name of `BANDS`, or `anywhere`.
     """
@@ -92,9 +92,11 @@ def random_view(rng: np.random.Generator, band: str, joints: F64) -> View:
 
 
 def look_at(eye: F64, at: F64, roll: float = 0.0) -> F64:
-    """Return the matrix (4,4) from world to camera for a camera at `eye` (3,) that looks at `at` (3,).
+    """Return the matrix (4,4) from the world to an OpenGL camera at `eye` (3,) that looks at `at` (3,).
 
-    `roll`: angle about the viewing direction, radians.
+    The two points must differ, and must not lie above each other. Without roll, world +Y points up in the picture.
+
+    `roll`: turn of the camera about the viewing direction, radians. If it is positive, the picture turns clockwise.
     """
     z = (eye - at) / np.linalg.norm(eye - at)
     x = np.cross([0.0, 1.0, 0.0], z)

@@ -43,6 +43,7 @@ def first_state(avatar: TrainableAvatar, settings: TrainingSettings, vgg: Vgg16 
     """Return the state of a training of `avatar` before the first step. `avatar` is prepared in place.
 
     `vgg`: network of the perceptual loss; None if MS-SSIM replaces it or the loss has no such term.
+    Raises MissingPartError as `chosen_device` does.
     """
     device = chosen_device(settings.device)
     average = copy.deepcopy(avatar.to(device)).eval()
@@ -68,6 +69,7 @@ def steps(
 
     `state`: state of the training, changed in place.
     `groups`: training samples.
+    Raises BadInputError as `batch_stream` does.
     """
     stream = batch_stream(groups, settings, count, state.step)
     peaks = (settings.network_rate, settings.network_rate, settings.texture_rate)
@@ -244,7 +246,6 @@ class _Masked(torch.optim.Optimizer):
     """
 
     def step(self, closure: Callable[[], float] | None = None) -> Any:
-        """Do a step of Adam or AdamW that does not change masked elements."""
         groups = [group for group in self.param_groups if group.get(MASKED)]
         kept = [
             self._kept(parameter) for group in groups for parameter in group["params"] if parameter.grad is not None
@@ -362,7 +363,6 @@ class TrainingState:
 
     @property
     def device(self) -> torch.device:
-        """The device of the training."""
         return next(self.avatar.parameters()).device
 
     def optimisers(self) -> dict[str, torch.optim.Optimizer]:
@@ -372,14 +372,14 @@ class TrainingState:
 
 
 def save_state(state: TrainingState, path: Path) -> None:
-    """Write `state` as the file `path`, whole or not at all. Raises BadInputError."""
+    """Write `state` as the file `path`, whole or not at all. Raises BadInputError if the file cannot be written."""
     arrays = {name: value.detach().cpu().numpy() for name, value in state.tensors().items()}
     with write_atomically(path) as draft, draft.open("wb") as file:
         np.savez(file, step=np.int64(state.step), **arrays)
 
 
 def load_state(state: TrainingState, path: Path) -> None:
-    """Fill `state` from a file of `save_state`. Raises BadInputError for the state of another training."""
+    """Fill `state` from a file of `save_state`. Raises BadInputError if the file lacks the state of this training."""
     try:
         with path.open("rb") as source, np.load(source, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}

@@ -96,9 +96,10 @@ class Subject:
 
 
 def clothed_subject(body: Path, threads: int, name: str = DEFAULT_NAME) -> Subject:
-    """Return the clothed body as a subject. Raises BadInputError.
+    """Return the clothed body as a subject.
 
     `body`: body file. `threads`: number of threads of a software OpenGL driver. `name`: name of the look.
+    Raises BadInputError for a wrong body file or an unknown look, MissingPartError without OpenGL.
     """
     look = look_named(name)
     shaped = load_body(body).shape(look.betas)
@@ -112,7 +113,8 @@ def captured_subject(folder: Path, threads: int, report: Callable[[str], None]) 
     """Return the person of the capture in `folder` as a subject. Samples show no held-out frame and no bad fit.
 
     `threads`: number of threads of a software OpenGL driver. `report`: called with lines about the frames and texels.
-    Raises BadInputError; FaultyCaptureError with all faults of the capture.
+    Raises BadInputError for a capture.toml that cannot be read, FaultyCaptureError with all faults of the capture, and
+    MissingPartError without OpenGL.
     """
     capture = open_capture(folder)
     frames, coverage, drawn = _checked(capture, threads)
@@ -247,7 +249,8 @@ def smooth_normals(vertices: F64, faces: Ints) -> F64:
 def measured_heights(shaped: ShapedBody, normals: F64, outline: Outline) -> tuple[Ints, F64, F64]:
     """Return N vertices at the outline: indices (N,), distances (N,) to the mask's outline, weights (N,).
 
-    A distance is along the vertex's normal, in metres. A weight is the number of pixels for a metre along the normal.
+    A distance is along the vertex's normal, in metres, positive outwards. A weight is the number of pixels for a metre
+    along the normal.
 
     `normals`: smoothed normals (V,3) at rest.
     """
@@ -377,6 +380,7 @@ def subject_with_offsets(
 
     `seed`: seed of the training; the views' seed follows from it. `report`: called with a line about the duration of
     the measurement. `track`: wraps the views of each round to show progress.
+    Raises BadInputError for a file with other content, or a file that cannot be written.
     """
     if not path.exists():
         offsets = measured_offsets(subject, seed, report, track)

@@ -135,7 +135,8 @@ def train_avatar(places: TrainingPlaces, asked: TrainingSettings, listener: List
     """Train as `asked`, write the bundles, and return facts about the training and the error on held-out frames.
 
     An interrupted training continues from its last state.
-    Raises BadInputError; FaultyCaptureError with all faults of the capture; MissingPartError without OpenGL.
+    Raises BadInputError for wrong settings or files, and FaultyCaptureError with all faults of the capture. Raises
+    MissingPartError without OpenGL, or without a GPU or package that is asked for.
     """
     started = time.monotonic()
     settings = resumed_settings(places.work / NAME, with_vgg(asked, places.vgg))
@@ -453,7 +454,7 @@ RUNTIME = "ort"
 def frame_errors(bundle: Bundle, renderer: CaptureRenderer, numbers: Sequence[int], threads: int) -> list[ImageError]:
     """Return the errors of `bundle` on the frames `numbers`; frames that do not show the person are left out.
 
-    The ground truth is the frame with its mask. Raises BadInputError, MissingPartError.
+    The ground truth is the frame with its mask. Raises errors as `integer_painter` does.
 
     `renderer`: renderer of the capture. `threads`: number of the runtime's threads.
     """
@@ -471,7 +472,8 @@ def frame_errors(bundle: Bundle, renderer: CaptureRenderer, numbers: Sequence[in
 def error_facts(errors: Sequence[ImageError]) -> dict[str, Any]:
     """Return the means of `errors`, and how they were measured.
 
-    Keys: `runtime`, `size` (tensor size), `frames` (number of frames), and the names of `MEANS` but `background`.
+    Keys: `runtime`, `size` (tensor size), `frames` (number of frames), and the names of `MEANS` but `background`. If
+    `errors` is empty, the means are left out.
     """
     names = [name for name in MEANS if name != "background"]
     means = (

@@ -192,7 +192,7 @@ def read_levels(levels: Sequence[Tensor], uv: Tensor, covered: Tensor) -> Tensor
 
 
 def levels_of(bundle: Bundle) -> list[Tensor]:
-    """Return the texture of `bundle` and its smaller levels, as `read_levels` takes them. Raises BadInputError."""
+    """Return the texture of `bundle` and its smaller levels for `read_levels`. Raises BadInputError for wrong files."""
     texture = bundle.read_texture()
     levels = [texture, *split_levels(bundle.read_levels(), texture.shape[1])]
     return [torch.from_numpy(level.transpose(2, 0, 1).copy())[None] for level in levels]
@@ -230,7 +230,10 @@ SAVED_WEIGHTS = "weights that this network's training saved"
 
 
 def load_network(network: UNet, path: Path) -> UNet:
-    """Load the weights that `save_network` wrote to `path` into `network`; return `network`. Raises BadInputError."""
+    """Load the weights that `save_network` wrote to `path` into `network`, and return `network`.
+
+    Raises BadInputError for any other file, and for the weights of another network.
+    """
     try:
         with path.open("rb") as source, np.load(source, allow_pickle=False) as arrays:
             saved = {name: torch.from_numpy(arrays[name]) for name in arrays.files}
@@ -249,7 +252,7 @@ def load_network(network: UNet, path: Path) -> UNet:
 
 
 def float_network_of(bundle: Bundle, weights: Path) -> UNet:
-    """Return the network of `bundle` with the weights that `save_network` wrote to a file. Raises BadInputError."""
+    """Return the network of `bundle` with the weights in the file `weights`. Raises BadInputError for another file."""
     entry = bundle.manifest.network
     return load_network(UNet(entry.encoder, entry.norm, entry.width, entry.channels, input_skip=True), weights)
 
@@ -277,7 +280,7 @@ BATCH, BATCHES = 8, 8
 
 
 def network_of(bundle: Bundle, groups: list[ShapeGroup], seed: int) -> UNet:
-    """Return the float network of `bundle`. Raises BadInputError.
+    """Return the float network of `bundle`. Raises BadInputError if its network is wrong or lacks a convolution.
 
     `groups`: samples for the norms' statistics. `seed`: seed of the choice of batches.
     """
@@ -385,9 +388,9 @@ def float_painter(network: UNet, *levels: torch.Tensor) -> Painter:
 
 
 def float_painter_of(bundle: Bundle, weights: Path) -> Painter:
-    """Return a painter that runs the float network of `bundle` on the texture of `bundle`. Raises BadInputError.
+    """Return a painter that runs the float network of `bundle` on the texture of `bundle`.
 
-    `weights`: file that `save_network` wrote.
+    `weights`: file that `save_network` wrote. Raises BadInputError for another file or a wrong texture.
     """
     return float_painter(float_network_of(bundle, weights), *levels_of(bundle))
 

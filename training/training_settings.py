@@ -251,7 +251,7 @@ class TrainingSettings(Table):
 
 
 def read_settings(path: Path) -> TrainingSettings:
-    """Return the settings in the file `path`. Raises BadInputError."""
+    """Return the settings in the file `path`. Raises BadInputError if it cannot be read, or for a wrong setting."""
     try:
         values = tomllib.loads(read_text(path, EXPECTED))
     except tomllib.TOMLDecodeError as error:
@@ -260,7 +260,9 @@ def read_settings(path: Path) -> TrainingSettings:
 
 
 def parsed_settings(values: dict[str, Any], where: str | Path) -> TrainingSettings:
-    """Return the checked settings of `values`, with usual values for missing keys. Raises BadInputError.
+    """Return the checked settings of `values`, with usual values for missing keys.
+
+    Raises BadInputError for an unknown key, a wrong value, or values that exclude each other (`CLASHES`).
 
     `values`: settings as in `training.toml`; `loss` may also be the name of a loss. `where`: source of `values`, for
     messages.

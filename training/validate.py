@@ -102,7 +102,7 @@ def integer_painter(renderer: PackedRenderer, bundle: Bundle, runtime: str, thre
     `bundle`: bundle with the texture and the network.
     `runtime`: name of the runtime.
     `threads`: number of the runtime's threads.
-    Raises BadInputError, MissingPartError.
+    Raises BadInputError for wrong files of the bundle or an unknown runtime, MissingPartError for a missing runtime.
     """
     network, texture, runs = bundle.read_network(), bundle.read_texture(), load_runtime(runtime)
     quantisation = Quantisation(network.input.scale, network.input.zero_point)
@@ -168,14 +168,15 @@ class FloatNetwork:
 
 
 def held_out_motions(names: Iterable[str]) -> list[Motion]:
-    """Return the motions `names`, each `builtin:NAME` or a file. Raises BadInputError."""
+    """Return the motions `names`, each `builtin:NAME` or a file. Raises BadInputError for a missing or wrong motion."""
     return [load_motion(AvatarSpec(motion=name), Path.cwd()) for name in names]
 
 
 def open_renderer(bundle: Bundle, threads: int) -> SampleRenderer:
-    """Return a new renderer of samples of the clothed body of `bundle`. Raises BadInputError, MissingPartError.
+    """Return a new renderer of samples of the clothed body of `bundle`.
 
     `threads`: number of threads of a software OpenGL driver.
+    Raises BadInputError for a wrong body file or an unknown look, MissingPartError without OpenGL.
     """
     return SampleRenderer(bundle.shaped_body(), threads, look=look_of(bundle.manifest.provenance))
 
@@ -192,7 +193,7 @@ def validate(
     `renderer`: renderer from `open_renderer`.
     `float_network`: float network to evaluate too, or None.
     `look`: called with the seed and the evaluation of every sample. Painters have the names of runtimes and `FLOAT`.
-    Raises BadInputError, MissingPartError.
+    Raises errors as `integer_painter` and `held_out_motions` do.
     """
     digests = digests_of(bundle.folder, bundle.manifest)
     motions = held_out_motions(plan.held_out)
@@ -291,7 +292,7 @@ def measure_sizes(
     `plan`: plan of the validation. The views of its first seed are painted on its first runtime.
     `renderer`: renderer from `open_renderer`.
     `look`: called after every view.
-    Raises BadInputError, MissingPartError.
+    Raises errors as `integer_painter` and `held_out_motions` do.
     """
     runtime, seed = plan.runtimes[0], plan.seeds[0]
     paint = integer_painter(renderer, bundle, runtime, plan.threads)
@@ -322,7 +323,10 @@ def measure_sizes(
 
 
 def on_picture(crop: Crop, view: View, side: int) -> Crop:
-    """Return `crop` with the shape that it has in a picture on which the body covers `side` x `side` pixels."""
+    """Return `crop` with its shape in a picture of another size, in which the body's rectangle has `side`² pixels.
+
+    `view`: view to which `crop` belongs.
+    """
     wide, high = (view.projection[axis, axis] / crop.projection[axis, axis] for axis in (0, 1))
     pixels = wide * high * OUTPUT_ROWS * round(OUTPUT_ROWS * view.aspect)  # of the crop, where the body has crop.pixels
     scale = side * math.sqrt(pixels / crop.pixels / math.prod(crop.shape))

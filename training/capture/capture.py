@@ -89,7 +89,7 @@ class Capture:
     def picture(self, number: int) -> U8:
         """Return frame `number` (h,w,4), with its mask as straight alpha.
 
-        Raises UnexpectedValue for a file that has become unreadable since the capture was opened.
+        Raises UnexpectedValue for a picture, and BadInputError for a video, that has become unreadable meanwhile.
         """
         return np.dstack([self.frames.read(number), self.masks.read(self.mask_of[number])])
 
@@ -381,7 +381,10 @@ def read_fit(where: str, arrays: Arrays, body: Body, flat_hand_mean: bool) -> tu
 
 
 def _numbers(where: str, array: NDArray[Any], faults: list[Fault]) -> F64:
-    """Return `array` as a flat row. If a value is not finite or above `MAX_VALUE`, add to `faults` and return zeros."""
+    """Return `array` as a flat row of float64.
+
+    If it has no numbers, or a number that is not finite or larger than `MAX_VALUE`, add to `faults` and return zeros.
+    """
     if array.dtype.kind not in "fiu":
         faults.append(Fault(where, f"dtype {array.dtype}", "numbers"))
         return np.zeros(array.size)

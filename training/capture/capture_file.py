@@ -132,7 +132,6 @@ class CameraTable(Table):
 
     @property
     def lens(self) -> Lens:
-        """Lens of the frames."""
         return Lens(self.width, self.height, self.fx, self.fy, self.cx, self.cy)
 
     def projection(self) -> F64:
@@ -174,7 +173,7 @@ class CaptureFile(Table):
 def read_capture_file(folder: Path) -> CaptureFile:
     """Return the content of `capture.toml` in `folder`.
 
-    Raises BadInputError for a file that is no TOML, and FaultyCaptureError with every defect of the keys.
+    Raises BadInputError for a file that is missing or no TOML, and FaultyCaptureError with every defect of the keys.
     """
     path = folder / NAME
     try:
@@ -283,7 +282,8 @@ class PictureFolder:
 class PictureVideo:
     """Pictures that are frames of a video. `kind`: `FRAME` or `MASK`.
 
-    The constructor decodes the whole video to count the frames.
+    The constructor decodes the whole video to count the frames. It raises BadInputError for a video without frames.
+    Constructor and `read` raise BadInputError for a video that cannot be decoded.
     """
 
     def __init__(self, path: Path, kind: str) -> None:

@@ -414,7 +414,7 @@ def zoomed_view(
 ) -> F64 | None:
     """Return a random map (3,3) from the frame's pixels to the screen's pixels.
 
-    Return None if the view's centre is outside the frame.
+    Return None if the view's centre is outside the frame or behind the camera.
 
     `band`: band of the view, a name of `BANDS` or `anywhere`.
     `posed`: body in the frame. `camera`: camera of the frame.

@@ -36,7 +36,7 @@ class CheckedFrame:
 
     `number`: number of the frame.
     `iou`: intersection over union of the drawn body and the mask.
-    `outside`: share (0 to 1) of the drawn body that the mask does not cover.
+    `outside`: share (0 to 1) of the drawn body that the mask does not cover; 1 if no body is drawn.
 
     Clothes and hair make the mask larger than the body. Therefore a good fit has a small `outside`, and an IoU below 1.
     """
@@ -186,7 +186,7 @@ class TexelCoverage:
         return float(self.seen.sum() / self.used.sum())
 
     def share_by_region(self) -> dict[str, float]:
-        """Return the share (0 to 1) of seen texels in each region, by the region's name."""
+        """Return the share (0 to 1) of seen texels in each region, by the region's name; 1 without texels."""
         seen, shares = self.seen, {}
         for number, name in enumerate(REGIONS):
             inside = self.used & (self.region == number)

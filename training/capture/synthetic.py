@@ -98,9 +98,7 @@ class SyntheticCapture:
     """Draws the frames of a recipe, with an OpenGL context of its own."""
 
     def __init__(self, shaped: ShapedBody, recipe: Recipe) -> None:
-        """Open the context, and put the clothes of the recipe's look on `shaped`.
-
-        `shaped`: body with the shape of the recipe's look.
+        """Open the context, and put clothes on `shaped`, a body with the shape of the recipe's look.
 
         Raises MissingPartError without OpenGL.
         """
@@ -140,7 +138,8 @@ def framing_view(rng: np.random.Generator, yaw: float, points: F64, projection: 
     axes, and t the tangent of half the field of view. The point is in the picture if the camera is at least |x| / t + z
     away from the aim (and the same for y).
 
-    `yaw`: direction of the camera about the body, in radians. `projection`: matrix (4,4) of the camera.
+    `yaw`: direction of the camera about the body, in radians: 0 is in front (+Z), pi / 2 on the body's left (+X).
+    `projection`: matrix (4,4) of the camera.
     """
     aim = (points.min(axis=0) + points.max(axis=0)) / 2
     pitch = np.radians(rng.triangular(*PITCH_DEG))

@@ -106,7 +106,7 @@ def quantise(
     of steps, so 6 or 7 bits count.
     `keep_float`: names of nodes that stay in float.
 
-    Raises BadInputError for wrong frames, an unknown method or layer, or a network that is not finite.
+    Raises BadInputError for wrong frames, an unknown method or layer, or a network of another form or not finite.
     """
     plain, ranges = _measured(model, frames, method)
     unknown = set(keep_float) - {node.name for node in plain.graph.node}
