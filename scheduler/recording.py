@@ -116,7 +116,7 @@ def read(path: Path) -> Recording:
         raise BadInputError.of_os_error(path, error, "a recorded run") from None
     except UnexpectedValue as error:
         raise BadInputError.at(f"{path}, line {number + 1}", error) from None
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, LookupError, TypeError, RecursionError) as error:
         raise BadInputError(
             f"{path}, line {number + 1}", str(error) or type(error).__name__, "a recorded run"
         ) from None
