@@ -36,6 +36,7 @@ from trilane.pipeline.journal import Record, Stepped
 from trilane.pipeline.timeline import Presented, Timeline
 from trilane.pipeline.unit_history import IdleSlice
 from trilane.scheduler.events import Event
+from trilane.scheduler.stats import CONFIDENCE_TEXT
 from trilane.stages.run_options import RunOptions
 from trilane.units import COMPUTED, MEASURED, NO_FIGURES
 
@@ -416,7 +417,7 @@ def _run_rows(report: Report) -> Iterable[Row]:
 
 
 def _between(low: float | None, high: float | None) -> str:
-    return TOO_SHORT if low is None or high is None else f"95 %: {low:.2f} to {high:.2f}"
+    return TOO_SHORT if low is None or high is None else f"{CONFIDENCE_TEXT}: {low:.2f} to {high:.2f}"
 
 
 def _error(facts: Mapping[str, Any]) -> tuple[str, str]:

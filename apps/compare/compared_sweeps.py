@@ -40,12 +40,13 @@ from trilane.apps.run.report import Report
 from trilane.apps.run.verdict import MOST_OTHERS
 from trilane.apps.sweep.store import TRIALS, TrialRecord, read_trials
 from trilane.errors import BadInputError
+from trilane.scheduler.stats import CONFIDENCE_TEXT
 
 MEAN: Final = Figure(FRAME_TIME, "", "", "mean", MS)
 METHOD: Final = (
-    "trials of one configuration are compared with each other, repeats as several runs; intervals hold 95 %; that any "
-    f"of the trials that are said to differ does so by chance has a probability of at most {100 * ALPHA:.0f} % (Holm); "
-    "over all: the geometric mean of the ratios"
+    "trials of one configuration are compared with each other, repeats as several runs; intervals hold "
+    f"{CONFIDENCE_TEXT}; that any of the trials that are said to differ does so by chance has a probability of at most "
+    f"{100 * ALPHA:.0f} % (Holm); over all: the geometric mean of the ratios"
 )
 
 

@@ -26,13 +26,14 @@ from trilane.errors import BadInputError, MissingPartError
 from trilane.files import instead_of_file, require_file
 from trilane.hw_profiles.schema import SHARE_TEXT
 from trilane.scene.schema import Scene
+from trilane.scheduler.stats import CONFIDENCE_TEXT
 from trilane.units import COMPUTED, HOST_CLOCK, MEASURED, NO_FIGURES
 from trilane.writing import write_atomically
 
 #: Origins of an image error.
 OF_RUN, OF_AVATAR = "errors of the runs themselves", "errors of the avatars' validations"
 #: Kinds of an interval of the frame time.
-BY_SCATTER, BY_MODEL = "95 %, scatter of the run's frames", f"{SHARE_TEXT}, of the model"
+BY_SCATTER, BY_MODEL = f"{CONFIDENCE_TEXT}, scatter of the run's frames", f"{SHARE_TEXT}, of the model"
 #: Keys of a scene that do not change its content. Another bundle may be another network of the same person.
 HOW_DRAWN = (
     *("size", "plan", "texture_filter", "error_budget_px", "error_budget_db", "most_side", "memory_mb"),
