@@ -19,7 +19,7 @@ import numpy as np
 from trilane.arrays import parse_shape
 from trilane.avatars.bundle import Bundle, bundle_folder
 from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation, digests_of, figures_digest
-from trilane.units import AVATARS, NO_FIGURES
+from trilane.units import ALL_WORK, AVATARS, NO_FIGURES, SIDES, work_of_side
 
 #: Name of each part of an avatar in a sentence.
 PARTS = {
@@ -169,14 +169,11 @@ def name_of(folder: Path) -> str:
 # The tensor sizes that an avatar needs, and its loss in smaller ones. Rule: they come from the avatar's validation, or
 # there are none.
 
-WHOLE = 1000  # pixels of a tensor of the full size, in thousandths
 DIGITS = 2
 #: A tensor is large enough for a body if it loses at most this much of the PSNR at the best measured size, in dB: for
 #: an avatar with a network of its own, and for avatars that share a network. These share a tensor too. Each adds to the
 #: background between them, so that a tenth of a dB costs more pixels.
 TOLERANCE_DB, SHARED_TOLERANCE_DB = 0.04, 0.3
-#: Work of the smaller tensors whose loss is told: 3/4 and 1/2 of the sides.
-WORKS = (563, 250)
 
 
 @dataclass(frozen=True)
@@ -199,7 +196,7 @@ class SizeLoss:
         The loss is 0 at the full size. For another size, it is the loss at the next smaller size that was measured;
         None if no smaller size was measured. Without figures, the result is None.
         """
-        if work >= WHOLE and self.by_work:
+        if work >= ALL_WORK and self.by_work:
             return 0.0
         measured = [size for size in self.by_work if size <= work]
         return self.by_work[max(measured)] if measured else None
@@ -227,10 +224,10 @@ def size_loss(bundle: Bundle, avatars: int) -> SizeLoss:
     if by_size.psnr_db_by_picture is not None:
         table = by_size.psnr_db_by_picture
         curve = curve_of(table, tolerance_db(avatars))
-        return SizeLoss(source, {WHOLE: 0.0, **_losses(table, curve)}, curve)
+        return SizeLoss(source, {ALL_WORK: 0.0, **_losses(table, curve)}, curve)
     pixels = {math.prod(parse_shape(size)): psnr for size, psnr in (by_size.psnr_db or {}).items()}
     own = max(pixels)
-    losses = {WHOLE * count // own: round(pixels[own] - psnr, DIGITS) for count, psnr in pixels.items()}
+    losses = {ALL_WORK * count // own: round(pixels[own] - psnr, DIGITS) for count, psnr in pixels.items()}
     return SizeLoss(source, losses)
 
 
@@ -265,12 +262,12 @@ def _losses(table: Mapping[int, Mapping[int, float]], curve: Sequence[tuple[int,
     A smaller tensor never counts as better.
     """
     losses = {}
-    for work in WORKS:
+    for work in map(work_of_side, SIDES[1:]):
         found = [
             max(whole - less, 0.0)
             for (_, pixels), side in zip(curve, sorted(table), strict=True)
             if (whole := psnr_at(table[side], pixels)) is not None
-            and (less := psnr_at(table[side], pixels * work / WHOLE)) is not None
+            and (less := psnr_at(table[side], pixels * work / ALL_WORK)) is not None
         ]
         if found:
             losses[work] = round(sum(found) / len(found), DIGITS)

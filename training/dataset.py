@@ -24,11 +24,12 @@ from trilane.arrays import F32, F64, U8, Shape, parse_shape
 from trilane.body.body import load_body
 from trilane.errors import BadInputError
 from trilane.scene.motion.motion import Motion
-from trilane.scene.tensor_budget import MOST_DENSITY, SIDES
+from trilane.scene.tensor_budget import MOST_DENSITY
 from trilane.training.clothing import look_named
 from trilane.training.random_views import Crop
 from trilane.training.sample_renderer import BAND_NAMES, PoseSource, Sample, SampleRenderer
 from trilane.training.training_settings import TrainingSettings
+from trilane.units import SIDES
 
 One = TypeVar("One")
 #: Share of each band among the training samples. Far samples are the most, because their tensors have many sizes.
