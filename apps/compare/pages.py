@@ -84,7 +84,7 @@ def _document(title: str, style: str, policy: str, body: str) -> str:
     """Return an HTML document.
 
     `title`: title of the page.
-    `style`: name of the file beside this module that has the styles.
+    `style`: name of the file beside this module that has the page's own styles.
     `policy`: content security policy: what the page may load and run.
     `body`: HTML after the heading.
     """
@@ -92,7 +92,7 @@ def _document(title: str, style: str, policy: str, body: str) -> str:
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{escape(policy)}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title><style>{_beside(style)}</style></head>\n"
+        f"<title>{escape(title)}</title><style>{_beside('page.css')}{_beside(style)}</style></head>\n"
         f"<body><h1>{escape(title)}</h1>\n{body}</body></html>\n"
     )
 
