@@ -37,6 +37,7 @@ from trilane.pipeline.timeline import Presented, Timeline
 from trilane.pipeline.unit_history import IdleSlice
 from trilane.scheduler.events import Event
 from trilane.scheduler.stats import CONFIDENCE_TEXT
+from trilane.signals import INTERRUPTED
 from trilane.stages.run_options import RunOptions
 from trilane.units import COMPUTED, MEASURED, NO_FIGURES
 
@@ -202,7 +203,7 @@ def run(
     left its folder, TrilaneError if no frame was presented. After an interrupt, raises KeyboardInterrupt as soon as the
     folder is complete; there is no folder if no frame was presented.
     """
-    from trilane.apps.run.run_job import INTERRUPTED, Hooks
+    from trilane.apps.run.run_job import Hooks
     from trilane.pipeline.pipeline_file import is_pipeline_file
 
     parameters = inspect.signature(run).parameters

@@ -36,7 +36,7 @@ from trilane.apps.compare.sides import (
     compared_run,
     read_told,
 )
-from trilane.apps.run.report import Report
+from trilane.apps.run.report import REPORT_FILE, Report
 from trilane.apps.run.verdict import MOST_OTHERS
 from trilane.apps.sweep.store import TRIALS, TrialRecord, read_trials
 from trilane.errors import BadInputError
@@ -252,7 +252,7 @@ def _trial(sweep: str, record: TrialRecord) -> ComparedRun:
 
 def _has_report(folder: Path) -> bool:
     try:
-        return (folder / "report.json").is_file()
+        return (folder / REPORT_FILE).is_file()
     except OSError:  # a name that is too long
         return False
 

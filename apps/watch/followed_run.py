@@ -14,6 +14,7 @@ from pathlib import Path
 
 import psutil
 
+from trilane.apps.run.report import REPORT_FILE
 from trilane.errors import BadInputError, did_you_mean
 from trilane.pipeline.journal import NAME, JournalReader, Record, journal_in
 
@@ -57,7 +58,7 @@ class FollowedRun:
     def __init__(self, folder: Path) -> None:
         journal = journal_in(folder)
         if journal is None:
-            remedy = "an older Trilane wrote it; run the scene again" if (folder / "report.json").is_file() else ""
+            remedy = "an older Trilane wrote it; run the scene again" if (folder / REPORT_FILE).is_file() else ""
             raise BadInputError(folder, without_journal(folder), EXPECTED, remedy)
         self.folder = folder
         matched = PARTIAL.fullmatch(folder.name)
