@@ -38,6 +38,14 @@ ON_HELD_OUT = "its error on those held out is in the provenance of its manifest"
 REPLACES = ", in place of what the manifest says now"
 NEIGHBOURS = "`trilane bench several` measures what an avatar loses to its neighbours"
 PLANNED, BY_FRAME = "auto", "`trilane bench planner` measures scenes whose tensor is planned"
+#: Motion, seeds, samples of each band and seed, and tensor size of a validation. One seed is not enough: the worst of
+#: its 96 samples differs by several dB from seed to seed.
+BUILTIN_HELD_OUT = "builtin:walk-wave-turn"
+SEEDS = (1, 2, 3, 4, 5, 6, 7, 8)
+PER_BAND = 24
+VALIDATION_SIZE = "256"
+#: Runtimes to validate with if they are installed. The first one gives the avatar's figures.
+VALIDATION_RUNTIMES = ("ort", "openvino")
 
 
 @dataclass(frozen=True)

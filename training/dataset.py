@@ -21,6 +21,7 @@ from numpy.lib.format import open_memmap
 from numpy.typing import NDArray
 
 from trilane.arrays import F32, F64, U8, Shape, parse_shape
+from trilane.avatars.validation import VALIDATION_SIZE
 from trilane.body.body import load_body
 from trilane.errors import BadInputError
 from trilane.scene.motion.motion import Motion
@@ -37,8 +38,6 @@ TRAINING_SHARE = {"far": 0.30, "full_body": 0.30, "upper_body": 0.17, "face": 0.
 #: Least and greatest density of a training sample's tensor: tensor pixels for one pixel of the picture, along a side.
 #: The planner's smallest tensor has the least, its densest tensor has the greatest.
 DENSITY = (min(SIDES), MOST_DENSITY)
-#: Tensor size of validation samples.
-VALIDATION_SIZE = "256"
 #: Number of samples in a part; a rendering process gets one part at a time.
 PART = 50
 

@@ -53,6 +53,9 @@ def work_of_side(side: float) -> int:
     return math.ceil(ALL_WORK * side * side)
 
 
+#: Names of the runtimes, as a tuple and in words.
+RUNTIMES = ("ort", "openvino", "qnn", "cuda")
+RUNTIME_WORDS = either(RUNTIMES)
 #: Methods by which a network is calibrated, and the usual method.
 CALIBRATION_METHODS = ("minmax", "percentile", "entropy")
 CALIBRATION_METHOD = CALIBRATION_METHODS[0]
