@@ -36,6 +36,8 @@ from trilane.pipeline.journal import Record, Stepped
 from trilane.pipeline.timeline import Presented, Timeline
 from trilane.pipeline.unit_history import IdleSlice
 from trilane.scheduler.events import Event
+from trilane.scheduler.stats import CONFIDENCE_TEXT
+from trilane.signals import INTERRUPTED
 from trilane.stages.run_options import RunOptions
 from trilane.units import COMPUTED, MEASURED, NO_FIGURES
 
@@ -201,7 +203,7 @@ def run(
     left its folder, TrilaneError if no frame was presented. After an interrupt, raises KeyboardInterrupt as soon as the
     folder is complete; there is no folder if no frame was presented.
     """
-    from trilane.apps.run.run_job import INTERRUPTED, Hooks
+    from trilane.apps.run.run_job import Hooks
     from trilane.pipeline.pipeline_file import is_pipeline_file
 
     parameters = inspect.signature(run).parameters
@@ -418,7 +420,7 @@ def _run_rows(report: Report) -> Iterable[Row]:
 
 
 def _between(low: float | None, high: float | None) -> str:
-    return TOO_SHORT if low is None or high is None else f"95 %: {low:.2f} to {high:.2f}"
+    return TOO_SHORT if low is None or high is None else f"{CONFIDENCE_TEXT}: {low:.2f} to {high:.2f}"
 
 
 def _error(facts: Mapping[str, Any]) -> tuple[str, str]:

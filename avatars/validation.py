@@ -19,7 +19,7 @@ import numpy as np
 from trilane.arrays import parse_shape
 from trilane.avatars.bundle import Bundle, bundle_folder
 from trilane.avatars.manifest import CAPTURED, UNTRAINED, Validation, digests_of, figures_digest
-from trilane.units import AVATARS, NO_FIGURES
+from trilane.units import ALL_WORK, AVATARS, NO_FIGURES, SIDES, work_of_side
 
 #: Name of each part of an avatar in a sentence.
 PARTS = {
@@ -38,6 +38,14 @@ ON_HELD_OUT = "its error on those held out is in the provenance of its manifest"
 REPLACES = ", in place of what the manifest says now"
 NEIGHBOURS = "`trilane bench several` measures what an avatar loses to its neighbours"
 PLANNED, BY_FRAME = "auto", "`trilane bench planner` measures scenes whose tensor is planned"
+#: Motion, seeds, samples of each band and seed, and tensor size of a validation. One seed is not enough: the worst of
+#: its 96 samples differs by several dB from seed to seed.
+BUILTIN_HELD_OUT = "builtin:walk-wave-turn"
+SEEDS = (1, 2, 3, 4, 5, 6, 7, 8)
+PER_BAND = 24
+VALIDATION_SIZE = "256"
+#: Runtimes to validate with if they are installed. The first one gives the avatar's figures.
+VALIDATION_RUNTIMES = ("ort", "openvino")
 
 
 @dataclass(frozen=True)
@@ -169,14 +177,11 @@ def name_of(folder: Path) -> str:
 # The tensor sizes that an avatar needs, and its loss in smaller ones. Rule: they come from the avatar's validation, or
 # there are none.
 
-WHOLE = 1000  # pixels of a tensor of the full size, in thousandths
 DIGITS = 2
 #: A tensor is large enough for a body if it loses at most this much of the PSNR at the best measured size, in dB: for
 #: an avatar with a network of its own, and for avatars that share a network. These share a tensor too. Background
 #: between them also takes pixels, so that a tenth of a dB costs more.
 TOLERANCE_DB, SHARED_TOLERANCE_DB = 0.04, 0.3
-#: Pixels of the smaller tensors whose loss is stated, in thousandths of the full size: sides of 3/4 and of 1/2.
-WORKS = (563, 250)
 
 
 @dataclass(frozen=True)
@@ -199,7 +204,7 @@ class SizeLoss:
         The loss is 0 at the full size. For a smaller tensor, it is the loss at the largest measured size up to `work`.
         The result is None if no such size was measured, and without figures.
         """
-        if work >= WHOLE and self.by_work:
+        if work >= ALL_WORK and self.by_work:
             return 0.0
         measured = [size for size in self.by_work if size <= work]
         return self.by_work[max(measured)] if measured else None
@@ -227,10 +232,10 @@ def size_loss(bundle: Bundle, avatars: int) -> SizeLoss:
     if by_size.psnr_db_by_picture is not None:
         table = by_size.psnr_db_by_picture
         curve = curve_of(table, tolerance_db(avatars))
-        return SizeLoss(source, {WHOLE: 0.0, **_losses(table, curve)}, curve)
+        return SizeLoss(source, {ALL_WORK: 0.0, **_losses(table, curve)}, curve)
     pixels = {math.prod(parse_shape(size)): psnr for size, psnr in (by_size.psnr_db or {}).items()}
     own = max(pixels)
-    losses = {WHOLE * count // own: round(pixels[own] - psnr, DIGITS) for count, psnr in pixels.items()}
+    losses = {ALL_WORK * count // own: round(pixels[own] - psnr, DIGITS) for count, psnr in pixels.items()}
     return SizeLoss(source, losses)
 
 
@@ -268,12 +273,12 @@ def _losses(table: Mapping[int, Mapping[int, float]], curve: Sequence[tuple[int,
     A size that was measured for no body is left out. A smaller tensor never counts as better. `curve`: from `curve_of`.
     """
     losses = {}
-    for work in WORKS:
+    for work in map(work_of_side, SIDES[1:]):
         found = [
             max(whole - less, 0.0)
             for (_, pixels), side in zip(curve, sorted(table), strict=True)
             if (whole := psnr_at(table[side], pixels)) is not None
-            and (less := psnr_at(table[side], pixels * work / WHOLE)) is not None
+            and (less := psnr_at(table[side], pixels * work / ALL_WORK)) is not None
         ]
         if found:
             losses[work] = round(sum(found) / len(found), DIGITS)

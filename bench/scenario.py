@@ -28,6 +28,8 @@ from trilane.pipeline.run import run_pipeline
 from trilane.stages.avatar_pipeline import avatar_pipeline
 from trilane.stages.configure import configure
 from trilane.stages.run_options import RunOptions
+from trilane.transport.slots import RULES
+from trilane.units import either
 
 JUDGES = ("trilane", "loadgen")
 MAX_FRAMES = 1_000_000
@@ -193,7 +195,8 @@ WARM_UP = 8
 #: Scenario -> percentile of the queries' latency that is judged. For offline, the rate is judged.
 PERCENTILES = {"single-stream": 0.90, "multi-stream": 0.99, "server": 0.99, "offline": 0.90}
 STALLED_S = 60.0
-KEEPS_ALL = "single, double and fifo edges drop none, under the policies sequential and pipelined"
+KEEPING = either(name for name, rule in RULES.items() if not rule.yields)
+KEEPS_ALL = f"a {KEEPING} edge drops none, under the policies sequential and pipelined"
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from trilane.arrays import F32, F64, I32, Ints
 from trilane.body.joints import JOINTS, LEFT_HAND, POSE_FEATURES, POSE_SIZE, RIGHT_HAND
 from trilane.errors import BadInputError
-from trilane.files import DAMAGED, npz_names, read_header, read_npz
+from trilane.files import DAMAGED, RATE_KEYS, npz_names, read_header, read_npz
 
 #: Range of heights from sole to crown, metres: from less than a newborn child's to more than any adult's.
 LEAST_HEIGHT_M, MOST_HEIGHT_M = 0.3, 3.0
@@ -98,9 +98,7 @@ MAX_VERTICES = 1 << 18
 MAX_FACES = 1 << 19
 SUM_TOLERANCE = 1e-3
 #: Names of arrays that show that a file holds a motion, in AMASS files and similar ones.
-MOTION_KEYS = frozenset(
-    {"poses", "smpl_poses", "smpl_pose", "smpl_thetas", "body_pose", "pose_body", "mocap_framerate", "mocap_frame_rate"}
-)
+MOTION_KEYS = frozenset({"poses", "smpl_poses", "smpl_pose", "smpl_thetas", "body_pose", "pose_body", *RATE_KEYS})
 MOST_NAMED = 16
 #: Unit roundoff of float32: the largest relative error of a weight that was rounded to float32.
 ROUNDING = 2.0**-24

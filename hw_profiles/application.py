@@ -28,8 +28,9 @@ from trilane.units import AFTER_INFER, BEFORE_INFER, INFER, LATENCY_TO, NS_PER_M
 
 NETWORK_UNITS: tuple[UnitName, ...] = ("gpu", "dsp")
 PACKED_BYTES_PER_PIXEL = 16
-#: Frames of a simulated run: for shares of time, for only a frame time, and for runs that drop frames.
-FRAMES, QUICK_FRAMES, FRAMES_WITH_DROPS = 192, 12, 480
+#: Frames of a simulated run: for shares of time, for only a frame time, and for runs that drop frames or have long
+#: queues, which take many frames to fill.
+FRAMES, QUICK_FRAMES, MOST_FRAMES = 192, 12, 480
 #: (stage, unit, time of a job in ns) for each stage, in data-flow order.
 StageTimes = tuple[tuple[str, UnitName, int], ...]
 LEAST_FPS, MOST_FPS = 1e-3, 1000.0  # a scene has the same limits
@@ -219,7 +220,7 @@ def _settled(times: StageTimes, variant: Variant, display_ns: int, quick: bool) 
 def _frames_of(variant: Variant, quick: bool) -> int:
     """Return how many frames are simulated. `quick`: as in `_settled`."""
     if variant.edge not in ("single", "double") or POLICIES[variant.policy].paced:
-        return FRAMES_WITH_DROPS
+        return MOST_FRAMES
     return QUICK_FRAMES if quick and variant.edge == "single" else FRAMES
 
 

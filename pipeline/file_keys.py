@@ -24,7 +24,7 @@ from trilane.pipeline.description import FACTORY, LETTERS, LONGEST_NAME
 from trilane.scheduler.policy import MOST_FRAMES, PACED_WORDS, POLICIES, POLICY_WORDS
 from trilane.transport.slots import EDGE_WORDS, edge_rule
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import UNITS
+from trilane.units import RUNTIME_WORDS, RUNTIMES, UNITS
 
 MOST_STAGES: Final = 64
 MOST_SAMPLES: Final = 1_000_000
@@ -33,7 +33,6 @@ LONGEST_SIDE: Final = 16_384  # longest side of a picture, in pixels
 LONGEST_MS: Final = 3.6e6  # longest time of a job, an hour
 ONE_TIME: Final = "mean with or without sd, exponential, samples, or from with or without name"
 MOST_SDS: Final = 1000  # largest standard deviation of a time, as a multiple of its mean
-RUNTIMES: Final = ("ort", "openvino", "qnn", "cuda")
 NAME: Final = f"^{LETTERS}{{1,{LONGEST_NAME}}}$"
 #: The expected form of a text, by its pattern; for messages.
 FORMS: Final = {
@@ -481,7 +480,7 @@ class OnnxStage(StageKeys):
         default=None, description="int8, fp16 or fp32 on a chip; if absent, the network and its unit decide."
     )
     runtime: Annotated[str, one_of(*RUNTIMES)] = Field(
-        default="ort", description="Runtime of the network on this machine: ort, openvino, qnn or cuda; if absent, ort."
+        default="ort", description=f"Runtime of the network on this machine: {RUNTIME_WORDS}; if absent, ort."
     )
     shapes: dict[str, Annotated[tuple[int, ...], BeforeValidator(_sizes)]] = Field(
         default={}, description="Sizes of inputs that the file leaves open: `{ image = '1x3x224x224' }`."

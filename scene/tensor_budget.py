@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 
 from trilane.arrays import BUCKET_STEP, Shape
 from trilane.scene.crop import Rect, covered, tight_shape
+from trilane.units import ALL_WORK
 
 #: Pairs (pixels of the picture that a body covers, pixels of the tensor for such a body), ascending, at least one.
 Curve = tuple[tuple[int, int], ...]
@@ -20,18 +21,6 @@ Curve = tuple[tuple[int, int], ...]
 MOST_DENSITY = 2.25
 #: Most pixels of an avatar, as a multiple of those for which its network was trained: sides of 5/4.
 MOST_GROWTH = 25 / 16
-#: Sides of a tensor, as shares of the sides for which its network was trained. The smaller ones are for frames that
-#: would be late, and for error budgets.
-SIDES = (1.0, 0.75, 0.5)
-ALL_WORK = 1000
-
-
-def work_of_side(side: float) -> int:
-    """Return the work of a scaled tensor: its pixels in thousandths of all pixels, rounded up.
-
-    `side`: factor by which each side of the tensor is scaled.
-    """
-    return math.ceil(ALL_WORK * side * side)
 
 
 @dataclass(frozen=True)

@@ -34,7 +34,7 @@ from typing import Any, Final, NamedTuple
 from trilane.scheduler.events import NEVER, DropCause, Settings
 from trilane.scheduler.state import StageState
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import either
+from trilane.units import ALL_WORK, either
 
 
 class Candidate(NamedTuple):
@@ -287,7 +287,6 @@ ROOM: Final = 750
 PATIENCE: Final = 30  # frames
 MOST_PATIENCE: Final = 960
 SAMPLES: Final = 3
-ALL: Final = 1000  # thousandths: all the work
 LOAD_ONE: Final = 1 << 20  # a load of 1
 TWENTIETH: Final = 20
 
@@ -311,7 +310,7 @@ class WorkLadder:
         """Begin at rung 0.
 
         `stages`: stages of the chain.
-        `works`: work of each rung in thousandths of all the work, from ALL downwards.
+        `works`: work of each rung in thousandths of all the work, from ALL_WORK downwards.
         `follow`: names of the stages that take less time for less work.
         `period_ns`: period of frames, more than 0.
         `deadline_ns`: longest time from a frame's release to its presentation; 0: none.
@@ -322,7 +321,7 @@ class WorkLadder:
         self._stages = stages
         self._period_ns, self._deadline_ns = period_ns, deadline_ns
         self._rungs = len(works)
-        self._alone = [list(works) if stage.name in follow else [ALL] * len(works) for stage in stages]
+        self._alone = [list(works) if stage.name in follow else [ALL_WORK] * len(works) for stage in stages]
         self._loads: list[deque[int]] = [deque(maxlen=SAMPLES) for _ in stages]
         self._waited = 0
         self._since_up = MOST_PATIENCE
@@ -353,10 +352,10 @@ class WorkLadder:
         for stage in self._stages:
             name = stage.unit.name
             of_units[name] = of_units.get(name, 0) + self.service_ns(stage.position, rung)
-        busiest = max(of_units.values()) * ALL // self._period_ns
+        busiest = max(of_units.values()) * ALL_WORK // self._period_ns
         if not self._deadline_ns:
             return busiest
-        return max(busiest, sum(of_units.values()) * ALL // self._deadline_ns)
+        return max(busiest, sum(of_units.values()) * ALL_WORK // self._deadline_ns)
 
     def consider(self) -> bool:
         """Choose the rung, and return whether it changed. Call this once for each frame, after its jobs are learnt."""

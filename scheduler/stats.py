@@ -27,7 +27,9 @@ from typing import Final, Protocol
 from trilane.scheduler.events import NEVER
 from trilane.units import NS_PER_MS, NS_PER_S
 
-CONFIDENCE = 0.95
+#: Probability with which an interval of measured values contains the true value, as a number and in words.
+CONFIDENCE: Final = 0.95
+CONFIDENCE_TEXT: Final = f"{100 * CONFIDENCE:.0f} %"
 SCORE_PER_MS = 15.0
 LARGEST_ENERGY_MJ = 1500.0
 LARGEST_EXPONENT = 700.0  # e to this power is still a number
@@ -77,7 +79,7 @@ def samples_needed(share: float) -> int:
 NEEDED: Final = {name: samples_needed(share) for name, share in PERCENTILES.items() if share > 0.5}
 
 
-def median_interval(values: Sequence[float], confidence: float = 0.95) -> tuple[float, float]:
+def median_interval(values: Sequence[float], confidence: float = CONFIDENCE) -> tuple[float, float]:
     """Return two of `values` (low, high): their distribution's median lies between them with at least `confidence`.
 
     By the sign test they are the k-th least and the k-th largest of the n values. k is the largest number with
@@ -105,8 +107,6 @@ MOST_BATCHES = 10
 LEAST_BATCHES = 5
 #: Least number of frames in a batch: as many as can be in flight in five stages, with two slots between neighbours.
 LEAST_FRAMES = 10
-#: The 0.975 quantile of Student's t, by degrees of freedom.
-T_975 = {4: 2.776445, 5: 2.570582, 6: 2.446912, 7: 2.364624, 8: 2.306004, 9: 2.262157}
 
 
 def mean_interval(values: Sequence[float], mean: float | None = None) -> tuple[float, float] | None:
@@ -145,7 +145,7 @@ def _half_width(values: Sequence[float], batches: int) -> float:
     length = len(values) // batches
     first = len(values) - batches * length
     means = [fmean(values[first + batch * length : first + (batch + 1) * length]) for batch in range(batches)]
-    return T_975[batches - 1] * stdev(means) / sqrt(batches)
+    return student_quantile(batches - 1) * stdev(means) / sqrt(batches)
 
 
 def frame_interval_ms(interval_ns: tuple[float, float] | None) -> dict[str, float | None]:

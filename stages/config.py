@@ -20,11 +20,11 @@ from trilane.body.joints import JOINTS, POSE_FEATURES
 from trilane.errors import BadInputError
 from trilane.pipeline.description import UnitSettings
 from trilane.scene.schema import Scene, StrictModel
-from trilane.scene.tensor_budget import ALL_WORK, Curve, TensorBudget
+from trilane.scene.tensor_budget import Curve, TensorBudget
 from trilane.transport.live_window import LiveWindow
 from trilane.transport.packets import header_dtype
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import UnitName
+from trilane.units import ALL_WORK, UnitName
 
 #: One avatar of a frame.
 #: `avatar`: number of the avatar in the scene.

@@ -40,9 +40,10 @@ from trilane.scene.planner import (
 )
 from trilane.scene.schema import Scene
 from trilane.scene.staging import Staged
-from trilane.scene.tensor_budget import ALL_WORK, SIDES, TensorBudget, area, work_of_side
+from trilane.scene.tensor_budget import TensorBudget, area
 from trilane.scheduler.policy import policy_named
 from trilane.stages.cpu.mesh_bounds import MeshBounds
+from trilane.units import ALL_WORK, SIDES, work_of_side
 
 KEY = "error_budget_db"
 

@@ -16,10 +16,10 @@ from trilane.options import NOTHING, Finite, Name, OnePath, Option, Options, Tex
 from trilane.scheduler.policy import POLICIES
 from trilane.transport.slots import DEFAULT_EDGE, EDGE_WORDS, EDGES, RULES, edge_rule
 from trilane.unexpected_value import UnexpectedValue
-from trilane.units import AVATARS_HELP, CALIBRATION_METHODS, CHANNELS, PERFORMANCE_PROFILES, ROOM, either
+from trilane.units import AVATARS_HELP, CALIBRATION_METHODS, CHANNELS, PERFORMANCE_PROFILES, ROOM, RUNTIME_WORDS, either
 
 PROFILE_HELP: Final = "Hardware profile: a name or a TOML file."
-RUNTIME_HELP: Final = "auto, ort, openvino, qnn or cuda; auto is the fastest installed one."
+RUNTIME_HELP: Final = f"auto, {RUNTIME_WORDS}; auto is the fastest installed one."
 SIZE_HELP: Final = "Tensor size in pixels: HEIGHTxWIDTH, or a side S for areas up to SxS."
 CHANNELS_HELP: Final = f"Channels of the neural texture: {either(CHANNELS)}."
 WIDTH_HELP: Final = "Width of the network: 64 is full; all channel counts scale with it."

@@ -21,14 +21,16 @@ from numpy.lib.format import open_memmap
 from numpy.typing import NDArray
 
 from trilane.arrays import F32, F64, U8, Shape, parse_shape
+from trilane.avatars.validation import VALIDATION_SIZE
 from trilane.body.body import load_body
 from trilane.errors import BadInputError
 from trilane.scene.motion.motion import Motion
-from trilane.scene.tensor_budget import MOST_DENSITY, SIDES
+from trilane.scene.tensor_budget import MOST_DENSITY
 from trilane.training.clothing import look_named
 from trilane.training.random_views import Crop
 from trilane.training.sample_renderer import BAND_NAMES, PoseSource, Sample, SampleRenderer
 from trilane.training.training_settings import TrainingSettings
+from trilane.units import SIDES
 
 One = TypeVar("One")
 #: Share of each band among the training samples. Far samples are the most, because their tensors have many sizes.
@@ -36,8 +38,6 @@ TRAINING_SHARE = {"far": 0.30, "full_body": 0.30, "upper_body": 0.17, "face": 0.
 #: Least and greatest density of a training sample's tensor: tensor pixels for one pixel of the picture, along a side.
 #: The planner's smallest tensor has the least, its densest tensor has the greatest.
 DENSITY = (min(SIDES), MOST_DENSITY)
-#: Tensor size of validation samples.
-VALIDATION_SIZE = "256"
 #: Number of samples in a part; a rendering process gets one part at a time.
 PART = 50
 

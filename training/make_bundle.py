@@ -21,8 +21,9 @@ from trilane.arrays import F32, F64, Mask
 from trilane.avatars.bundle import Bundle, load_bundle, pack_levels, write_bundle
 from trilane.avatars.manifest import Manifest, network_entry
 from trilane.avatars.network_file import reshaped
+from trilane.avatars.validation import BUILTIN_HELD_OUT, VALIDATION_SIZE
 from trilane.body.body import ShapedBody
-from trilane.training.dataset import U16, VALIDATION_SIZE, ShapeGroup, motion_poses, random_kind
+from trilane.training.dataset import U16, ShapeGroup, motion_poses, random_kind
 from trilane.training.first_texture import fill_along_surface, grown, used_texels
 from trilane.training.network import export_onnx
 from trilane.training.quantising.quantise import ByteRanges, Quantised, byte_ranges, quantise
@@ -30,7 +31,7 @@ from trilane.training.sample_renderer import BAND_NAMES, Sample, SampleRenderer
 from trilane.training.subject import Person
 from trilane.training.surface import BodyArrays, body_arrays
 from trilane.training.trainable_avatar import ByteGrid, TrainableAvatar, float_network_of, levels_of, read_levels
-from trilane.training.validate import BUILTIN_HELD_OUT, held_out_motions
+from trilane.training.validate import held_out_motions
 from trilane.writing import write_atomically, write_bytes
 
 INT8_MAX = 127

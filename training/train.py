@@ -23,13 +23,13 @@ from PIL import Image
 from trilane.arrays import F32
 from trilane.avatars.bundle import OFFSETS, Bundle, bundle_folder, load_bundle, write_manifest
 from trilane.avatars.manifest import sha256_of
+from trilane.avatars.validation import VALIDATION_SIZE
 from trilane.errors import BadInputError
 from trilane.files import read_text
 from trilane.training.capture.capture_samples import CaptureRenderer
 from trilane.training.clothing import KEY, look_named
 from trilane.training.dataset import (
     FIELDS,
-    VALIDATION_SIZE,
     Planned,
     ShapeGroup,
     open_groups,

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from trilane import machine
-from trilane.arrays import F64, U8, Shape, shapes_within
+from trilane.arrays import F64, U8, Shape, shapes_within, to_code, to_light
 from trilane.avatars.bundle import Bundle, write_manifest
 from trilane.avatars.manifest import (
     AT_THE_TOP,
@@ -30,6 +30,7 @@ from trilane.avatars.manifest import (
     with_figures_digest,
 )
 from trilane.avatars.network_file import reshaped
+from trilane.avatars.validation import BUILTIN_HELD_OUT, PER_BAND, SEEDS, VALIDATION_RUNTIMES, VALIDATION_SIZE
 from trilane.scene.motion.files import load_motion
 from trilane.scene.motion.motion import Motion
 from trilane.scene.schema import AvatarSpec
@@ -40,7 +41,7 @@ from trilane.stages.gpu.raster import PackedAvatar, PackedPass, Placement
 from trilane.stages.gpu.skinned_mesh import SkinnedMesh
 from trilane.stages.machine_facts import package_version
 from trilane.training.clothing import look_of
-from trilane.training.dataset import VALIDATION_SIZE, plan_validation
+from trilane.training.dataset import plan_validation
 from trilane.training.image_error import SIDE, ImageError, SampleError, image_error, over, scenes, summary
 from trilane.training.random_views import OUTPUT_ROWS, Crop, View
 from trilane.training.sample_renderer import BAND_NAMES, Sample, SampleRenderer
@@ -126,10 +127,6 @@ def integer_painter(renderer: PackedRenderer, bundle: Bundle, runtime: str, thre
     return paint
 
 
-BUILTIN_HELD_OUT = "builtin:walk-wave-turn"
-#: Seeds of a validation. One seed is not enough: the worst of its 96 samples differs by several dB from seed to seed.
-SEEDS = (1, 2, 3, 4, 5, 6, 7, 8)
-PER_BAND = 24
 #: Name of the float network's painter; the other painters have the names of runtimes.
 FLOAT = "float"
 #: A function that is called with the seed and the evaluation of each sample.
@@ -149,7 +146,7 @@ class ValidationPlan:
     held_out: tuple[str, ...] = (BUILTIN_HELD_OUT,)
     seeds: tuple[int, ...] = SEEDS
     per_band: int = PER_BAND
-    runtimes: tuple[str, ...] = ("ort",)
+    runtimes: tuple[str, ...] = VALIDATION_RUNTIMES[:1]
     size: str = VALIDATION_SIZE
     threads: int = 1
     revision: str | None = None
@@ -344,10 +341,10 @@ def shown(image: U8, painted: Crop, seen: Crop) -> U8:
     `painted`: crop of the tensor, of the same view.
     """
     alpha = image[..., 3:] / 255.0
-    planes = np.dstack([_linear(image[..., :3] / 255.0) * alpha, alpha])
+    planes = np.dstack([to_light(image[..., :3] / 255.0) * alpha, alpha])
     for axis, element in ((0, 1), (1, 0)):
         planes = np.moveaxis(_read(np.moveaxis(planes, axis, 0), painted, seen, element), 0, axis)
-    colour = _encoded(planes[..., :3] / np.maximum(planes[..., 3:], 1e-6))
+    colour = to_code(planes[..., :3] / np.maximum(planes[..., 3:], 1e-6))
     return np.asarray(np.round(np.clip(np.dstack([colour, planes[..., 3:]]), 0, 1) * 255), np.uint8)
 
 
@@ -368,16 +365,6 @@ def _read(rows: F64, painted: Crop, seen: Crop, element: int) -> F64:
     part = (place - low).reshape(-1, 1, 1)
     read = rows[low] * (1 - part) + rows[np.minimum(low + 1, lines - 1)] * part
     return np.asarray(read.reshape(count, taps, *rows.shape[1:]).mean(axis=1))
-
-
-def _linear(encoded: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return sRGB values `encoded` in 0..1 as linear light in 0..1 (IEC 61966-2-1)."""
-    return np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-
-
-def _encoded(linear: NDArray[np.floating]) -> NDArray[np.floating]:
-    """Return `linear` light in 0..1 as sRGB values in 0..1 (IEC 61966-2-1)."""
-    return np.where(linear <= 0.0031308, linear * 12.92, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 
 
 # Sheets that compare pictures: the ground truth and each painter's picture, side by side.

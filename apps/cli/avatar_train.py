@@ -17,9 +17,10 @@ from trilane import machine
 from trilane.apps.cli.commands import AvatarArgument, JsonOption, given
 from trilane.apps.cli.console import print_facts, stderr_console, stdout_console, stdout_kept
 from trilane.avatars.manifest import BANDS, CAPTURED
+from trilane.avatars.validation import BUILTIN_HELD_OUT, PER_BAND, SEEDS, VALIDATION_RUNTIMES, VALIDATION_SIZE
 from trilane.errors import BadInputError, MissingPartError, install_line, package_line
 from trilane.stages.run_options import SIZE_HELP
-from trilane.units import AVATARS
+from trilane.units import AVATARS, RUNTIME_WORDS
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -53,8 +54,6 @@ Examples:
   trilane avatar validate default --seed 1 --seed 2 --sheet worst.png
   trilane avatar validate my-avatar --sizes
 """
-#: Runtimes to validate with if none is given and they are installed. The first one gives the avatar's figures.
-RUNTIMES = ("ort", "openvino")
 
 
 def train(
@@ -235,19 +234,22 @@ def validate(
     name: AvatarArgument,
     held_out: Annotated[
         list[str] | None,
-        typer.Option(help="Motion that no training used: builtin:NAME or a file. Repeat it; if none, walk-wave-turn."),
+        typer.Option(
+            help=f"Motion that no training used: builtin:NAME or a file. Repeat it; if none, {BUILTIN_HELD_OUT}."
+        ),
     ] = None,
     seed: Annotated[
-        list[int] | None, typer.Option(min=0, help="Seed of views and poses. Repeat it; if none, 1 to 8.")
+        list[int] | None,
+        typer.Option(min=0, help=f"Seed of views and poses. Repeat it; if none, {SEEDS[0]} to {SEEDS[-1]}."),
     ] = None,
     per_band: Annotated[
         int, typer.Option(min=1, max=1000, help="Views of each band of distances, for each seed.")
-    ] = 24,
+    ] = PER_BAND,
     runtime: Annotated[
         list[str] | None,
-        typer.Option(help="ort, openvino, qnn or cuda. Repeat it; if none, ort, and openvino if installed."),
+        typer.Option(help=f"{RUNTIME_WORDS}. Repeat it; if none, {', and '.join(VALIDATION_RUNTIMES)} if installed."),
     ] = None,
-    size: Annotated[str, typer.Option(help=SIZE_HELP)] = "256",
+    size: Annotated[str, typer.Option(help=SIZE_HELP)] = VALIDATION_SIZE,
     float_network: Annotated[
         Path | None, typer.Option(help="Weights before quantising (.npz), to say what quantising costs.")
     ] = None,
@@ -271,7 +273,7 @@ def validate(
     from trilane.stages.dsp.runtime import installed, resolve
     from trilane.unexpected_value import UnexpectedValue
 
-    runtimes = [resolve(each) for each in runtime or [each for each in RUNTIMES if each in installed()]]
+    runtimes = [resolve(each) for each in runtime or [each for each in VALIDATION_RUNTIMES if each in installed()]]
     try:
         shape_buckets(size)
     except UnexpectedValue as error:
@@ -285,12 +287,11 @@ def validate(
         from trilane.training import validate as work
     except ImportError as error:
         raise MissingPartError(f"validating needs {error.name}", extra="metrics") from None
-    seeds = tuple(dict.fromkeys(seed)) if seed else work.SEEDS
     require_writable_manifest(bundle.folder)
     made = made_facts(())
     plan = work.ValidationPlan(
-        held_out=tuple(held_out or (work.BUILTIN_HELD_OUT,)),
-        seeds=seeds,
+        held_out=tuple(held_out or (BUILTIN_HELD_OUT,)),
+        seeds=tuple(dict.fromkeys(seed or SEEDS)),
         per_band=per_band,
         runtimes=tuple(dict.fromkeys(runtimes)),
         size=size,

@@ -22,7 +22,7 @@ from trilane.apps.predict.predict_options import ENCODER_HELP, NORM_HELP
 from trilane.scheduler.policy import POLICY_WORDS
 from trilane.stages.run_options import AS_IT_IS, CHANNELS_HELP, RUNTIME_HELP, SIZE_HELP, WIDTH_HELP
 from trilane.transport.slots import EDGE_WORDS
-from trilane.units import AVATARS_HELP, CALIBRATION_METHODS, either
+from trilane.units import AVATARS_HELP, CALIBRATION_METHODS, RUNTIME_WORDS, either
 
 #: Bench -> its module, and its line in `trilane bench --help`.
 BENCHES = {
@@ -64,7 +64,7 @@ Examples:
 """
 FIXED_SIZE = "Tensor size in pixels: HEIGHTxWIDTH."
 SQUARE_SIZE = "Side of the square tensor in pixels."
-NAMED_RUNTIME = "ort, openvino, qnn or cuda."
+NAMED_RUNTIME = f"{RUNTIME_WORDS}."
 DRIVER_THREADS = "Threads of the software OpenGL driver."
 #: Option, or bench and option -> its line in `--help`.
 MEANINGS = {

@@ -31,6 +31,7 @@ from trilane.apps.cli.console import (
     without_controls,
 )
 from trilane.errors import BadInputError
+from trilane.scheduler.stats import CONFIDENCE_TEXT
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -288,7 +289,7 @@ def _trial_table(pairs: Sequence[TrialPair]) -> Table:
         values = [setting(pair.options.get(name, pair.sides.name)) for name in names]
         figures = (f"{row.base:.4g}", f"{row.other:.4g}", change_of(row, MS), interval_of(row, MS))
         rows.append((*values, *figures, str(pair.outcome)))
-    return _table((*names, "base, ms", "other, ms", "change", "95 % interval", "outcome"), rows)
+    return _table((*names, "base, ms", "other, ms", "change", f"{CONFIDENCE_TEXT} interval", "outcome"), rows)
 
 
 def _table(titles: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
@@ -334,7 +335,7 @@ def _figure_table(comparison: Comparison, figures: list[Figure]) -> Table:
         row, unit = comparison.rows[figure], figure.unit
         values = (value_of(row.base, unit), value_of(row.other, unit), change_of(row, unit), interval_of(row, unit))
         rows.append((name_of(figure), figure.statistic, *values, str(comparison.outcome(figure))))
-    return _table(("figure", "statistic", "base", "other", "change", "95 % interval", "outcome"), rows)
+    return _table(("figure", "statistic", "base", "other", "change", f"{CONFIDENCE_TEXT} interval", "outcome"), rows)
 
 
 SUMMARY: Final = "GITHUB_STEP_SUMMARY"

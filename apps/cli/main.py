@@ -22,7 +22,7 @@ from typer.core import TyperCommand, TyperGroup
 from trilane.apps.old_names import in_new_names
 from trilane.errors import TrilaneError, install_line, reason
 from trilane.machine import require_memory, shortage
-from trilane.signals import interrupting
+from trilane.signals import INTERRUPTED, interrupting
 
 #: Command -> its module, and its line in `trilane --help`.
 COMMANDS = {
@@ -49,7 +49,7 @@ COMMANDS = {
     "doctor": ("trilane.apps.cli.doctor", "Say what this machine has, what is missing and how to install it."),
 }
 
-FAILED, MISSING_PART, INTERRUPTED = 1, 3, 130  # Typer itself exits with 2 for wrong usage, and with 130 if interrupted
+FAILED, MISSING_PART = 1, 3  # Typer itself exits with 2 for wrong usage, and with INTERRUPTED if interrupted
 
 #: Exceptions that libraries raise if they get no memory or no thread. They can have other causes.
 OF_MEMORY = (MemoryError, ImportError, RuntimeError)

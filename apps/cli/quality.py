@@ -14,6 +14,7 @@ import typer
 from trilane.apps.cli.commands import Commands, JsonOption, SceneArgument, SceneAvatarOption, SceneSizeOption
 from trilane.apps.cli.console import print_json, print_line, say, stderr_console, stdout_console, stdout_kept
 from trilane.errors import BadInputError
+from trilane.units import RUNTIME_WORDS
 
 app = Commands()
 EPILOG = """\b
@@ -49,7 +50,7 @@ def quality(
     runtime: Annotated[
         list[str] | None,
         typer.Option(
-            help="ort, openvino, qnn or cuda, once for each; all installed ones if not given. Hard cases then leave "
+            help=f"{RUNTIME_WORDS}, once for each; all installed ones if not given. Hard cases then leave "
             "out the emulator qnn, which takes minutes."
         ),
     ] = None,

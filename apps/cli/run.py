@@ -18,7 +18,7 @@ import typer
 from trilane.apps.cli.commands import Commands, JsonOption, PortOption, with_options
 from trilane.apps.cli.console import print_json, print_verdict, say, shown_messages, stderr_console, stdout_console
 from trilane.errors import BadInputError
-from trilane.scheduler.stats import NEEDED, PERCENTILES
+from trilane.scheduler.stats import CONFIDENCE_TEXT, NEEDED, PERCENTILES
 from trilane.stages.run_options import RunOptions
 from trilane.units import COMPUTED, MEASURED, NO_FIGURES
 
@@ -207,7 +207,9 @@ def _caption(report: Report) -> str:
         lines.insert(0, _made(report.made))
     if report.frames.skipped:
         lines.append(_skipped(report))
-    lines.append("in brackets: 95 % interval, by the scatter of this run's frames; two runs may differ by more")
+    lines.append(
+        f"in brackets: {CONFIDENCE_TEXT} interval, by the scatter of this run's frames; two runs may differ by more"
+    )
     runs: list[PolicyMetrics] = [report, report.baseline] if report.baseline else [report]
     summaries = [times for run in runs for times in (run.frame_time_ms, run.latency_ms)]
     if any(_too_few(times, name) for times in summaries for name in NEEDED):
@@ -404,7 +406,7 @@ def _rate_rows(runs: Sequence[PolicyMetrics]) -> Rows:
     yield "", "all work / time of all cores", [_number(run.machine_efficiency, 2) for run in runs]
     units, stages = ([getattr(run.bound, kind, None) for run in runs] for kind in ("unit", "stage"))
     is_slowed = any(part is not None and part.cost is not None for part in units)
-    what = "% longer if 20 % slower" if is_slowed else "% of the path (95 % interval)"
+    what = "% longer if 20 % slower" if is_slowed else f"% of the path ({CONFIDENCE_TEXT} interval)"
     yield "bound", f"unit, {what}", [_bounds(part, is_slowed=is_slowed) for part in units]
     yield "", f"stage, {what}", [_bounds(part, is_slowed=is_slowed) for part in stages]
     yield "frames", "lost + dropped + not begun", [_left_out(run.frames) for run in runs]

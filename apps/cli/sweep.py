@@ -25,6 +25,7 @@ import typer
 from trilane.apps.cli.commands import Commands, JsonOption
 from trilane.apps.cli.console import print_json, print_line, say, stderr_console, stdout_console, stdout_kept
 from trilane.errors import BadInputError
+from trilane.signals import INTERRUPTED
 
 if TYPE_CHECKING:
     from trilane.apps.cli.sweep_options import SweptCommand
@@ -42,7 +43,7 @@ Examples:
   trilane sweep docs/examples/chip-sweep.toml --engine ray
 """
 ENDING = ".toml"
-SOME_FAILED, INTERRUPTED = 1, 130
+SOME_FAILED = 1
 #: Column of the summary -> keys that lead to its figure in a trial's result.
 FIGURES = {"fps": ("fps",), "frame ms": ("frame_time_ms", "mean")}
 #: The same for the further columns of a sweep with `--check`.

@@ -23,7 +23,6 @@ from trilane.apps.cli.commands import Commands, JsonOption
 from trilane.apps.cli.console import print_json, print_line, say, stdout_console
 from trilane.apps.cli.sweep import (
     ENDING,
-    INTERRUPTED,
     EngineName,
     EngineOption,
     ResumeOption,
@@ -40,6 +39,7 @@ from trilane.apps.cli.sweep import (
 )
 from trilane.apps.sweep.definition import COMMANDS, METRICS
 from trilane.errors import BadInputError, did_you_mean
+from trilane.signals import INTERRUPTED
 from trilane.units import HOST, either
 
 if TYPE_CHECKING:

@@ -36,16 +36,17 @@ from trilane.apps.compare.sides import (
     compared_run,
     read_told,
 )
-from trilane.apps.run.report import Report
+from trilane.apps.run.report import REPORT_FILE, Report
 from trilane.apps.run.verdict import MOST_OTHERS
 from trilane.apps.sweep.store import TRIALS, TrialRecord, read_trials
 from trilane.errors import BadInputError
+from trilane.scheduler.stats import CONFIDENCE_TEXT
 
 MEAN: Final = Figure(FRAME_TIME, "", "", "mean", MS)
 METHOD: Final = (
-    "trials of one configuration are compared with each other, repeats as several runs; intervals hold 95 %; that any "
-    f"of the trials that are said to differ does so by chance has a probability of at most {100 * ALPHA:.0f} % (Holm); "
-    "over all: the geometric mean of the ratios"
+    "trials of one configuration are compared with each other, repeats as several runs; intervals hold "
+    f"{CONFIDENCE_TEXT}; that any of the trials that are said to differ does so by chance has a probability of at most "
+    f"{100 * ALPHA:.0f} % (Holm); over all: the geometric mean of the ratios"
 )
 
 
@@ -251,7 +252,7 @@ def _trial(sweep: str, record: TrialRecord) -> ComparedRun:
 
 def _has_report(folder: Path) -> bool:
     try:
-        return (folder / "report.json").is_file()
+        return (folder / REPORT_FILE).is_file()
     except OSError:  # a name that is too long
         return False
 

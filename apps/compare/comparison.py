@@ -41,10 +41,11 @@ from trilane.errors import BadInputError
 from trilane.pipeline.run_metrics import Bound, PathShare
 from trilane.scheduler.ledger import CAUSES
 from trilane.scheduler.policy import POLICIES
+from trilane.scheduler.stats import CONFIDENCE_TEXT
 
 SCHEMA: Final = 1
 METHOD: Final = (
-    "intervals hold 95 %; that the verdict names a difference by chance has a probability of at most "
+    f"intervals hold {CONFIDENCE_TEXT}; that the verdict names a difference by chance has a probability of at most "
     f"{100 * ALPHA:.0f} % (Holm); no difference: surely less than {100 * MATTERS:.0f} %; cannot tell: neither"
 )
 SEVERAL: Final = (

@@ -20,19 +20,20 @@ from pathlib import Path
 from typing import Any
 
 from trilane.apps.compare.frontier import SAME_DB, frontier, knees
-from trilane.apps.run.report import MAX_REPORT_BYTES
+from trilane.apps.run.report import MAX_REPORT_BYTES, REPORT_FILE
 from trilane.apps.sweep.store import TRIALS, TrialRecord, read_trials
 from trilane.errors import BadInputError, MissingPartError
 from trilane.files import instead_of_file, require_file
 from trilane.hw_profiles.schema import SHARE_TEXT
 from trilane.scene.schema import Scene
+from trilane.scheduler.stats import CONFIDENCE_TEXT
 from trilane.units import COMPUTED, HOST_CLOCK, MEASURED, NO_FIGURES
 from trilane.writing import write_atomically
 
 #: Origins of an image error.
 OF_RUN, OF_AVATAR = "errors of the runs themselves", "errors of the avatars' validations"
 #: Kinds of an interval of the frame time.
-BY_SCATTER, BY_MODEL = "95 %, scatter of the run's frames", f"{SHARE_TEXT}, of the model"
+BY_SCATTER, BY_MODEL = f"{CONFIDENCE_TEXT}, scatter of the run's frames", f"{SHARE_TEXT}, of the model"
 #: Keys of a scene that do not change its content. Another bundle may be another network of the same person.
 HOW_DRAWN = (
     *("size", "plan", "texture_filter", "error_budget_px", "error_budget_db", "most_side", "memory_mb"),
@@ -45,7 +46,7 @@ NOT_SETTINGS = (
     *("avatar_dirs", "networks", "shapes", "changes", "own_pixels", "size_curves"),
     *("works", "posed_vertices", "pace_ns", "units", "cuts", "record"),
 )
-REPORT, VIDEO = "report.json", "video.mp4"
+VIDEO = "video.mp4"
 EXPECTED = "a run folder, a sweep's folder, a prediction that was saved with --json, or a folder of these"
 MOST = 10_000
 FIGURES = (
@@ -83,15 +84,15 @@ def _entries(place: Path) -> Iterator[Entry]:
         yield replace(entry_of(place.stem, _document(place)), within=within)
     elif not place.is_dir():
         raise BadInputError(place, instead_of_file(place), EXPECTED)
-    elif (place / REPORT).is_file():
-        yield replace(entry_of(place.name, _document(place / REPORT), place / VIDEO), within=within)
+    elif (place / REPORT_FILE).is_file():
+        yield replace(entry_of(place.name, _document(place / REPORT_FILE), place / VIDEO), within=within)
     elif (place / TRIALS).is_file():
         trials = list(read_trials(place).values())
         for name, trial in zip(_names(trials), trials, strict=True):
             yield replace(_trial(place, trial, name), within=place.absolute().name)
     else:
         for folder in sorted(path for path in place.iterdir() if path.is_dir() and path.suffix != ".partial"):
-            if (folder / REPORT).is_file() or (folder / TRIALS).is_file():
+            if (folder / REPORT_FILE).is_file() or (folder / TRIALS).is_file():
                 yield from _one_of_many(folder)
 
 

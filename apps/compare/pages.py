@@ -38,6 +38,7 @@ from trilane.apps.compare.frontier import SAME_DB, frontier, knees
 from trilane.apps.compare.overview import Entry, table_rows, told_choices
 from trilane.apps.compare.rows import Figure
 from trilane.hw_profiles.schema import SHARE_TEXT
+from trilane.scheduler.stats import CONFIDENCE_TEXT
 from trilane.stages.gpu.video_reader import open_video
 
 UNITS = {"frame_ms": "frame, ms", "low_ms": "from, ms", "high_ms": "to, ms", "latency_ms": "latency, ms"}
@@ -48,9 +49,10 @@ LONG = 40  # letters; the style cuts a longer cell, which is shown in full when 
 SHARES = ("other_programs",)
 LETTER, BESIDE = 7, 12  # width of a name's letter, and distance of a name from its dot, pixels
 MEANING = (
-    "Frame time is the mean between presented frames, from and to its interval: of a run 95 %, by the scatter of its "
-    f"own frames; of a prediction {SHARE_TEXT}, by the model. PSNR says how near the picture is to the truth; larger "
-    "is better. It is a mean over frames; the worst frame and the 1st percentile beside it tell what the mean hides. "
+    f"Frame time is the mean between presented frames, from and to its interval: of a run {CONFIDENCE_TEXT}, by the "
+    f"scatter of its own frames; of a prediction {SHARE_TEXT}, by the model. PSNR says how near the picture is to "
+    "the truth; larger is better. It is a mean over frames; the worst frame and the 1st percentile beside it tell what "
+    "the mean hides. "
     "The frontier holds what nobody beats in both on the same clock and machine, with the same scene and the same kind "
     f"of error. Pictures within {SAME_DB} dB count as equal, and so do times whose intervals meet. An entry without a "
     "known error is in the table and on no frontier. After the knee more time buys little picture. The verdict says "
@@ -79,7 +81,7 @@ def _document(title: str, style: str, policy: str, body: str) -> str:
     """Return an HTML document.
 
     `title`: title of the page.
-    `style`: name of the file beside this module that has the styles.
+    `style`: name of the file beside this module that has the page's own styles.
     `policy`: content security policy: what the page may load and run.
     `body`: HTML after the heading.
     """
@@ -87,7 +89,7 @@ def _document(title: str, style: str, policy: str, body: str) -> str:
         '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{escape(policy)}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title><style>{_beside(style)}</style></head>\n"
+        f"<title>{escape(title)}</title><style>{_beside('page.css')}{_beside(style)}</style></head>\n"
         f"<body><h1>{escape(title)}</h1>\n{body}</body></html>\n"
     )
 
@@ -404,7 +406,7 @@ def _section(comparison: Comparison) -> Iterator[str]:
         )
         yield _captioned("What changed in configuration and machine", ("key", "base", "other"), rows)
     scales = _scales(comparison)
-    titles = ("figure", "statistic", "base", "other", "change", "95 % interval", "outcome", "drawn")
+    titles = ("figure", "statistic", "base", "other", "change", f"{CONFIDENCE_TEXT} interval", "outcome", "drawn")
     figures = sorted(comparison.rows, key=lambda figure: figure not in comparison.differing)
     rows = (_figure(figure, comparison, scales) for figure in figures)
     yield _captioned("Figures; those that differ stand first", titles, rows)

@@ -25,7 +25,7 @@ from pydantic_core import from_json, to_json
 
 from trilane.apps.compare.difference import COMPARED, STATISTICS
 from trilane.apps.compare.run_frames import Key, RunFrames, read_frames
-from trilane.apps.run.report import MAX_REPORT_BYTES, read_report
+from trilane.apps.run.report import MAX_REPORT_BYTES, REPORT_FILE, read_report
 from trilane.apps.run.verdict import Trust, trust_of
 from trilane.apps.watch.followed_run import FollowedRun, RunState, folder_of
 from trilane.errors import BadInputError
@@ -240,14 +240,14 @@ def _is_there(text: str) -> bool:
 def _of_folder(name: str, path: Path) -> ComparedRun:
     journal = path / JOURNAL
     saved = [] if os.path.lexists(journal) else sorted(path.glob("*.json"))
-    if saved and not os.path.lexists(path / "report.json"):
+    if saved and not os.path.lexists(path / REPORT_FILE):
         if len(saved) > 1:
             found = ", ".join(each.name for each in saved[:4])
             raise BadInputError(path, f"{len(saved)} documents ({found})", "one prediction", "name its file")
         return _of_file(name, saved[0])
     if not os.path.lexists(journal):
         return compared_run(name, RunKind.REPORT, read_report(path).as_json())
-    if os.path.lexists(path / "report.json"):
+    if os.path.lexists(path / REPORT_FILE):
         return compared_run(name, RunKind.RUN, read_report(path).as_json(), read_frames(journal))
     frames = read_frames(journal)
     document, unknown = _journal_document(frames, journal)

@@ -182,9 +182,9 @@ def facts_of_folder(folder: Path, begun: Begun) -> RunFacts:
     `begun`: first record of the journal.
     Raises BadInputError for a report that cannot be read.
     """
-    if (folder / "report.json").is_file():
-        from trilane.apps.run.report import read_report
+    from trilane.apps.run.report import REPORT_FILE, read_report
 
+    if (folder / REPORT_FILE).is_file():
         return facts_of_report(folder.name, read_report(folder))
     facts = begun.facts
     scene = config_of(begun).get("scene", {})

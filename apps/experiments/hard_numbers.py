@@ -427,7 +427,7 @@ STEPS: dict[str, tuple[float, int, Sequence[float]]] = {
     "a zero point of 0": (POWER, 0, [k - 7.5 for k in range(16)]),
     "a zero point of 255": (POWER, 255, [k - 7.5 for k in range(16)]),
 }
-LARGEST, LEAST_NORMAL, LEAST = 65504.0, 2.0**-14, 2.0**-24
+LARGEST, LEAST = 65504.0, 2.0**-24
 #: Name -> scale, zero point, and the values of the channels.
 NUMBERS: dict[str, tuple[float, int, Sequence[float]]] = {
     "the largest FP16 numbers": (6 / 255, 117, [LARGEST, -LARGEST] * 8),

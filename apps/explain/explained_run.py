@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, get_type_hints
 
 from trilane.apps.explain.reasons import MOST_SAMPLES, BudgetRow, ShownFrame, SlowFrames, Usual, advice, notes, reasons
-from trilane.apps.run.report import Report, read_report
+from trilane.apps.run.report import REPORT_FILE, Report, read_report
 from trilane.apps.run.verdict_facts import verdict_of
 from trilane.apps.watch.followed_run import CUT_OFF, FollowedRun, RunState
 from trilane.errors import BadInputError, MissingPartError
@@ -244,7 +244,7 @@ def explain_run(folder: Path, slowest: int = 10) -> ExplainedRun:
 
     Raises BadInputError if `folder` is no run folder, or if its journal or report cannot be read.
     """
-    report = read_report(folder) if (folder / "report.json").exists() else None  # there is none while a run goes on
+    report = read_report(folder) if (folder / REPORT_FILE).exists() else None  # there is none while a run goes on
     return ExplainedRun(folder, *open_journal(folder), report, slowest)
 
 

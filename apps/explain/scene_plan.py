@@ -37,7 +37,7 @@ from trilane.hw_profiles.schema import Profile, corners_of
 from trilane.pipeline.memory import Assets
 from trilane.scene.crop import Rect
 from trilane.scene.planner import FrameWork
-from trilane.scene.tensor_budget import ALL_WORK, MOST_DENSITY
+from trilane.scene.tensor_budget import MOST_DENSITY
 from trilane.scheduler.placement import Ranked
 from trilane.stages.avatar_assets import distinct, mesh_levels_of, networks_of, painting, shaped_body, staged_of
 from trilane.stages.config import RunConfig, pose_dtype, posed_vertices, posed_vertices_bytes
@@ -46,7 +46,7 @@ from trilane.stages.cpu.pose import FramePlan, PoseStage
 from trilane.stages.foresee import is_limited
 from trilane.transport.packets import Packet, SlotLayout, view_packet
 from trilane.transport.slots import DEFAULT_EDGE
-from trilane.units import COMPUTED, HOST, MEASURED, NS_PER_MS, UNITS, UnitName
+from trilane.units import ALL_WORK, COMPUTED, HOST, MEASURED, NS_PER_MS, UNITS, UnitName
 from trilane.writing import write_atomically
 
 MOST_FRAMES = 9

@@ -32,6 +32,7 @@ from trilane.apps.inspect.readers import (
     inspect_trace,
     inspect_video,
 )
+from trilane.apps.run.report import REPORT_FILE
 from trilane.avatars.bundle import MANIFEST
 from trilane.errors import BadInputError
 from trilane.files import (
@@ -76,7 +77,7 @@ ENDINGS = {
 #: Names of files, and the kind of a folder that has one of them. The first match counts.
 MARKS: tuple[tuple[tuple[str, ...], str], ...] = (
     ((MANIFEST,), AVATAR),
-    (("report.json", JOURNAL), RUN),
+    ((REPORT_FILE, JOURNAL), RUN),
     (("trials.jsonl",), SWEEP),
 )
 #: Key of a JSON document -> kind of a file with this key. The first match counts.

@@ -23,7 +23,7 @@ from PIL import ExifTags, Image, ImageDraw
 from trilane.apps.avatar_files import bundle_facts
 from trilane.apps.compare.overview import read_entries
 from trilane.apps.inspect.inspection import Inspection, Length, drawn_cameras, drawn_points, drawn_skeletons, used
-from trilane.apps.run.report import read_report
+from trilane.apps.run.report import REPORT_FILE, read_report
 from trilane.apps.run.run_files import SHEET
 from trilane.apps.sweep.definition import read_sweep
 from trilane.avatars.bundle import DEFAULT, MANIFEST, bundle_folder, load_bundle
@@ -164,7 +164,7 @@ def inspect_run(path: Path) -> Inspection:
     sheet = folder / SHEET
     detected = Detected("run folder", "a report or a journal in it")
     draw = partial(_copied, sheet) if sheet.is_file() else None
-    if (folder / "report.json").is_file():
+    if (folder / REPORT_FILE).is_file():
         found = inspect_report(folder)
         return Inspection("run", f"a run folder with {found.what}", found.advice, detected, found.length,
                           found.facts, draw=draw)  # fmt: skip

@@ -13,7 +13,7 @@ from trilane.apps.check.port_types import port_types, read_networks
 from trilane.apps.explain.explained_run import open_journal
 from trilane.apps.predict.predict_options import PredictOptions
 from trilane.apps.predict.predicted_verdict import pipeline_verdict
-from trilane.apps.run.report import read_report
+from trilane.apps.run.report import REPORT_FILE, read_report
 from trilane.apps.run.verdict import Trust, trust_of
 from trilane.errors import BadInputError
 from trilane.hw_profiles.graph_file import GraphFile
@@ -168,7 +168,7 @@ def _trust_in(folder: Path) -> Trust:
 
     Raises BadInputError if the report cannot be read.
     """
-    return trust_of(read_report(folder).as_json() if (folder / "report.json").exists() else {})
+    return trust_of(read_report(folder).as_json() if (folder / REPORT_FILE).exists() else {})
 
 
 def _with_share(file: PipelineFile, measured: MeasuredStages) -> PipelineFile:

@@ -22,7 +22,8 @@ from trilane.units import NO_FIGURES, TARGET_FPS
 
 SCHEMA = 1
 MAX_REPORT_BYTES = 64 << 20
-EXPECTED = "a run folder or its report.json"
+REPORT_FILE = "report.json"
+EXPECTED = f"a run folder or its {REPORT_FILE}"
 
 
 class Cpu(Record):
@@ -435,7 +436,7 @@ def read_report(path: Path) -> Report:
 
     Raises BadInputError for a file that cannot be read, that has a wrong key, or that a newer Trilane wrote.
     """
-    file = path / "report.json" if path.is_dir() else path
+    file = path / REPORT_FILE if path.is_dir() else path
     try:
         if (size := require_file(file, EXPECTED)) > MAX_REPORT_BYTES:
             raise BadInputError(file, f"{size} bytes", f"a report of at most {MAX_REPORT_BYTES}")

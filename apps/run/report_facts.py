@@ -19,9 +19,8 @@ from trilane.avatars.validation import SizeLoss
 from trilane.machine import here
 from trilane.pipeline.result import RunResult
 from trilane.pipeline.run_metrics import Caps, PolicyMetrics, RunMetrics, Temperature
-from trilane.scene.tensor_budget import ALL_WORK
 from trilane.stages.config import RunConfig
-from trilane.units import COMPARED, COMPUTED, MEASURED
+from trilane.units import ALL_WORK, COMPARED, COMPUTED, MEASURED
 
 CHECKOUT: Final = Path(__file__).resolve().parents[2]
 GIT_S: Final = 5.0

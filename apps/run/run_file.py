@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any, Final, Protocol
 
 from trilane.apps.check.port_types import PortTypes, port_types, read_networks, require_weights, value_type
-from trilane.apps.run.report import write_report
+from trilane.apps.run.report import REPORT_FILE, write_report
 from trilane.apps.run.report_facts import made_facts, report_of
 from trilane.apps.run.run_files import VIDEO, join_folder, write_files
 from trilane.apps.run.run_folder import RunFolder, default_place
-from trilane.apps.run.run_job import ENDLESS, INTERRUPTED, Hooks, RunOutcome, error_of, exit_code_of, sensors
+from trilane.apps.run.run_job import ENDLESS, Hooks, RunOutcome, error_of, exit_code_of, sensors
 from trilane.errors import BadInputError, UnwrittenError
 from trilane.hw_profiles.graph_file import GraphFile, fed_inputs
 from trilane.hw_profiles.host import settings_of, usable_cores
@@ -49,6 +49,7 @@ from trilane.pipeline.run import run_pipeline
 from trilane.pipeline.stage import payload_bytes
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.placement import Place
+from trilane.signals import INTERRUPTED
 from trilane.stages.blocks.video import DEFAULT_FPS, FoundPictures, footage
 from trilane.stages.dsp.runtime import resolve
 from trilane.stages.machine_facts import machine_facts
@@ -469,7 +470,7 @@ def _run(asked: _Asked, folder: RunFolder, told: Hooks, starter: UnitStarter) ->
         options = {name: asked.options.as_json()[name] for name in ("scene", *TAKEN)}
         known = {"made": asked.made, "options": options, **written}
         report = report_of(result, config, machine=asked.machine, facts=known)
-        write_report(report, folder.work / "report.json")
+        write_report(report, folder.work / REPORT_FILE)
         place = folder.complete()
     return RunOutcome(report, place, INTERRUPTED if late.count else exit_code_of(result))
 

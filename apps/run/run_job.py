@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from trilane import machine
-from trilane.apps.run.report import Report, write_report
+from trilane.apps.run.report import REPORT_FILE, Report, write_report
 from trilane.apps.run.report_facts import avatar_report, config_facts, resolution_note, resolution_of
 from trilane.apps.run.run_folder import RunFolder
 from trilane.arrays import F64, U8, Mask
@@ -35,6 +35,7 @@ from trilane.pipeline.controls import Interrupts, RunControls
 from trilane.pipeline.result import Failure, JournalFile, RunResult
 from trilane.pipeline.unit_starter import UnitStarter
 from trilane.scheduler.policy import policy_named
+from trilane.signals import INTERRUPTED
 from trilane.stages.avatar_pipeline import run_avatar
 from trilane.stages.configure import Checked
 from trilane.stages.placing import placed
@@ -47,7 +48,6 @@ if TYPE_CHECKING:
     from trilane.avatars.bundle import Bundle
 
 BASELINE_POLICY = "sequential"
-INTERRUPTED = 130
 ENDLESS = 1_000_000_000  # frames of a watched run that no number limits: a year at 30 frames a second
 NO_VIDEO = "no video, no contact sheet and no checksum: the frames were presented without, as was asked for"
 TRUTH = "the truth: the clothed body that the avatar was trained on"
@@ -185,7 +185,7 @@ def run_to_folder(
             result = _renamed(result, folder.named)
             report = avatar_report(result, checked.config, machine=machine, baseline=baseline, facts=facts)
             _tell(report, hooks)
-            write_report(report, folder.work / "report.json")
+            write_report(report, folder.work / REPORT_FILE)
             place = folder.complete()
         return RunOutcome(report, place, INTERRUPTED if stopped or late.count else exit_code_of(result))
 

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
-from trilane.scheduler.stats import NEEDED
+from trilane.scheduler.stats import CONFIDENCE_TEXT, NEEDED
 from trilane.units import HOST_CLOCK
 
 #: Share of the cores' time. If other programs take more, the run is not trusted, and comparisons say so.
@@ -125,7 +125,7 @@ class Rate(NamedTuple):
     fps: float
     low: float | None = None
     high: float | None = None
-    share: str = "95 %"
+    share: str = CONFIDENCE_TEXT
 
 
 class LateFrames(NamedTuple):

@@ -35,6 +35,7 @@ from trilane.apps.run.verdict import Trust, trust_of
 from trilane.apps.sweep.definition import Trial, TrialClock
 from trilane.apps.sweep.store import SWEEP, Engine, TrialRecord, planned
 from trilane.errors import BadInputError, MissingPartError
+from trilane.signals import INTERRUPTED
 from trilane.stages.machine_facts import machine_facts
 
 #: The module that a trial runs; tests replace it.
@@ -44,7 +45,7 @@ END_S = 10.0
 #: A run that the machine disturbed is repeated at most so many times.
 REPEATS = 2
 #: Exit codes of a process that was ended from outside: by an interrupt, or by a signal that a defect does not cause.
-ENDED_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT, -signal.SIGHUP, 130)
+ENDED_FROM_OUTSIDE = (-signal.SIGKILL, -signal.SIGTERM, -signal.SIGINT, -signal.SIGHUP, INTERRUPTED)
 host_facts = cache(machine_facts)
 #: Resource in Ray: each machine has 1 of it, and a trial of the host clock takes 1.
 RESOURCE = "trilane_host_clock"

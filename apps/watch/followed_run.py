@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from enum import StrEnum
 from pathlib import Path
 
+from trilane.apps.run.report import REPORT_FILE
 from trilane.apps.run.run_folder import is_locked
 from trilane.errors import BadInputError, did_you_mean
 from trilane.pipeline.journal import NAME, JournalReader, Record, journal_in
@@ -56,7 +57,7 @@ class FollowedRun:
     def __init__(self, folder: Path) -> None:
         journal = journal_in(folder)
         if journal is None:
-            remedy = "an older Trilane wrote it; run the scene again" if (folder / "report.json").is_file() else ""
+            remedy = "an older Trilane wrote it; run the scene again" if (folder / REPORT_FILE).is_file() else ""
             raise BadInputError(folder, without_journal(folder), EXPECTED, remedy)
         self.folder = folder
         self.name = run_name(folder)

@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from trilane.apps.run.report import read_report
+from trilane.apps.run.report import REPORT_FILE, read_report
 from trilane.apps.run.verdict import Verdict, judged
 from trilane.apps.run.verdict_facts import facts_of, facts_so_far, verdict_of
 from trilane.apps.watch.figures import (
@@ -331,7 +331,7 @@ def _as_reported(figures: MomentFigures, folder: Path) -> MomentFigures:
 
     If `folder` has no report, return `figures` unchanged. Raises BadInputError for a report that cannot be read.
     """
-    if not (folder / "report.json").is_file():
+    if not (folder / REPORT_FILE).is_file():
         return figures
     return replace(figures, verdict=verdict_of(read_report(folder), str(folder)))
 

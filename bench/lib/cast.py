@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from trilane.arrays import BUCKET_STEP, F32, F64, U8, Floats, Shape
+from trilane.arrays import BUCKET_STEP, F32, F64, U8, Floats, Shape, to_code, to_light
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M, load_bundle
 from trilane.body.joints import Skeleton
 from trilane.scene.crop import Rect, crop_projection
@@ -278,14 +278,3 @@ def laid_over(background: U8, layers: Iterable[RasterLayer]) -> tuple[F64, F64]:
         light[part] = own[..., :3] + (1 - own[..., 3:]) * light[part]
         seen_through[part] *= 1 - own[..., 3]
     return to_code(light), 1 - seen_through
-
-
-def to_light(code: F64) -> F64:
-    """Return the linear light in 0..1 of sRGB values in 0..1, by IEC 61966-2-1."""
-    return np.asarray(np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4))
-
-
-def to_code(light: F64) -> F64:
-    """Return the sRGB values in 0..1 of linear light, by IEC 61966-2-1. Light outside of 0..1 is clipped first."""
-    light = np.clip(light, 0.0, 1.0)
-    return np.asarray(np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055))

@@ -27,6 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from trilane.files import ARRAYS
 from trilane.unexpected_value import UnexpectedValue
 
 MAX_BYTES = 256 << 20
@@ -34,7 +35,6 @@ MAX_OPERATIONS = 2_000_000
 MAX_INDEX = 1 << 32
 MAX_NAME = 200
 MAX_SIDES = 32
-ARRAYS = "save its arrays with NumPy where it was made: numpy.savez(FILE, poses=..., trans=..., mocap_frame_rate=...)"
 #: Names of numeric dtypes as NumPy writes them: byte order, kind, and number of bytes.
 _NUMBERS = re.compile(r"[<>|=]?(b1|[iu][1248]|f[248])")
 _ORDERS = ("<", ">", "|", "=")

@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.body.joints import JOINT_INDEX, JOINTS
 from trilane.errors import BadInputError
-from trilane.files import as_numbers
+from trilane.files import ARRAYS, RATE_KEYS, as_numbers
 from trilane.scene.motion.motion import ANY, REST_PELVIS, SMPL_REST_PELVIS, WORLD, RawMotion
-from trilane.scene.motion.pickled import ARRAYS, printable
+from trilane.scene.motion.pickled import printable
 from trilane.scene.motion.stored import FoundTable, contents, tables_in
 from trilane.scene.recordings import Detected
 from trilane.scene.rotations import matrix_from_rotvec, rotvec_from_matrix
@@ -153,7 +153,6 @@ class ArrayLayout:
         return (*(array.key for array in self.arrays), *(key for key in own if key))
 
 
-RATE_KEYS = ("mocap_framerate", "mocap_frame_rate", "fps", "frame_rate")
 _VIDEO = "no rate in the file, 30 frames/s assumed"
 
 #: A dict has the first layout whose needed keys it has.

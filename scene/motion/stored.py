@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from trilane.arrays import F64
 from trilane.errors import BadInputError
 from trilane.files import (
+    ARRAYS,
     PICKLE,
     as_numbers,
     npy_pickle,
@@ -27,7 +28,7 @@ from trilane.files import (
     read_npz,
     refuse_other,
 )
-from trilane.scene.motion.pickled import ARRAYS, MAX_BYTES, Foreign, StoredArray, printable, values_of
+from trilane.scene.motion.pickled import MAX_BYTES, Foreign, StoredArray, printable, values_of
 from trilane.unexpected_value import UnexpectedValue
 
 DEEPEST = 4

@@ -1,4 +1,4 @@
-"""Names for array types in annotations, sizes of tensors as text and as shape buckets, and the PSNR of pictures.
+"""Names for array types in annotations, sizes of tensors as text and as shape buckets, the PSNR and light of pictures.
 
 Rules: the name of an array type states the elements, docstrings state the shape. A tensor's shape is (height, width),
 and both sides are multiples of `BUCKET_STEP`.
@@ -73,6 +73,17 @@ LEAST_SQUARE = 1e-10
 def psnr_db(square: float) -> float:
     """Return the PSNR in dB, at most 100. `square`: mean square difference of values in 0..1."""
     return float(-10 * np.log10(max(square, LEAST_SQUARE)))
+
+
+def to_light(code: F64) -> F64:
+    """Return the linear light in 0..1 of sRGB values in 0..1, by IEC 61966-2-1."""
+    return np.asarray(np.where(code <= 0.04045, code / 12.92, ((code + 0.055) / 1.055) ** 2.4))
+
+
+def to_code(light: F64) -> F64:
+    """Return the sRGB values in 0..1 of linear light, by IEC 61966-2-1. Light outside of 0..1 is clipped first."""
+    light = np.clip(light, 0.0, 1.0)
+    return np.asarray(np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055))
 
 
 def check_side(side: int, name: str = "side") -> int:

@@ -32,7 +32,10 @@ PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff")
 _AS_BVH = "in Blender: File > Import, choose the armature, then File > Export > Motion Capture (.bvh)"
 _OTHER_3D = f"export the motion as BVH, such as {_AS_BVH}"
 _UNPACK = "unpack it and give the file inside"
-_ARRAYS = "save its arrays with NumPy: np.savez(FILE, poses=..., trans=..., mocap_frame_rate=...)"
+#: Keys of a motion's rate in files of arrays.
+RATE_KEYS = ("mocap_framerate", "mocap_frame_rate", "fps", "frame_rate")
+#: Remedy for a file whose arrays Trilane does not read.
+ARRAYS = "save its arrays with NumPy where it opens: numpy.savez(FILE, poses=..., trans=..., mocap_frame_rate=...)"
 
 
 @dataclass(frozen=True)
@@ -63,9 +66,9 @@ SIGNATURES: tuple[tuple[bytes, Signature], ...] = (
     (rb"(#[^\n]*\n|\s)*:(FULLY-SPECIFIED|version 1\.)", Signature("an ASF or AMC file", remedy=_OTHER_3D)),
     (rb"\s*<\?xml.{0,300}<COLLADA", Signature("a COLLADA file", remedy=_OTHER_3D)),
     (rb"[\x02-\x08]\x50", Signature("a C3D file", remedy="solve it to a skeleton and save that as BVH")),
-    (rb"\x80[\x02-\x05]", Signature("a Python pickle", PICKLE, _ARRAYS)),
-    (rb"\x89HDF\r\n\x1a\n", Signature("an HDF5 file", remedy=_ARRAYS)),
-    (rb"MATLAB 5\.0 MAT-file", Signature("a MATLAB file", remedy=_ARRAYS)),
+    (rb"\x80[\x02-\x05]", Signature("a Python pickle", PICKLE, ARRAYS)),
+    (rb"\x89HDF\r\n\x1a\n", Signature("an HDF5 file", remedy=ARRAYS)),
+    (rb"MATLAB 5\.0 MAT-file", Signature("a MATLAB file", remedy=ARRAYS)),
     (rb"version https://git-lfs", Signature("a Git LFS pointer, not the file itself", remedy="fetch it: git lfs pull")),
     (rb"(?i:\s*<(!doctype html|html))", Signature("a web page", remedy="download the file itself")),
     (rb"%PDF", Signature("a PDF file")),
@@ -74,7 +77,7 @@ SIGNATURES: tuple[tuple[bytes, Signature], ...] = (
     (rb"\xff\xfe|\xfe\xff", Signature("text in UTF-16", remedy="save it as UTF-8")),
     (rb"\x93NUMPY", Signature("a NumPy array (.npy)", ARRAY)),
     (rb"PK\x03\x04.{26}[^\0/]{0,120}/data\.pkl|PK\x03\x04.{26}[^\0/]{0,120}/\.format_version",
-     Signature("a file of torch.save", remedy=_ARRAYS)),
+     Signature("a file of torch.save", remedy=ARRAYS)),
     (rb"PK\x03\x04.{26}[^\0/]{0,120}\.npy", Signature("NumPy arrays (.npz)", ARRAY)),
     (rb"PK(\x03\x04|\x05\x06)", Signature("a ZIP archive", ARCHIVE, _UNPACK)),
     (rb"\x1f\x8b|BZh[1-9]1AY|\xfd7zXZ\0|7z\xbc\xaf|Rar!\x1a|\x28\xb5\x2f\xfd|.{257}ustar",

@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from types import FrameType
 from typing import NoReturn
 
+#: Exit code of a command that was interrupted.
+INTERRUPTED = 130
 #: Signals that end a command. The kernel sends SIGXCPU when a limit of CPU time is reached (`ulimit -t`).
 ENDING = (
     signal.SIGINT,

@@ -5,6 +5,7 @@ Rule: no other file repeats one of these lists or phrases.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from enum import StrEnum
 from typing import Literal, get_args
@@ -37,6 +38,24 @@ MAX_CHANNELS = CHANNELS[-1]
 #: Largest number of smaller levels of the neural texture. The fifth level of a usual texture of 512x512 has 16 texels
 #: along a side; a sixth would have too few for a body.
 MOST_TEXTURE_LEVELS = 5
+#: Sides of a tensor, as shares of the sides for which its network was trained. The smaller ones are for frames that
+#: would be late, and for error budgets.
+SIDES = (1.0, 0.75, 0.5)
+#: All the work of a stage in thousandths, such as all pixels of a tensor.
+ALL_WORK = 1000
+
+
+def work_of_side(side: float) -> int:
+    """Return the work of a scaled tensor: its pixels in thousandths of all pixels, rounded up.
+
+    `side`: factor by which each side of the tensor is scaled.
+    """
+    return math.ceil(ALL_WORK * side * side)
+
+
+#: Names of the runtimes, as a tuple and in words.
+RUNTIMES = ("ort", "openvino", "qnn", "cuda")
+RUNTIME_WORDS = either(RUNTIMES)
 #: Methods by which a network is calibrated, and the usual method.
 CALIBRATION_METHODS = ("minmax", "percentile", "entropy")
 CALIBRATION_METHOD = CALIBRATION_METHODS[0]

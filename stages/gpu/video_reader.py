@@ -30,7 +30,7 @@ import numpy as np
 from av.sidedata.sidedata import Type
 from numpy.typing import NDArray
 
-from trilane.arrays import F32, F64, U8, Shape
+from trilane.arrays import F32, F64, U8, Shape, to_code
 from trilane.errors import BadInputError
 from trilane.files import HEAD_BYTES, PICTURE, VIDEO, require_file, signature_of_head
 from trilane.scene.lens import cover
@@ -127,8 +127,7 @@ def roll_off(light: F64) -> F64:
 def _srgb() -> U8:
     """Return sRGB bytes (STEPS,). Entry i is for the light (i / (STEPS - 1)) ** 2."""
     light = (np.arange(STEPS) / (STEPS - 1)) ** 2
-    curve = np.where(light <= 0.0031308, 12.92 * light, 1.055 * np.power(light, 1 / 2.4) - 0.055)
-    return (curve * 255 + 0.5).astype(np.uint8)
+    return (to_code(light) * 255 + 0.5).astype(np.uint8)
 
 
 AHEAD = 4

@@ -1,10 +1,11 @@
-"""Sizes and shapes of tensors, by hand and by trying every pair of sides."""
+"""Sizes and shapes of tensors, by hand and by trying every pair of sides; the sRGB curve by its standard."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from trilane.arrays import checked_size, parse_shape, shape_buckets
+from trilane.arrays import checked_size, parse_shape, shape_buckets, to_code, to_light
 from trilane.unexpected_value import UnexpectedValue
 
 
@@ -40,3 +41,11 @@ def test_what_is_no_size(size: str) -> None:
     with pytest.raises(UnexpectedValue) as refused:
         shape_buckets(size)
     assert str(refused.value) == f"found {size!r}, expected HEIGHTxWIDTH such as 256x256"
+
+
+def test_light_and_code_are_srgb() -> None:
+    """IEC 61966-2-1: code 10 lies on the straight part, 128 on the curve; every byte comes back."""
+    codes = np.arange(256)
+    assert to_light(np.array([10 / 255, 128 / 255])) == pytest.approx([0.00303527, 0.21586050], abs=1e-8)
+    assert np.array_equal(np.rint(to_code(to_light(codes / 255.0)) * 255), codes)
+    assert to_code(np.array([-0.1, 1.1])) == pytest.approx([0, 1])

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from trilane.pipeline import file_keys
 from trilane.stages.dsp.runtime import RUNTIMES
 from trilane.stages.machine_facts import OPTIONAL_PACKAGES
+from trilane.units import RUNTIMES as NAMES
 
 PROJECT = tomllib.loads((Path(__file__).resolve().parents[2] / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 
@@ -21,5 +21,5 @@ def test_an_optional_package_comes_with_the_extra_that_is_named(package: str) ->
     assert any(line.startswith(package) for line in wanted), wanted
 
 
-def test_a_pipeline_file_knows_every_runtime() -> None:
-    assert set(file_keys.RUNTIMES) == {*RUNTIMES}
+def test_every_runtime_is_named_where_people_choose() -> None:
+    assert set(NAMES) == {*RUNTIMES}

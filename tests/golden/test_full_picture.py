@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from trilane.arrays import F32, F64
+from trilane.arrays import F32, F64, to_light
 from trilane.avatars.bundle import CLOTHES_STANDOFF_M
 from trilane.bench.lib import full_picture
-from trilane.bench.lib.cast import Box, Cast, RasterLayer, blended, premultiplied, to_light
+from trilane.bench.lib.cast import Box, Cast, RasterLayer, blended, premultiplied
 from trilane.bench.lib.full_picture import SAMPLES, FullPictures, true_pictures
 from trilane.bench.lib.stage_chain import AvatarFrames
 from trilane.body.body import load_body

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from trilane.arrays import F64, U8, Shape
-from trilane.avatars.bundle import bundle_folder
+from trilane.avatars.bundle import CAPTURE, bundle_folder
 from trilane.body.body import Body, ShapedBody, load_body
 from trilane.body.joints import JOINTS, LEFT_HAND, MAX_VALUE, POSE_SIZE, RIGHT_HAND, rodrigues
 from trilane.errors import BadInputError
@@ -25,7 +25,6 @@ from trilane.training.capture.capture_file import (
     A_ROTATION,
     FRAME,
     MASK,
-    NAME,
     NO_ROTATION,
     CaptureFile,
     Fault,
@@ -238,7 +237,7 @@ class _Opening:
         if missing:
             among = f" among the {len(seen)} with fits that could be read" if len(seen) < frames else ""
             found = f"no frame that shows the {', the '.join(missing)}{among}"
-            remedy = f"film it too; or, if it will never be seen, write missing_views = {missing} in {NAME}"
+            remedy = f"film it too; or, if it will never be seen, write missing_views = {missing} in {CAPTURE}"
             self.faults.append(Fault(self.file.fits, found, "frames of all four sides", remedy))
 
 

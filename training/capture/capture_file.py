@@ -18,6 +18,7 @@ from PIL import Image
 from pydantic import Field, ValidationError, field_validator
 
 from trilane.arrays import F64, MAX_SIDE, U8, Shape
+from trilane.avatars.bundle import CAPTURE
 from trilane.errors import BadInputError, did_you_mean, reason
 from trilane.files import read_text
 from trilane.scene.lens import Lens
@@ -77,7 +78,6 @@ def _names(places: list[str]) -> str:
     return ", ".join(places[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
-NAME = "capture.toml"
 EXPECTED = "a capture file (TOML): docs/captures.md"
 NEAR_M, FAR_M = 0.05, 100.0
 Side = Literal["front", "left", "back", "right"]
@@ -175,7 +175,7 @@ def read_capture_file(folder: Path) -> CaptureFile:
 
     Raises BadInputError for a file that is missing or no TOML, and FaultyCaptureError with every defect of the keys.
     """
-    path = folder / NAME
+    path = folder / CAPTURE
     try:
         values = tomllib.loads(read_text(path, EXPECTED))
     except tomllib.TOMLDecodeError as error:
@@ -188,7 +188,7 @@ def read_capture_file(folder: Path) -> CaptureFile:
 
 def _fault(details: dict[str, Any]) -> Fault:
     """Return the fault for `details`, one of the `errors()` of a pydantic ValidationError."""
-    where = f"{NAME}: {'.'.join(map(str, details['loc']))}"
+    where = f"{CAPTURE}: {'.'.join(map(str, details['loc']))}"
     if details["type"] == "missing":
         return Fault(where, "nothing", "a value", "add the key")
     if details["type"] == "extra_forbidden":

@@ -17,11 +17,12 @@ import numpy as np
 from PIL import Image, ImageFilter
 
 from trilane.arrays import F64, U8, Floats, Shape
+from trilane.avatars.bundle import CAPTURE
 from trilane.body.body import ShapedBody
 from trilane.body.joints import JOINTS, LEFT_HAND, RIGHT_HAND, rodrigues
 from trilane.scene.lens import Lens, centred
 from trilane.scene.rotations import rotvec_from_matrix
-from trilane.training.capture.capture_file import FAR_M, NAME, NEAR_M, OPENGL_FROM_OPENCV
+from trilane.training.capture.capture_file import FAR_M, NEAR_M, OPENGL_FROM_OPENCV
 from trilane.training.clothing import DEFAULT_NAME, look_named
 from trilane.training.random_views import look_at, random_pose
 from trilane.training.sample_renderer import SampleRenderer
@@ -193,9 +194,9 @@ def write_capture(folder: Path, capture: SyntheticCapture, recipe: Recipe) -> It
     """Write the capture of `recipe` to the empty `folder`, and yield the number of each written frame."""
     for part in ("frames", "masks", "fits", *((f"{TRUTH}/masks", f"{TRUTH}/fits") if recipe.is_noisy else ())):
         (folder / part).mkdir(parents=True)
-    (folder / NAME).write_text(capture_text(recipe, "frames"), encoding="utf-8")
+    (folder / CAPTURE).write_text(capture_text(recipe, "frames"), encoding="utf-8")
     if recipe.is_noisy:
-        (folder / TRUTH / NAME).write_text(capture_text(recipe, "../frames"), encoding="utf-8")
+        (folder / TRUTH / CAPTURE).write_text(capture_text(recipe, "../frames"), encoding="utf-8")
     for number in range(recipe.frames):
         exact = capture.frame(number)
         Image.fromarray(exact.frame).save(folder / "frames" / f"{number:06}.png", compress_level=FAST_PNG)

@@ -26,17 +26,14 @@ from onnx import TensorProto, helper, numpy_helper
 from trilane.arrays import F32, U8
 from trilane.avatars.network_file import LAYERS, NetworkFile
 from trilane.errors import BadInputError
+from trilane.stages.dsp.ort import ERRORS_ONLY, PROVIDER
 from trilane.training.quantising.calibration import MOVES, SHARING
 from trilane.training.quantising.quantise import Quantised
 
 #: Number of pictures with random rounding errors from which the bound is computed.
 DRAWS = 16
-#: Probability that a further picture with random rounding errors has an error above the bound.
-RISK = 0.001
-#: Student's t with `DRAWS` - 1 degrees of freedom exceeds this value with the probability `RISK`.
+#: Student's t with `DRAWS` - 1 degrees of freedom exceeds this value with the probability 0.001.
 STUDENT_T = 3.7328
-PROVIDERS = ["CPUExecutionProvider"]
-ERRORS_ONLY = 3
 PICTURE = 255
 #: Operators whose output consists of multiples of a step if their inputs do.
 KEEPS_STEPS = (*SHARING, "Relu", "Identity")
@@ -96,7 +93,7 @@ def float_picture(model: onnx.ModelProto, quantised: Quantised, tensor: U8) -> F
 def predicted_bound(model: NoiseModel, wanted: F32, tensor: U8, seed: int = 0) -> tuple[float, float]:
     """Return (expected mean absolute error of the picture, bound of this error), in steps of 1/255.
 
-    The error of a further draw exceeds the bound with the probability `RISK`: bound = m + t s sqrt(1 + 1/n). Here m is
+    The error of a further draw exceeds the bound with the probability 0.001: bound = m + t s sqrt(1 + 1/n). Here m is
     the mean and s the standard deviation of n = `DRAWS` draws, and t = `STUDENT_T`.
 
     `wanted`: float network's picture (N, H, W, 4), in 0..255.
@@ -246,7 +243,7 @@ def session(model: onnx.ModelProto) -> Any:
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = ERRORS_ONLY
     settings.intra_op_num_threads = 1
-    return onnxruntime.InferenceSession(model.SerializeToString(), settings, providers=PROVIDERS)
+    return onnxruntime.InferenceSession(model.SerializeToString(), settings, providers=[PROVIDER])
 
 
 # The noise model of an ideal quantiser, whose steps follow from the float network and the input, not from the real
@@ -405,7 +402,7 @@ def _outputs(model: onnx.ModelProto, feed: NDArray[Any], names: list[str]) -> di
     opened.graph.output.extend(helper.make_tensor_value_info(name, TensorProto.FLOAT, None) for name in names)
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = ERRORS_ONLY
-    session = onnxruntime.InferenceSession(opened.SerializeToString(), settings, providers=PROVIDERS)
+    session = onnxruntime.InferenceSession(opened.SerializeToString(), settings, providers=[PROVIDER])
     values = session.run(names, {session.get_inputs()[0].name: feed})
     return dict(zip(names, values, strict=True))
 

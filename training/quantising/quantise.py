@@ -31,6 +31,7 @@ from trilane.arrays import F32, psnr_db
 from trilane.avatars.network_file import FLOAT_LAYERS_KEY, NetworkFile, check_network, constants_of
 from trilane.errors import BadInputError
 from trilane.hw_profiles.governor import figure_for
+from trilane.stages.dsp.ort import ERRORS_ONLY, PROVIDER
 from trilane.training.quantising.calibration import (
     CannotRoundAlikeError,
     limit_logits,
@@ -404,8 +405,6 @@ TIE_DB = 0.1
 COUNTS = (5, 10, 50, 100)
 #: Default number of frames, at the end of all frames, on which the error is measured.
 EVALUATED = 5
-PROVIDERS = ["CPUExecutionProvider"]
-ERRORS_ONLY = 3
 
 
 def calibration_table(
@@ -470,7 +469,7 @@ def _session(model: onnx.ModelProto) -> Any:
     """Return a function that runs the network: it takes the only input array and returns the only output array."""
     settings = onnxruntime.SessionOptions()
     settings.log_severity_level = ERRORS_ONLY
-    session = onnxruntime.InferenceSession(model.SerializeToString(), settings, providers=PROVIDERS)
+    session = onnxruntime.InferenceSession(model.SerializeToString(), settings, providers=[PROVIDER])
     name = session.get_inputs()[0].name
     return lambda feed: session.run(None, {name: feed})[0]
 

@@ -11,7 +11,7 @@ const PICTURE_HEADER_BYTES = 21;
 const encoder = new TextEncoder();
 const decoder = new TextDecoder();
 
-export function token() {
+function token() {
   return new URLSearchParams(location.search).get("token") ?? "";
 }
 
@@ -21,7 +21,7 @@ export function withToken(path) {
 }
 
 // Returns a binary message as {json} or {picture: {frame, mediaMs, ageMs, jpeg}}; null for an unknown kind.
-export function parse(buffer) {
+function parse(buffer) {
   const view = new DataView(buffer);
   if (view.byteLength > 0 && view.getUint8(0) === JSON_KIND) {
     return { json: JSON.parse(decoder.decode(new Uint8Array(buffer, 1))) };

@@ -9,7 +9,7 @@ const BYTES = ["read", "written", "uploaded", "read_back", "least"];
 const LONG_TEXT = 24;
 
 // Returns a text such as "PSNR 30.6 dB, worst frame 19.5 dB (source)" for each avatar, or why there is no figure.
-export function errorText(accuracy) {
+function errorText(accuracy) {
   const avatars = Object.entries(accuracy ?? {});
   if (avatars.length === 0) return "not known: the run does not say how exact its avatar is";
   return avatars.map(([name, facts]) => `${avatars.length > 1 ? `${name}: ` : ""}${oneError(facts)}`).join("; ");

@@ -3,7 +3,7 @@
 import { SliceRing } from "./ring.js";
 
 // A unit with two stages at 60 frames a second has so many jobs in more than two minutes.
-export const SLICES_PER_UNIT = 16384;
+const SLICES_PER_UNIT = 16384;
 export const CAUSE_MEANINGS = {
   starved: "no input",
   blocked: "no free slot behind, or as many frames in flight as may be",

@@ -38,7 +38,7 @@ function changed() {
   for (const listener of listeners) listener();
 }
 
-export function chooseTheme(theme) {
+function chooseTheme(theme) {
   if (theme === "system") delete root.dataset.theme;
   else root.dataset.theme = theme;
   try {

@@ -413,7 +413,7 @@ export class Timeline {
 }
 
 // Returns a round length of time that fits into `span` at most `most` times.
-export function tickStep(span, most) {
+function tickStep(span, most) {
   let unit = 0.1;
   for (;;) {
     for (const times of TICKS) if (span / (unit * times) <= Math.max(most, 1)) return unit * times;

@@ -122,7 +122,7 @@ def test_what_ends_a_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     queries.wait()
     assert len(queries.answered_s) == 2
     queries.unanswered({"a:late": 2, "b": 1})
-    cause = r"^frames of queries were dropped or lost \(a:late 2, b 1\), and every query must be answered: single"
+    cause = r"^frames of queries were dropped or lost \(a:late 2, b 1\), and every query must be answered: a single"
     with pytest.raises(TrilaneError, match=cause):
         queries.wait()
 

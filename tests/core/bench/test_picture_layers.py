@@ -17,8 +17,6 @@ from trilane.bench.lib.cast import (
     placed,
     premultiplied,
     shrunk,
-    to_code,
-    to_light,
 )
 from trilane.bench.lib.full_picture import fineness
 from trilane.scene.crop import Rect
@@ -75,13 +73,6 @@ def test_the_tensor_is_as_near_to_the_area_of_the_network_as_whole_pixels_allow(
     for other in (*range(1, 9), *(Fraction(1, n) for n in range(2, 9))):
         there = shape[0] * shape[1] * other**2
         assert got <= max(there, area) / min(there, area)
-
-
-def test_light_and_code_are_srgb() -> None:
-    """IEC 61966-2-1: code 10 lies on the straight part, 128 on the curve; every byte comes back."""
-    assert to_light(np.array([10 / 255, 128 / 255])) == pytest.approx([0.00303527, 0.21586050], abs=1e-8)
-    assert np.array_equal(np.rint(to_code(to_light(CODES / 255.0)) * 255), CODES)
-    assert to_code(np.array([-0.1, 1.1])) == pytest.approx([0, 1])
 
 
 def test_half_of_white_over_black_is_half_the_light() -> None:

@@ -524,14 +524,12 @@ def test_the_bound_is_reached_where_one_joint_turns_half_round(shaped: ShapedBod
     assert np.linalg.norm(whole - fewer) == pytest.approx(0.05 * 2 * 0.3, rel=1e-5)
 
 
-def test_a_motion_is_said_to_be_one(tmp_path: Path) -> None:
-    arrays = {"poses": np.zeros((2, 156)), "trans": np.zeros((2, 3)), "mocap_framerate": np.array(60.0)}
-    np.savez(tmp_path / "m.npz", **arrays)
+@pytest.mark.parametrize("keys", ["mocap_framerate, poses, trans", "fps, trans"])
+def test_a_motion_is_said_to_be_one(tmp_path: Path, keys: str) -> None:
+    np.savez(tmp_path / "m.npz", **dict.fromkeys(keys.split(", "), np.zeros(1)))
     with pytest.raises(BadInputError) as raised:
         load_body(tmp_path / "m.npz")
-    assert raised.value.remedy == (
-        "arrays that were found: mocap_framerate, poses, trans: a motion, which `trilane run --motion` takes"
-    )
+    assert raised.value.remedy == f"arrays that were found: {keys}: a motion, which `trilane run --motion` takes"
     np.savez(tmp_path / "m.npz", **{f"a{k:02}": np.zeros(1) for k in range(18)})
     with pytest.raises(BadInputError) as raised:
         load_body(tmp_path / "m.npz")

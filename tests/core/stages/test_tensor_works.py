@@ -20,11 +20,12 @@ from trilane.avatars.validation import SizeLoss, _losses, curve_of, psnr_at, siz
 from trilane.errors import BadInputError
 from trilane.scene.crop import Rect
 from trilane.scene.schema import Scene
-from trilane.scene.tensor_budget import TensorBudget, work_of_side
+from trilane.scene.tensor_budget import TensorBudget
 from trilane.stages.config import RunConfig
 from trilane.stages.configure import configure
 from trilane.stages.foresee import tensor_works
 from trilane.stages.run_options import RunOptions
+from trilane.units import work_of_side
 
 ALL = (1000, 563, 250)
 LOSS = SizeLoss("from somewhere", {1000: 0.0, 562: 1.0, 250: 3.0})

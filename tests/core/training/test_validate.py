@@ -336,16 +336,6 @@ def test_a_part_of_the_tensor_is_read_where_it_lies() -> None:
     assert (part == picture[:4, 2:]).all()
 
 
-def test_light_is_linear_between_its_ends() -> None:
-    """IEC 61966-2-1: linear below 0.04045, and both ways undo each other."""
-    encoded = np.linspace(0, 1, 1001)
-    linear = validate._linear(encoded)
-    assert linear[[0, 1000]].tolist() == [0.0, 1.0]
-    assert linear[40] == pytest.approx(0.04 / 12.92) and linear[500] == pytest.approx(0.2140411, rel=1e-6)
-    assert validate._encoded(linear) == pytest.approx(encoded, abs=2e-7)
-    assert validate._encoded(np.array([0.003])) == pytest.approx([0.03876])
-
-
 # Sheets of pictures side by side: which samples, in which order, how large, before what.
 
 #: Height and width of a cell.

@@ -279,6 +279,7 @@ def test_the_page_escapes_and_asks_nobody() -> None:
     assert "http:" not in text.replace("http://www.w3.org", "")
     assert "https:" not in text
     assert "1 of 2 have no speed or no known error" in text
+    assert text.count("prefers-color-scheme: dark") == 1
 
 
 def test_the_page_names_the_knee_first() -> None:

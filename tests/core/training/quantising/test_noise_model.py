@@ -15,7 +15,6 @@ from onnx import TensorProto, helper, numpy_helper
 from trilane.errors import BadInputError
 from trilane.training.quantising.noise_model import (
     DRAWS,
-    RISK,
     STUDENT_T,
     NoiseModel,
     float_picture,
@@ -166,7 +165,7 @@ def test_student_t_is_exceeded_with_the_stated_risk():
     u = (np.arange(100000) + 0.5) / 100000
     x = STUDENT_T + u / (1 - u)
     density = factor * (1 + x**2 / degrees) ** (-(degrees + 1) / 2) / (1 - u) ** 2
-    assert density.mean() == pytest.approx(RISK, rel=1e-3)
+    assert density.mean() == pytest.approx(0.001, rel=1e-3)
 
 
 @pytest.fixture(scope="module")
