@@ -29,6 +29,7 @@ from trilane.files import require_file, signature_of
 #: Metadata key of the file: a JSON list of the names of layers that were left in float on purpose.
 FLOAT_LAYERS_KEY = "trilane.float_layers"
 MAX_BATCH = 64
+LEAST_IR = 4  # first version of ONNX in which an initializer need not be an input
 MAX_CHANNELS = 64
 #: Operators that take most of the time and must run in integers.
 LAYERS = ("Conv", "ConvTranspose", "Gemm")
@@ -169,6 +170,7 @@ def check_network(model: onnx.ModelProto, where: str) -> NetworkFile:
     inputs = [value for value in graph.input if value.name not in constants]
     del graph.input[:]
     graph.input.extend(inputs)
+    model.ir_version = max(model.ir_version, LEAST_IR)
     shape = _check_input(model, where)
     _check_output(model, where, shape)
     for node in graph.node:

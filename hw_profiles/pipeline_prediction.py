@@ -137,9 +137,9 @@ def measured_price(file: PipelineFile, name: str, measured: MeasuredStages) -> S
     try:
         time = measured.times[name].times(factor)
     except ValidationError:
-        found = f"{factor:g} times {measured.times[name].mean_ms:g} ms"
+        found = f"a factor of {factor:g} for times around {measured.times[name].mean_ms:g} ms"
         where = f"{file.path}: stages.{name}.scale.{measured.chip}"
-        raise BadInputError(where, found, f"a time of at most {LONGEST_MS:g} ms") from None
+        raise BadInputError(where, found, f"no time above {LONGEST_MS:g} ms in the result") from None
     source = f"measured in {measured.run}" + (f", times {factor:g}" if measured.chip != HOST else "")
     return StagePrice(time, source, *interval_around(time.mean_ms, MODEL_ERROR), is_measured=True)
 

@@ -381,4 +381,9 @@ def file_text(tables: Mapping[str, Any], comments: Sequence[str] = ()) -> str:
 def _value(value: object) -> str:
     if isinstance(value, Mapping):
         return "{ " + ", ".join(f"{key} = {_value(each)}" for key, each in value.items()) + " }"
+    return quoted(value)
+
+
+def quoted(value: object) -> str:
+    """Return a text, a number, a boolean or a list of them as TOML writes it."""
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")  # JSON leaves it as it is

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import math
-import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -41,7 +40,7 @@ LEAST_FPS = 1e-3  # far below that, a period in nanoseconds overflows
 LONGEST_S = 1e6  # longest motion, seconds
 FARTHEST_M = 1e4  # farthest coordinate of an avatar, metres; there float32 still resolves millimetres
 
-NAME, NO_NAME, LONGEST_NAME = r"^[\w .-]+$", r"[^\w .-]", 80
+NAME, LONGEST_NAME = r"^[\w .-]+$", 80
 
 LISTED = Strict(strict=False)  # lets a list of the file become a tuple
 Finite = Annotated[float, Field(allow_inf_nan=False)]
@@ -492,7 +491,8 @@ def load_scene(path: Path) -> dict[str, Any]:
         values = tomllib.loads(read_text(path, "a scene file (TOML)"))
     except (ValueError, RecursionError) as error:  # raised also for numbers and lists that are too long
         raise BadInputError(path, f"no valid TOML ({error})", "a scene file (TOML)") from None
-    values.setdefault("name", re.sub(NO_NAME, "-", path.stem)[:LONGEST_NAME])
+    named = "".join(each if each.isalpha() or each.isdecimal() or each in "_ .-" else "-" for each in path.stem)
+    values.setdefault("name", named[:LONGEST_NAME])
     scene = scene_from(path, values)
     base = path.absolute().parent
     values["background"] = located(scene.background, base)

@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from functools import partial
 from itertools import count
-from json import dumps
 from pathlib import Path
 
 import av
@@ -19,7 +17,7 @@ import av
 from trilane.apps.check.port_types import NETWORK_CHANNELS, port_types, read_networks, require_weights, value_type
 from trilane.errors import BadInputError, TrilaneError
 from trilane.hw_profiles.graph_file import fed_inputs, read_graph
-from trilane.pipeline.description import LONGEST_NAME
+from trilane.pipeline.description import LONGEST_NAME, quoted
 from trilane.pipeline.file_keys import PortType
 from trilane.pipeline.pipeline_file import read_pipeline
 from trilane.stages.gpu.video_reader import open_video, require_video
@@ -28,9 +26,6 @@ from trilane.writing import write_bytes
 A_VIDEO = "a video that PyAV reads"
 LONGEST_ENDING = len("-video")  # longest text that is added to a network's name in the name of a stage
 ON_A_CHIP = "on a chip, each block but discard needs time_ms = MS, or scale = { CHIP = FACTOR } and --measured RUN"
-
-#: Function that returns a text in TOML's quotes. TOML has no surrogate pairs, which JSON writes for rare characters.
-_quoted = partial(dumps, ensure_ascii=False)
 
 
 def write_new_file(
@@ -93,17 +88,17 @@ def _branch(
     prepared = [name + ending for ending in endings]
     lines = []
     for stage, port in zip(prepared, inputs, strict=True):
-        of = f", port = {_quoted(port)}" if len(inputs) > 1 else ""
+        of = f", port = {quoted(port)}" if len(inputs) > 1 else ""
         lines.append(f'{stage} = {{ block = "prepare", unit = "cpu", in = "camera", like = "{name}"{of} }}')
     reads = f'"{prepared[0]}"'
     if len(inputs) > 1:
-        reads = "{ " + ", ".join(f'{_quoted(p)} = "{s}"' for s, p in zip(prepared, inputs, strict=True)) + " }"
+        reads = "{ " + ", ".join(f'{quoted(p)} = "{s}"' for s, p in zip(prepared, inputs, strict=True)) + " }"
     open_sizes = {port: "x".join(map(str, shapes[port])) for port in inputs if port in shapes}
-    known = ", ".join(f"{_quoted(port)} = {_quoted(sizes)}" for port, sizes in open_sizes.items())
+    known = ", ".join(f"{quoted(port)} = {quoted(sizes)}" for port, sizes in open_sizes.items())
     given = f", shapes = {{ {known} }}" if known else ""
     lines.append(f'{name} = {{ onnx = {_inside(network, folder)}, unit = "{unit}", in = {reads}{given} }}')
     first = graph.model.graph.output[0]
-    found = _quoted(f"{name}.{first.name}")
+    found = quoted(f"{name}.{first.name}")
     lines.append(f'{name}-out = {{ block = "discard", unit = "cpu", in = {found} }}')
     return lines + [f"# {line}" for line in _video_of(name, found, value_type(first))]
 
@@ -166,7 +161,7 @@ def _inside(path: Path, folder: Path) -> str:
     if not absolute.is_relative_to(folder):
         remedy = f"write the file into {absolute.parent}, or put a link to {path.name} into {folder}"
         raise BadInputError(path, f"a file outside of {folder}", "one in the folder of the pipeline file", remedy)
-    return _quoted(absolute.relative_to(folder).as_posix())
+    return quoted(absolute.relative_to(folder).as_posix())
 
 
 def _video(path: Path) -> tuple[int, int, float]:

@@ -111,7 +111,9 @@ def spinner(text: str) -> Iterator[None]:
     if not console.is_terminal:
         yield
         return
-    with console.status(text):
+    from rich.text import Text
+
+    with console.status(Text(text)):
         yield
 
 

@@ -273,17 +273,21 @@ def accuracy_line(name: str, facts: Mapping[str, Any]) -> str:
     source = facts.get("source", NO_FIGURES)
     if source == NO_FIGURES:
         return f"avatar {name}: {NO_FIGURES} of accuracy: {facts.get('why', UNSAID)}"
-    bands = ", ".join(f"{band} {value:.1f}" for band, value in facts["psnr_db_by_band"].items())
+    bands = ", ".join(f"{band} {value:.1f}" for band, value in facts.get("psnr_db_by_band", {}).items())
     body = f"; of the body alone {facts['body_psnr_db']:.1f}" if "body_psnr_db" in facts else ""
+    inside = (
+        f"; {facts['see_through']:.1%} of the inside lets more than a tenth through" if "see_through" in facts else ""
+    )
+    mask = f"; mask IoU {facts['iou']:.3f}" if "iou" in facts else ""
+    place = f", on {facts['runtime']} at tensor size {facts['size']}" if {"runtime", "size"} <= {*facts} else ""
     return (
-        f"avatar {name}: PSNR on held-out views before random backgrounds, dB: {bands}{body}{_worst(facts)}; "
-        f"{facts['see_through']:.1%} of the inside lets more than a tenth through; mask IoU {facts['iou']:.3f} "
-        f"({source}, on {facts['runtime']} at tensor size {facts['size']})"
+        f"avatar {name}: PSNR on held-out views before random backgrounds, dB: {bands or facts['psnr_db']}"
+        f"{body}{_worst(facts)}{inside}{mask} ({source}{place})"
     )
 
 
 def _worst(facts: Mapping[str, Any]) -> str:
-    if "worst" not in facts:
+    if not {"worst", "samples", "by_seed"} <= {*facts}:
         return ""
     return f"; worst of {facts['samples']} views (seeds {', '.join(facts['by_seed'])}) {facts['worst']['psnr_db']:.1f}"
 

@@ -172,7 +172,7 @@ def compared_run(
 def _refused(where: str, error: ValidationError, expected: str) -> BadInputError:
     first = error.errors()[0]
     key = ".".join(str(part) for part in first["loc"])
-    return BadInputError(f"{where}{key}".rstrip(".: "), first["msg"].lower(), expected)
+    return BadInputError(f"{where}{key}".rstrip(".: "), first["msg"].lower().removeprefix("value error, "), expected)
 
 
 @dataclass(frozen=True)

@@ -239,9 +239,10 @@ class _RunPictures:
         self._fps = fps
         self._container: Any = None
         with suppress(OSError, av.error.FFmpegError, IndexError):  # the run was not recorded, or has no pictures
-            container = open_video(path)
-            self._stream: Any = container.streams.video[0]
-            self._container = container
+            self._container = open_video(path)
+            self._stream: Any = self._container.streams.video[0]
+            return
+        self.close()
 
     @property
     def is_missing(self) -> bool:
@@ -263,11 +264,12 @@ class _RunPictures:
                     break
                 newest = picture
             return None if newest is None else jpeg_of(newest.to_image())
-        return None
+        return None  # the video is damaged at this frame
 
     def close(self) -> None:
         if self._container is not None:
             self._container.close()
+            self._container = None
 
 
 class _Piece(NamedTuple):

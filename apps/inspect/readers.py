@@ -31,7 +31,7 @@ from trilane.avatars.network_file import read_network
 from trilane.body.body import ShapedBody, load_body
 from trilane.body.joints import Skeleton
 from trilane.errors import BadInputError, reason
-from trilane.files import read_bytes, read_npz, read_text
+from trilane.files import HEAD_BYTES, read_bytes, read_npz, read_text
 from trilane.hw_profiles.graph_file import read_graph
 from trilane.hw_profiles.profile_files import load_profile
 from trilane.pipeline.journal import NAME as JOURNAL
@@ -220,10 +220,15 @@ def inspect_trace(path: Path) -> Inspection:
 
 
 def _trace_events(path: Path) -> int:
-    try:
-        document: Any = json.loads(read_text(path, "a trace in Chrome's format"))
-    except (BadInputError, ValueError, RecursionError):
+    with path.open("rb") as file:
+        is_json = file.read(HEAD_BYTES).lstrip()[:1] in (b"{", b"[")
+    if not is_json:
         return _packets(path)
+    expected = "a trace in Chrome's format"
+    try:
+        document: Any = json.loads(read_text(path, expected))
+    except (ValueError, RecursionError) as error:
+        raise BadInputError(path, str(error), expected) from None
     events = document.get("traceEvents") if isinstance(document, dict) else None
     if not isinstance(events, list):
         raise BadInputError(f"{path}: traceEvents", type(events).__name__, "a list of events")

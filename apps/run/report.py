@@ -7,6 +7,7 @@ image error of its avatars.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -298,23 +299,33 @@ class VerdictFacts(Record):
 OptionValue = str | int | float | bool | tuple[str, ...] | None
 
 
-class _Avatar(Model, extra="allow"):
+class _Part(Model, extra="allow", strict=True, allow_inf_nan=False):
+    """Base class of the parts of a report that are checked, but stay as they are in the file."""
+
+
+class _Avatar(_Part):
     bundle: str
 
 
-class _Scene(Model, extra="allow"):
+class _Output(_Part):
+    width: int = Field(default=1, ge=1)
+    height: int = Field(default=1, ge=1)
+
+
+class _Scene(_Part):
     """The keys of a scene that a verdict and the dashboard read."""
 
     name: str
-    fps: float = Field(default=TARGET_FPS, gt=0, allow_inf_nan=False)
-    avatars: tuple[_Avatar, ...] = ()
+    fps: float = Field(default=TARGET_FPS, gt=0)
+    output: _Output | None = None
+    avatars: list[_Avatar] = Field(default=[])
 
 
-class _WorstView(Model, extra="allow"):
+class _WorstView(_Part):
     psnr_db: float | None = None
 
 
-class _Accuracy(Model, extra="allow", allow_inf_nan=False):
+class _Accuracy(_Part):
     """The keys of an avatar's accuracy that a verdict reads."""
 
     source: str = NO_FIGURES
@@ -329,13 +340,29 @@ class _Accuracy(Model, extra="allow", allow_inf_nan=False):
         return self
 
 
-def _refuse_other(model: type[Model], key: str, value: Any) -> None:
-    """Raise ValueError, which names the key inside `key`, if `value` does not have the form of `model`."""
+class _WrongPartError(ValueError):
+    """A wrong value inside a part. `key`: path to the value. `found`: sentence part."""
+
+    def __init__(self, key: tuple[str | int, ...], found: str) -> None:
+        super().__init__(f"{'.'.join(map(str, key))}: {found}")
+        self.key, self.found = key, found
+
+
+def _refuse_other(part: type[_Part], key: str, value: Any) -> None:
+    """Raise _WrongPartError if `value`, which stands at `key`, does not have the form of `part`."""
+    if not isinstance(value, dict):
+        raise _WrongPartError((key,), "no table of keys and values")
     try:
-        model.model_validate(value)
+        part.model_validate(value)
     except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        raise ValueError(f"{'.'.join(map(str, (key, *first['loc'])))}: {first['msg']}") from None
+        first = error.errors()[0]
+        raise _WrongPartError((key, *first["loc"]), _found(first)) from None
+
+
+def _found(details: Mapping[str, Any]) -> str:
+    """Return what is wrong with a value, in words. `details`: one of the `errors()` of a pydantic ValidationError."""
+    cause = details.get("ctx", {}).get("error")
+    return cause.found if isinstance(cause, _WrongPartError) else str(cause or details["msg"].lower())
 
 
 class Preamble(Record):
@@ -447,8 +474,10 @@ def read_report(path: Path) -> Report:
         raise BadInputError.of_os_error(file, error, EXPECTED) from None
     except ValidationError as error:
         first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"]) or "the document"
-        raise BadInputError(f"{file}: {key}", first["msg"].lower(), EXPECTED) from None
+        cause = first.get("ctx", {}).get("error")
+        inside = cause.key if isinstance(cause, _WrongPartError) else ()
+        key = ".".join(map(str, (*first["loc"], *inside))) or "the document"
+        raise BadInputError(f"{file}: {key}", _found(first), EXPECTED) from None
     except ValueError as error:
         raise BadInputError(f"{file}: the document", str(error), EXPECTED) from None
 

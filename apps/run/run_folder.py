@@ -209,6 +209,8 @@ def is_locked(folder: Path) -> bool:
         fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
     except BlockingIOError:
         return True
+    except OSError:  # a file system without locks: no run of this machine is there
+        return False
     finally:
         os.close(fd)
     return False

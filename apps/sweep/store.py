@@ -22,7 +22,7 @@ from typing import Any, Literal, Self
 from pydantic import Field, StrictFloat, StrictInt
 from pydantic_core import from_json
 
-from trilane.apps.sweep.definition import Trial
+from trilane.apps.sweep.definition import MOST_TRIALS, Trial
 from trilane.errors import BadInputError, reason
 from trilane.pipeline.run_metrics import Record
 from trilane.units import HOST_CLOCK
@@ -31,8 +31,9 @@ from trilane.writing import WRITABLE, write_bytes
 SWEEP, TRIALS, LOCK = "sweep.json", "trials.jsonl", ".lock"
 #: Seconds to wait for the trials of a killed sweep to end: they hold its lock until then.
 LOCK_S = 15.0
-MAX_TRIALS_BYTES = 256 << 20
+MAX_TRIALS_BYTES = MOST_TRIALS << 16  # far more than the lines of all trials of the largest sweep
 TRIES = 3
+PIECE_BYTES = 1 << 30
 #: Keys of a trial in the answers of `trilane sweep` and `trilane tune`, in their order.
 ROW = ("id", "command", "options", "repeat", "status", "exit_code", "error", "seconds", "repeated", "unsure")
 
@@ -123,7 +124,8 @@ def _whole(file: int, path: Path) -> bytes:
     """Return the content of the open file `file`. Raises BadInputError, which names `path`, if it is too large."""
     if (size := os.fstat(file).st_size) > MAX_TRIALS_BYTES:
         raise BadInputError(path, f"{size} bytes", f"at most {MAX_TRIALS_BYTES}")
-    return os.pread(file, size, 0)
+    pieces = [os.pread(file, PIECE_BYTES, at) for at in range(0, size, PIECE_BYTES)]  # the kernel reads at most 2 GiB
+    return b"".join(pieces)
 
 
 def _record(line: bytes) -> TrialRecord | None:

@@ -171,7 +171,10 @@ def _numbers(where: str, value: Any, expected: str) -> F64:
     array = np.array(value, dtype=object)
     if not {type(each) for each in array.flat} <= {int, float, type(None)}:
         raise BadInputError(where, "something else than numbers", expected)
-    return array.astype(np.float64)
+    try:
+        return array.astype(np.float64)
+    except OverflowError:
+        raise BadInputError(where, "a whole number that is too large", expected) from None
 
 
 def _is_singular(matrix: NDArray[np.float64]) -> bool:

@@ -93,6 +93,7 @@ SIGNATURES: tuple[tuple[bytes, Signature], ...] = (
     (rb"\0.{3}(ftyp|moov|mdat|wide|free)", Signature("an MP4 or QuickTime video", VIDEO)),
     (rb"\x1aE\xdf\xa3", Signature("a Matroska or WebM video", VIDEO)),
     (rb"RIFF.{4}AVI ", Signature("an AVI video", VIDEO)),
+    (rb"YUV4MPEG2 ", Signature("a YUV4MPEG video", VIDEO)),
 )  # fmt: skip
 _PATTERNS = tuple((re.compile(pattern, re.DOTALL), signature) for pattern, signature in SIGNATURES)
 

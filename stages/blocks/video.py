@@ -24,7 +24,7 @@ from trilane.arrays import U8, Shape
 from trilane.errors import BadInputError
 from trilane.pipeline.stage import Arrays, PortedStage, UnitContext
 from trilane.stages.cpu.present import Segment
-from trilane.stages.gpu.background import pictures_in, read_picture
+from trilane.stages.gpu.background import is_picture, pictures_in, read_picture
 from trilane.stages.gpu.video_reader import VideoReader, open_video, require_video, video_stream
 from trilane.transport.live_window import LiveWindow
 
@@ -47,8 +47,8 @@ def footage(path: Path) -> FoundPictures:
     """Return number and rate of the pictures of a video or a folder. Raises BadInputError if `path` has no pictures."""
     if not path.exists():
         raise BadInputError(path, "no such file", EXPECTED, "put it there, or change `path`")
-    if path.is_dir():
-        return FoundPictures(len(pictures_in(path)), None)
+    if files := _pictures(path):
+        return FoundPictures(len(files), None)
     require_video(path)
     try:
         with open_video(path) as container:
@@ -60,6 +60,11 @@ def footage(path: Path) -> FoundPictures:
         raise BadInputError(path, f"no readable video ({error})", EXPECTED, "convert it to .mp4") from None
 
 
+def _pictures(path: Path) -> list[Path]:
+    """Return the pictures of a folder, or the single picture `path`; empty for a video."""
+    return pictures_in(path) if path.is_dir() else [path] if is_picture(path) else []
+
+
 class VideoStage(PortedStage):
     """Writes one picture for each frame. Raises BadInputError for a file that cannot be read."""
 
@@ -68,7 +73,7 @@ class VideoStage(PortedStage):
         self._path = self.settings.folder / self.settings.keys["path"]
         height, width = next(iter(self.writes.values())).shape[:2]
         self._shape: Shape = (height, width)
-        self._files = pictures_in(self._path) if self._path.is_dir() else []
+        self._files = _pictures(self._path)
         self._reader = None if self._files else VideoReader(self._path, self._shape)
         self._fps = self.settings.keys.get("fps") or (None if self._files else footage(self._path).fps) or DEFAULT_FPS
         self._picture: U8 = np.zeros((height, width, 3), np.uint8)

@@ -50,6 +50,8 @@ OPEN = {
     "apps.compare.sides.ImportedTime",
     "apps.run.report._Accuracy",
     "apps.run.report._Avatar",
+    "apps.run.report._Output",
+    "apps.run.report._Part",
     "apps.run.report._Scene",
     "apps.run.report._WorstView",
     "apps.sweep.store.TrialRecord",

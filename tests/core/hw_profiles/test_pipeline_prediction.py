@@ -520,7 +520,7 @@ def test_a_scale_that_makes_a_time_too_long_is_refused(tmp_path: Path) -> None:
         write_file(tmp_path, '[stages]\na = { python = "m:f", unit = "b", scale = { snapdragon-888 = 2 } }')
     )
     measured = MeasuredStages({"a": StageTime(mean=3e6)}, "run", "snapdragon-888")
-    said = r"stages.a.scale.snapdragon-888: found 2 times 3e\+06 ms, expected a time of at most 3.6e\+06 ms$"
+    said = r"stages.a.scale.snapdragon-888: found a factor of 2 for times around 3e\+06 ms, expected no time above"
     with pytest.raises(BadInputError, match=said):
         measured_price(file, "a", measured)
 

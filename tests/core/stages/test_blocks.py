@@ -354,6 +354,15 @@ def test_pictures_of_a_folder_are_shown_by_name_at_one_size(tmp_path: Path) -> N
         video.footage(tmp_path / "no.mp4")
 
 
+def test_a_single_photo_is_shown_again_and_again(tmp_path: Path) -> None:
+    """FFmpeg reads a larger JPEG with its reader of numbered pictures, which opens other files."""
+    noise = np.random.default_rng(1).integers(0, 255, (240, 320, 3), np.uint8)
+    Image.fromarray(noise).resize((1280, 960)).save(tmp_path / "photo.jpg")
+    assert video.footage(tmp_path / "photo.jpg") == (1, None)
+    stage = Ported(video.build_video, {}, {"": "u8 16x32x3"}, tmp_path, path="photo.jpg")
+    assert np.array_equal(stage(frame=0), stage(frame=7))
+
+
 def test_a_text_that_names_another_video_is_refused(tmp_path: Path) -> None:
     written_video(tmp_path / "other.mp4", 2)
     (tmp_path / "list.txt").write_text("ffconcat version 1.0\nfile other.mp4\n")

@@ -63,7 +63,7 @@ def test_the_file_has_the_sizes_and_the_rate_of_the_files(folder: Path) -> None:
 
 
 def test_names_beyond_the_basic_plane_are_written(folder: Path) -> None:
-    name = "x\N{GRINNING FACE}"
+    name = "x\N{GRINNING FACE}\x7f"
     values = [helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 3, "h", "w"])]
     values.append(helper.make_tensor_value_info("y", TensorProto.FLOAT, [1, 3, "h", "w"]))
     graph = helper.make_graph([helper.make_node("Relu", [name], ["y"])], "g", values[:1], values[1:])

@@ -357,7 +357,7 @@ def test_predictions_of_one_chip_share_the_models_error(tmp_path: Path) -> None:
         path.write_text(json.dumps(answer), encoding="utf-8")
         return read_told(str(path))
 
-    with pytest.raises(BadInputError, match=r"frame_time_ms: found .* its mean is 0 ms, and a frame takes more than 0"):
+    with pytest.raises(BadInputError, match=r"frame_time_ms: found its mean is 0 ms, and a frame takes more than 0"):
         prediction("none", 0.0, "one")
     base = prediction("a", 20.0, "one")
     assert pair(base, prediction("b", 20.5, "one")).verdict == "frame time +2.5 %"

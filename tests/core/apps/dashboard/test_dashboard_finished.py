@@ -185,7 +185,7 @@ def test_a_damaged_or_silent_video_has_no_pictures(tmp_path: Path) -> None:
     content = (tmp_path / "whole.mp4").read_bytes()
     (tmp_path / "damaged.mp4").write_bytes(content[: len(content) // 2])
     damaged = _RunPictures(tmp_path / "damaged.mp4", FPS)
-    assert damaged.jpeg(0) is not None or damaged.is_missing
+    assert damaged.jpeg(0) is not None
     assert damaged.jpeg(FRAMES - 1) is None
     damaged.close()
     with av.open(str(tmp_path / "sound.mp4"), "w") as container:

@@ -262,13 +262,21 @@ SCENE = make_report()["config"]["scene"]
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"config": {}}, "config: found value error, scene: input should be a valid dictionary or instance of _scene"),
-        ({"config": {"scene": {}}}, "config: found value error, scene.name: field required"),
-        ({"config": {"scene": {**SCENE, "avatars": [{}]}}}, "scene.avatars.0.bundle: field required"),
-        ({"config": {"scene": {**SCENE, "fps": "fast"}}}, "scene.fps: input should be a valid number"),
-        ({"accuracy": {"hiker": {"source": "validation"}}}, "hiker: value error, no psnr_db and no psnr_db_by_band"),
-        ({"accuracy": {"hiker": {"psnr_db_by_band": {"far": "good"}}}}, "hiker.psnr_db_by_band.far: input should be"),
-        ({"accuracy": {"hiker": {"psnr_db": 10**400}}}, "hiker.psnr_db: input should be a valid number"),
+        ({"config": {}}, "config.scene: found no table of keys and values"),
+        ({"config": {"scene": {}}}, "config.scene.name: found field required"),
+        ({"config": {"scene": {**SCENE, "avatars": [{}]}}}, "config.scene.avatars.0.bundle: found field required"),
+        ({"config": {"scene": {**SCENE, "fps": "30"}}}, "config.scene.fps: found input should be a valid number"),
+        ({"config": {"scene": {**SCENE, "output": 5}}}, "config.scene.output: found input should be"),
+        (
+            {"config": {"scene": {**SCENE, "output": {"width": "x"}}}},
+            "config.scene.output.width: found input should be",
+        ),
+        ({"accuracy": {"Hiker": {"source": "validation"}}}, "accuracy.Hiker: found no psnr_db and no psnr_db_by_band"),
+        (
+            {"accuracy": {"Hiker": {"psnr_db_by_band": {"far": "30"}}}},
+            "accuracy.Hiker.psnr_db_by_band.far: found input",
+        ),
+        ({"accuracy": {"Hiker": {"psnr_db": 10**400}}}, "accuracy.Hiker.psnr_db: found input should be a"),
     ],
 )
 def test_what_is_read_of_a_scene_and_of_an_accuracy_is_checked(
