@@ -150,7 +150,11 @@ def digest_of(shaped: ShapedBody) -> str:
 
 
 def measures_of(shaped: ShapedBody) -> NDArray[np.float64]:
-    """Return samples (N,) of arrays that are computed from the body's file: joints, vertices, skinning weights."""
+    """Return numbers (N,) by which a file of mesh levels recognises its body, beside the digest.
+
+    They are all joints, every STEP-th vertex, the mean skinning weights of each joint, and the weights of every STEP-th
+    vertex.
+    """
     weights = shaped.body.weights.astype(np.float64)
     parts = (shaped.joints, shaped.vertices[::STEP], weights.mean(axis=0), weights[::STEP])
     return np.concatenate([np.asarray(part, np.float64).ravel() for part in parts])

@@ -1,6 +1,8 @@
 """The network file of an avatar: reads and checks it, and rewrites the network for other tensor shapes.
 
-Rule: a network is checked once, when it is read or made; code that holds a `NetworkFile` need not check it again.
+Rule: operators, shapes, scales and zero points are checked once, when a network is read or made. Code that holds a
+`NetworkFile` need not check them again. A `NetworkFile` may still have layers in float; `check_integer_layers` refuses
+those that its metadata does not list.
 """
 
 from __future__ import annotations

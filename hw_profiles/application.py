@@ -119,8 +119,11 @@ def _job(
 def stage_times_ms(profile: Profile, plan: Plan, corners: Corners) -> dict[tuple[str, UnitName], float]:
     """Return the time of one job in ms, by (stage, unit), in data-flow order.
 
-    A job has `plan.variant.batch` frames. Joints count for each avatar in view, vertices for the meshes that are drawn,
-    and pixels for the one tensor that all avatars share.
+    A job has `plan.variant.batch` frames. The pose time is proportional to the avatars in view. The raster time depends
+    on the vertices that are drawn, and on the pixels of the tensor that all avatars share. Unknown values in the
+    profile's `application` table count as 0.
+
+    `corners`: corner of each unit, in the order of `UNITS`.
     """
     app, network, batch = profile.application, plan.network, plan.variant.batch
     cpu, gpu = (profile.units[u].clock(corners[UNITS.index(u)]) for u in ("cpu", "gpu"))

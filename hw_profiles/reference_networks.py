@@ -297,12 +297,13 @@ class TensorRef(NamedTuple):
 
 
 class GraphBuilder:
-    """Builds an ONNX graph: its methods append operators, and return their results.
+    """Builds an ONNX graph. The methods append operators and return their results.
 
-    All tensors are NCHW with batch 1. They are declared as FLOAT, but the chip's profile decides how many bytes an
-    element takes.
+    All activations are NCHW with batch 1. All tensors are declared as FLOAT, but the chip's profile decides how many
+    bytes an element takes.
 
-    `norm`: normalisation after each convolution: `batch` (folded: no operator), `instance`, `group`.
+    `norm`: normalisation that `normed` and `unit` append: `batch`, `instance` or `group`. `batch` appends no operator,
+    because it is folded into the convolution.
     """
 
     def __init__(self, norm: str) -> None:

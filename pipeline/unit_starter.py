@@ -174,21 +174,22 @@ class UnitStarter:
 
         Raises TrilaneError if the unit cannot be started.
         """
-        spec_fd = os.memfd_create(f"trilane:spec:{spec.unit}", os.MFD_CLOEXEC)
         try:
-            os.write(spec_fd, spec.model_dump_json().encode())
-            self.renew()
-            for server in range(SERVERS):
-                if server:
-                    self._replace()
-                try:
-                    return self._ask(spec, [spec_fd, stderr_fd])
-                except _ServerError as error:
-                    why = str(error)
+            spec_fd = os.memfd_create(f"trilane:spec:{spec.unit}", os.MFD_CLOEXEC)
+            try:
+                os.write(spec_fd, spec.model_dump_json().encode())
+                self.renew()
+                for server in range(SERVERS):
+                    if server:
+                        self._replace()
+                    try:
+                        return self._ask(spec, [spec_fd, stderr_fd])
+                    except _ServerError as error:
+                        why = str(error)
+            finally:
+                os.close(spec_fd)
         except OSError as error:
             why = error.strerror or str(error)
-        finally:
-            os.close(spec_fd)
         raise TrilaneError(f"unit {spec.unit} could not be started: {why}")
 
     def _ask(self, spec: UnitSpec, fds: Sequence[int]) -> StartedUnit:

@@ -93,10 +93,11 @@ class PlacedCamera:
     """A camera in the scene.
 
     `path`: path of the camera, in its own world.
-    `turn` (3, 3), `shift` (3,): transform from the path's world to the scene's world.
-    `mount` (3, 3): rotation from the camera's axes to the path's axes.
+    `turn` (3, 3), `shift` (3,), metres: a point p of the path's world is at `turn @ p + shift` in the scene's world.
+    `mount` (3, 3): rotation from the placed camera's axes to the axes of the camera in `path`; a constant tilt.
     `notes`: what was decided, for people.
-    `ways`: ways of the avatars; the camera moves by their mean. Empty for a camera that does not go along.
+    `ways`: smoothed paths of the avatars over the floor. The camera moves by their mean. Empty if the camera does not
+    go along.
     """
 
     path: CameraPath

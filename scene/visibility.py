@@ -372,7 +372,11 @@ def best_place(film: Filming) -> tuple[F64, float]:
 
 
 def _merits(film: Filming, judge: PlaceJudge, places: F64) -> F64:
-    """Return the scores (S,) of places in a climb; -1 where the floor is too near to an eye."""
+    """Return the scores (S,) by which the search for the best place compares `places` (S, 3), in the recording's world.
+
+    A score is `PlaceMerits.score` plus a small bonus for bodies that are nearly whole in the picture. It is -1 if the
+    floor at the place is higher than `highest_floor`.
+    """
     shown = judge.shown(places)
     merits = shown.score + NEARLY_MOMENTS / len(film.eyes) * shown.nearly
     return np.where(places[:, 1] <= highest_floor(film), merits, -1.0)

@@ -303,7 +303,10 @@ class Assignment:
             self._admit(now_ns)
 
     def _feed_stage(self, stage: StageState, now_ns: int) -> None:
-        """If the stage has no inputs and could begin a frame, put frames in flight until one waits for it."""
+        """If the stage has no inputs and its output has room, put frames in flight until one waits for the stage.
+
+        This ends early when the source is empty or the limit of frames in flight is reached.
+        """
         if stage.before or not (stage.output is None or self._choice.can_claim(stage, stage.output)):
             return
         while not stage.waiting and not self._source.is_empty and not self._choice.is_full():

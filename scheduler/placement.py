@@ -57,8 +57,9 @@ class CpuCore(NamedTuple):
 class UnitWork(NamedTuple):
     """The work of a unit for a frame, on cores of full speed that the unit has to itself.
 
-    `serial_ns`: sum of the service times of the unit's jobs.
-    `core_ns`: time that the jobs take on each of the unit's cores; less than `serial_ns` if a device works for them.
+    `serial_ns`: sum of the times of the unit's jobs, without preempted time.
+    `core_ns`: mean CPU time of the unit's threads, summed over the jobs. A floating unit takes this time on all its
+    cores together. It is less than `serial_ns` if threads wait, for example for a device.
     `jobs`: number of jobs for a frame.
     """
 

@@ -1,8 +1,11 @@
-"""Decisions about a frame before its first job: the run's policy, the frame's release, and how much work it gets.
+"""Policies, the release of frames, and how much work a frame gets.
 
-Rule: a policy is a row of the table `POLICIES`; policies differ only in their rows. Runs on this machine and runs in
-virtual time take their settings from here, so that a policy means the same on both clocks. The source queues frames
-within limits: each frame is taken once, or counted as dropped.
+Rule: a policy is a row of the table `POLICIES`; policies differ only in their rows. A policy says which job a unit
+takes next, and which frames are dropped. Runs on this machine and runs in virtual time take their settings from here,
+so that a policy means the same on both clocks.
+
+The source queues frames within limits. Each released frame is taken once or counted as dropped. Frames that wait when
+the run stops never begin.
 
 A frame that would be late gets less work. A ladder has rungs: rung 0 is all the work, and each further rung is less
 work at the price of a worse picture. Rule: measured times decide; less work is chosen at once, more work only later.
@@ -16,12 +19,12 @@ The use of a rung is the larger of two ratios:
 - the busiest unit's time for a frame, divided by the period;
 - the time of all stages for a frame, divided by the time from release to deadline.
 
-The wanted rung is the first whose use is at most `FULL`. Without such a rung, it is the first rung whose use exceeds
-the least use by at most a twentieth, because less work would save nothing.
+`FULL` and `ROOM` are thousandths. The wanted rung is the first whose use is at most `FULL`. Without such a rung, it is
+the first rung whose use exceeds the least use by at most a twentieth, because less work would save almost nothing.
 
 The ladder changes at once to a rung of less work. It returns to more work by one rung, after `patience` successive
 frames in which that rung's use was at most `ROOM`. If it must leave that rung within `patience` frames, the patience
-doubles, up to `MOST_PATIENCE`. If it leaves the rung later, the patience is `PATIENCE` again.
+doubles, up to `MOST_PATIENCE`. Every other change to less work sets the patience to `PATIENCE`.
 """
 
 from __future__ import annotations

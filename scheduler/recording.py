@@ -48,8 +48,8 @@ _EVENTS, _ACTIONS = _forms(EVENTS), _forms(ACTIONS)
 class Recording:
     """The steps of one run, as tuples (now_ns, events, actions).
 
-    `accounts`: (time in ns, unit, account) for each change of a unit's account (ledger.py): from this time on, the unit
-    has this account. `accounts` is not written, because a replay gives it again.
+    `accounts`: (time in ns, unit, account) for each change. From this time on, the unit's time goes to this account, a
+    number of ledger.py. `accounts` is not written, because a replay computes it again.
     """
 
     graph: Graph

@@ -253,7 +253,7 @@ KINDS: dict[str, Callable[[Shape, np.random.Generator], F32]] = {
 
 @cache
 def scenes() -> tuple[F32, ...]:
-    """Return all scenes, each (SIDE,SIDE,3) in 0..1. They are the same in every process."""
+    """Return all images of scenery, each (SIDE,SIDE,3) float32 in 0..1. They are the same in every process."""
     return tuple(_scene(np.random.default_rng((SIDE, number))) for number in range(SCENES))
 
 

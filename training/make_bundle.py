@@ -64,12 +64,13 @@ class QuantisedAvatar:
 def byte_texture(
     avatar: TrainableAvatar, shaped: ShapedBody, unseen: Mask | None = None, person: int = 0
 ) -> tuple[NDArray[np.int8], NDArray[np.float32], NDArray[np.int8] | None]:
-    """Return the texture (S,S,C) int8, the scale (C,) of each channel, and the packed smaller levels or None.
+    """Return (texture (S,S,C) int8, scale (C,) of each channel, smaller levels).
 
-    Texels that the body does not use are 0.
+    The smaller levels are packed by `pack_levels`; None if the avatar has none. They use the same scale. Texels farther
+    than TEXEL_MARGIN from those that the body uses are 0.
 
-    `unseen`: image of any side that marks texels of the body that were never trained. They are filled from trained
-    texels.
+    `unseen`: bool image (h,h) of any side. True marks texels of the body that were never trained. They are filled from
+    trained texels.
     `person`: number of the person in `avatar`.
     """
     body = body_arrays(shaped)
@@ -258,7 +259,11 @@ def held_out_views(renderer: SampleRenderer, bundle: Bundle, views: int) -> list
 
 
 def _tensors(renderer: SampleRenderer, bundle: Bundle, sample: Callable[[int], Sample], wanted: int) -> Iterator[F32]:
-    """Yield `wanted` inputs (H,W,C) of the network of `bundle`. Samples of other shapes are passed over."""
+    """Yield `wanted` float inputs (H,W,C) of the network of `bundle`, with (H,W) = `CALIBRATION_SHAPE`.
+
+    `sample`: function that returns the sample of a number. It is called with 0, 1, 2 and so on; samples of another
+    tensor shape are passed over. At least `wanted` samples must have `CALIBRATION_SHAPE`.
+    """
     levels = levels_of(bundle)
     found = (one for one in map(sample, count()) if one.crop.shape == CALIBRATION_SHAPE)
     for _, one in zip(range(wanted), found, strict=False):

@@ -343,10 +343,11 @@ WEIGHTS = {"stand": 0.20, "walk": 0.26, "reach": 0.20, "overhead": 0.15, "sit": 
 
 
 def _arm(pose: F64, side: str, raised: float, swung: float, bent: float, twisted: float = 0.0) -> None:
-    """Set one arm of `pose`. All angles are degrees from the T pose.
+    """Set the shoulder and the elbow of one arm in `pose`, axis-angle by joint. `side`: key of `SIDES`.
 
-    `raised`: 90 is overhead, -90 is hanging. `swung`: positive is backwards. `bent`: angle of the elbow. `twisted`:
-    turn about the upper arm; negative turns a bent forearm upwards.
+    The other parameters are degrees from the T pose. `raised`: 90 is overhead, -90 is hanging. `swung`: positive is
+    backwards; the effect falls above level, to none overhead. `bent`: angle of the elbow. `twisted`: turn about the
+    upper arm; negative turns a bent forearm upwards.
     """
     sign = SIDES[side]
     hanging, level = max(0.0, -np.sin(np.radians(raised))), np.cos(np.radians(raised))

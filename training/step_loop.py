@@ -40,8 +40,10 @@ SEED_BITS = 31
 
 
 def first_state(avatar: TrainableAvatar, settings: TrainingSettings, vgg: Vgg16 | None = None) -> TrainingState:
-    """Return the state of a training of `avatar` before the first step. `avatar` is prepared in place.
+    """Return the state of a training of `avatar` before the first step.
 
+    `avatar` changes in place: it moves to the chosen device, and gets the noise, dropout and precision of `settings`.
+    If `settings` round to bytes, it gets a byte grid too.
     `vgg`: network of the perceptual loss; None if MS-SSIM replaces it or the loss has no such term.
     Raises MissingPartError as `chosen_device` does.
     """

@@ -366,9 +366,9 @@ def _names(dots: Sequence[Dot], across: _Axis, up: _Axis) -> Iterator[str]:
 
 
 def still(video: Path) -> bytes | None:
-    """Return a frame near the middle of `video` as a JPEG, at most `STILL_WIDTH` pixels wide.
+    """Return the last keyframe at or before the middle of `video` as a JPEG, at most `STILL_WIDTH` pixels wide.
 
-    None is returned if the video cannot be read.
+    If the duration is unknown, the first frame is returned. If the video cannot be read, None is returned.
     """
     try:
         with open_video(video) as container:

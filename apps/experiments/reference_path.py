@@ -129,8 +129,10 @@ class RunBody:
     def vertices(self, seen: CastView, level: int | None, causes: Causes) -> F64:
         """Return the vertices (V,3) float64, metres, in the world.
 
-        `seen`: the avatar in a frame. `level`: index into `DETAILS` by the run's plan; None if the run does not show
-        the avatar. `causes`: causes that are on; only the causes in `BODY` have an effect.
+        `seen`: the avatar in a frame.
+        `level`: index into `DETAILS` that the run's plan chose. None if the run does not show the avatar; nothing is
+        left out then. If the GPU unit skins, its own detail replaces `DETAILS[level]`.
+        `causes`: causes that are on; only the causes in `BODY` have an effect.
         """
         detail = self._detail(level, causes)
         if Cause.FLOAT32 not in causes:

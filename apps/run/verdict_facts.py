@@ -215,9 +215,10 @@ def _tries(
 ) -> Iterator[str]:
     """Yield proposals, the most useful first. Every run gets the last one, `trilane explain`.
 
-    The first is to end other programs that take more than MOST_OTHERS. A run that is paced or below `target` gets the
-    proposals of `_shorter`.
-    A run that holds `target` may get late latching (see MUCH_LATER) or, for a scene, a larger picture (see MUCH_LEFT).
+    The first is to end other programs, if together they took more than MOST_OTHERS of the cores' time. A run that is
+    paced or below `target` gets the proposals of `_shorter`.
+    A run that holds `target` may get late latching (see MUCH_LATER). If it is the run of a scene, it may also get a
+    larger picture (see MUCH_LEFT).
     `run`, `config`, `folder`: see `facts_of`. `baseline`: figures with one frame at a time; None if unknown.
     `bound`: bound of the run; None if unknown. `target`: rate to hold, in frames a second.
     """

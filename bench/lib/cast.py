@@ -202,8 +202,8 @@ def shrunk(light: F64, factor: int) -> F64:
 def enlarged(light: F64, factor: int) -> F64:
     """Return `light` (h,w,C), enlarged bilinearly to (h * factor, w * factor, C).
 
-    Each pixel becomes a square of `factor` x `factor` pixels. Beyond the centres of the outermost pixels, their values
-    are repeated.
+    The outer borders of both pictures coincide. Beyond the centres of the outermost pixels of `light`, their values are
+    repeated.
     """
     return _enlarged_down(_enlarged_down(light, factor).swapaxes(0, 1), factor).swapaxes(0, 1)
 

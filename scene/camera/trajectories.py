@@ -258,7 +258,10 @@ def load_stray(path: Path, clock: TableClock = ANY_CLOCK) -> RawCamera:
 
 
 def _stray_lenses(file: Path, poses: PoseTable) -> tuple[tuple[Lens, ...], str]:
-    """Return (one lens for all poses or one for each; their source in words)."""
+    """Return (lenses, source of the lenses in words). There is one lens for all poses, or one lens for each pose.
+
+    Raises BadInputError for a lens or a camera matrix that is wrong.
+    """
     parts = ("fx", "fy", "cx", "cy")
     if all(name in poses.names for name in parts):
         table = np.column_stack([poses.column(name) for name in parts])

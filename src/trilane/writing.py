@@ -1,7 +1,10 @@
-"""Writes output files so that they are whole or absent: under a temporary name in the same folder, then renamed.
+"""Writes output files so that each is whole or absent: under a temporary name first, then renamed.
 
-Rule: if writing ends early for any reason, the old file stays as it was, and no other file is left. Only a process that
-is killed outright may leave its temporary file, `.trilane-*`.
+A temporary file lies in the folder of the output file. `write_folder` uses a temporary folder beside the output folder.
+A device or a pipe is written directly.
+
+Rule: if writing ends early for any reason, an old file stays as it was, unless `write_folder` has already replaced it.
+Temporary files are removed. Only a process that is killed outright may leave its `.trilane-*`.
 """
 
 from __future__ import annotations

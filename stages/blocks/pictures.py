@@ -267,7 +267,11 @@ def _classes(mask: NDArray[Any]) -> U8:
 
 
 def _depth_colours(depth: F32) -> U8:
-    """Return the colours (h,w,3) of `depth` (h,w). Infinities count as the nearest finite depth, NaN as the least."""
+    """Return the colours (h,w,3) uint8 of `depth` (h,w), from blue for the least finite depth to red for the largest.
+
+    Plus infinity counts as the largest finite depth. Minus infinity and NaN count as the least. If all finite depths
+    are equal, or there are none, the picture is blue.
+    """
     finite = depth[np.isfinite(depth)]
     low, high = (float(finite.min()), float(finite.max())) if finite.size else (0.0, 0.0)
     depth = np.nan_to_num(np.clip(depth, low, high), nan=low)
