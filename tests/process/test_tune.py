@@ -40,6 +40,12 @@ def order(folder: Path) -> list[float]:
     return [json.loads(line)["options"]["fps"] for line in (folder / TRIALS).read_text().splitlines()]
 
 
+def test_a_search_in_which_nothing_keeps_ends_with_1(tmp_path: Path) -> None:
+    search = started(tmp_path / "s", "--keep", "fps>1000")
+    out, said = search.communicate(timeout=LIMIT_S)
+    assert (search.returncode, json.loads(out)["best"]) == (1, None), said
+
+
 def test_a_killed_search_goes_on_with_the_same_trials(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     log = tmp_path / "log"
     monkeypatch.setenv("SWEEP_TRIAL_LOG", str(log))

@@ -187,6 +187,12 @@ def test_what_is_printed(folder: Path, command: Command, check_printed: Callable
     assert err == ""
 
 
+def test_one_frame_is_printed(folder: Path, command: Command) -> None:
+    lines = command("explain", folder, "--frame", "20")[0].splitlines()
+    assert lines[0].startswith("Frame 20: presented ")
+    assert [line.split()[1] for line in lines if "composite" in line] == ["composite"]
+
+
 def test_json_is_the_document(folder: Path, command: Command) -> None:
     out, _ = command("explain", folder, "--slowest", 3, "--json")
     assert json.loads(out) == json.loads(json.dumps(explain_run(folder, 3).as_json()))
