@@ -210,7 +210,9 @@ def _table(path: Path, columns: Sequence[str]) -> list[tuple[str, dict[str, str]
     reader = csv.DictReader(read_text(path, "a CSV file").splitlines(), restval="")
     if missing := [column for column in columns if column not in (reader.fieldnames or ())]:
         raise BadInputError(path, f"no column {', '.join(missing)}", f"the columns {', '.join(columns)}")
-    return [(f"{path}: line {reader.line_num}", row) for row in reader]
+    if not (rows := [(f"{path}: line {reader.line_num}", row) for row in reader]):
+        raise BadInputError(path, "no row below the columns", "one or more")
+    return rows
 
 
 @lru_cache(maxsize=128)

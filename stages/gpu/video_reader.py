@@ -38,7 +38,7 @@ from trilane.scene.lens import cover
 #: Containers whose reader opens no other file, by FFmpeg's names. Readers of playlists and of numbered pictures do.
 CONTAINERS = (
     "mov,matroska,webm,avi,mpegts,mpeg,mpegvideo,m4v,h264,hevc,av1,obu,ivf,ogg,flv,asf,dv,mxf,nut,gif,mjpeg,"
-    "yuv4mpegpipe,apng,webp_pipe,png_pipe,bmp_pipe,tiff_pipe"
+    "yuv4mpegpipe,apng,webp_pipe,png_pipe,bmp_pipe,tiff_pipe,wav,mp3,flac,aac"
 )
 PQ, HLG = "PQ", "HLG"
 #: Light of white on a common display, and the brightest light of a video that is still reduced, not cut; cd/m2.

@@ -346,7 +346,7 @@ BACKGROUNDS: dict[str, tuple[str, Content, str]] = {
     "bomb": ("a.png", picture_of(60_000, 60_000), "3600000000 pixels"),
     "wrong pixels": ("a.png", picture_of(40, 30), "no readable picture"),
     "cut film": ("a.mkv", cut_file("film.mkv", 0.1), "no "),
-    "text as a film": ("a.mp4", BVH, "no readable video"),
+    "text as a film": ("a.mp4", BVH, "found text"),
     "sound alone": ("a.wav", sound_only, "no video stream"),
     "folder without pictures": ("a", folder_of(), "no pictures"),
     "folder of broken pictures": ("a", folder_of(a=b"\x89PNG\r\n\x1a\n"), "no readable picture"),
