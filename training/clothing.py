@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from trilane.arrays import F64
 from trilane.body.joints import JOINT_INDEX
@@ -329,6 +328,8 @@ def _shoes(body: BodyArrays, landmarks: Landmarks) -> list[_Sheet]:
 
 def nearest(points: F64, vertices: F64, count: int = 8) -> NDArray[np.int64]:
     """Return the indices (N,count) of the `vertices` (V,3) nearest to each of `points` (N,3), nearest first."""
+    from scipy.spatial import cKDTree  # here, because commands that draw no clothes import this module without SciPy
+
     _, order = cKDTree(vertices).query(points, range(1, count + 1))
     return np.asarray(order, np.int64)
 

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter1d
 
 from trilane.arrays import F64, Ints
 from trilane.body.body import ShapedBody
@@ -333,6 +332,8 @@ def long_hair(vertices: F64, joints: F64, eye: F64) -> Stitched:
         around = _ring(np.vstack([head[head[:, 1] > height - 0.012], near]), height, 0.018) - centre
         turn = np.arctan2(around[:, 0], around[:, 2])
         radius[row] = np.interp(at[row], turn, np.hypot(around[:, 0], around[:, 2]), period=2 * np.pi)
+    from scipy.ndimage import gaussian_filter1d  # here, as in clothing.py
+
     # The sides and the top of the sheet dive into the hair of the head.
     radius = gaussian_filter1d(radius, 2.0, axis=0) + 0.034 * rise - 0.018 - 0.022 * across**6 * (1 - low)
     radius += 0.034 * smoothstep(eye[1] - 0.06, neck[1] - 0.04, heights)[:, None]

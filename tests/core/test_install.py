@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import importlib.metadata
 import shlex
+import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -114,3 +115,21 @@ def test_every_extra_that_is_named_is_one() -> None:
     folders = [folder for folder in (ROOT / "src" / "trilane").iterdir() if folder.is_dir()]
     named = {extra for folder in folders for file in folder.rglob("*.py") for extra in extras_named(file)}
     assert {"anny", "fit", "loadgen", "openvino", "peers", "plot", "qnn", "train"} <= named <= set(extras)
+
+
+#: Refuses what only extras install, then imports modules of commands that a plain install has.
+WITHOUT_EXTRAS = """
+import sys
+class Refuses:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {"scipy", "torch", "skimage", "flip_evaluator", "starlette", "matplotlib"}:
+            raise ModuleNotFoundError(name, name=name)
+sys.meta_path.insert(0, Refuses())
+import trilane.apps.avatar_files, trilane.apps.inspect.inspect_file, trilane.apps.run.run_job
+import trilane.apps.compare.pages, trilane.apps.explain.explained_run, trilane.apps.predict.asked_file
+"""
+
+
+def test_commands_of_a_plain_install_need_no_extra() -> None:
+    done = subprocess.run([sys.executable, "-c", WITHOUT_EXTRAS], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
