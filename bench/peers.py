@@ -45,8 +45,8 @@ def measure(
 ) -> dict[str, Any]:
     """Compare the speed of Trilane's runtimes with the libraries' own examples and with peaks of the machine.
 
-    `ratios` are medians over the rounds. In a key with `over`, the ratio is the speed of the runtime before `over`,
-    divided by the speed of the variant after `over`. In a key with `of`, the ratio is a share of a peak.
+    `ratios` are medians over the rounds. A key `a_over_b` is the speed of the runtime `a`, divided by the speed of the
+    variant `b`. In a key with `of`, the ratio is a share of a peak.
     `ort_over_fp32`, `openvino_over_fp32`: Trilane's runtime in INT8, and ONNX Runtime in FP32 with its defaults.
     `openvino_over_benchmark_app`: Trilane's runtime, and OpenVINO's own tool on the same file.
     `openvino_of_roofline`: share of the best rate that an INT8 layer of the same runtimes reaches here.

@@ -429,7 +429,7 @@ def _derivatives(at: F64, data: _Rows, mean: F64, spread: F64, chips: int) -> tu
 class LeftOut(NamedTuple):
     """A row with its prediction by a fit that has not seen its network.
 
-    `unsure`: relative error of the prediction from the spread of the fit's numbers.
+    `unsure`: relative error that the spread of the fit's numbers causes in the prediction.
     `unlike`: distance of the network from the nearest network of the fit, 0 to 1 (`Fitted.unlike`).
     """
 

@@ -200,5 +200,5 @@ def _measured(value: float, source: str) -> Quantity:
 
 
 def is_known(profile: Profile, unit: UnitName) -> bool:
-    """Return whether times on `unit` have a known error: only this machine has units that nobody measured."""
+    """Return whether times on `unit` have a known error: a chip's times always do, this machine's only if measured."""
     return profile.name != HOST or profile.units[unit].measured is not None

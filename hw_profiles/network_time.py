@@ -185,8 +185,8 @@ def in_precision(profile: Profile, unit: UnitName, numbers: NumberFormat, asked:
     """Return `profile` with the unit computing in the network's precision.
 
     `unit`: unit that runs the network.
-    `numbers`: number format of the file. A float network runs in FP16 on a unit whose own precision is INT8. In all
-    other cases, the unit keeps its own precision.
+    `numbers`: number format of the file. An INT8 unit runs a float network in FP16.
+    In all other cases, the unit keeps its own precision.
     `asked`: int8, fp16 or fp32, which replaces this choice; None keeps it.
     """
     own = profile.units[unit].precision

@@ -355,7 +355,7 @@ class _Graph:
 
 
 def first_result(node: Any) -> str:
-    """Return the name of the first result that `node` makes. A recurrent layer may make only a later result."""
+    """Return the first named output of `node`. A recurrent layer may leave its first outputs without a name."""
     name: str = next(name for name in node.output if name)
     return name
 
@@ -479,7 +479,9 @@ def _padding(count: int, block: int) -> float:
 
 
 def _convolution(node: Any, source: Shape, weight: Shape, out: Shape, moved: int) -> Iterator[tuple[str, float]]:
-    """Yield (term of `TERMS`, amount) of a convolution: elements moved, and products with channels in whole blocks.
+    """Yield (term of `TERMS`, amount) of a convolution: moved elements, and multiplications.
+
+    The multiplications count channels rounded up to whole blocks.
 
     `source`, `out`: shapes (N, C, ...). `weight`: shape with the kernel's sides from axis 2 on.
     `moved`: elements read and written, with channels in whole blocks.

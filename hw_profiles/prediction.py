@@ -210,7 +210,7 @@ class NetworkPrediction(Record):
     `fps`: inferences a second. `job_ms`: time that belongs to no operator.
     `operators`, `without_rule`: operators in the order of the file, and operator types without a rule.
     `power`: power of the settled device. `rate`, `power_limit`: answers about the rate and the limit that were wanted.
-    `fps_start` to `timeline`: course over minutes, absent without one.
+    The fields from `fps_start` to `timeline` are absent unless minutes were asked for.
     """
 
     file: str

@@ -156,7 +156,7 @@ class Piece(NamedTuple):
     `stage`: stage of `job`; for DOWN, a stage of the unit that was down.
     `job`: job that contains the piece; for a piece between two jobs, the later job.
     `begin_ns`, `end_ns`: begin and end of the piece, in ns of the run's clock.
-    `asleep`: kind as which the job's sleep counts, ASLEEP or STOPPED.
+    `asleep`: kind of the job's sleep, ASLEEP or STOPPED.
     """
 
     what: str

@@ -236,7 +236,7 @@ class UnitHistory:
     def cut(self, job: JobRecord) -> Iterator[IdleSlice]:
         """Yield the idle slice, if any, between the unit's last job and this job.
 
-        Only the cause OVERHEAD has slices between jobs: during any other cause the unit has no job.
+        Only OVERHEAD is cut by jobs: the unit may have jobs while it lasts. Every other cause ends before the next job.
         """
         if self._idle_cause == OVERHEAD:
             if job.begin_ns > self.cut_ns:

@@ -281,7 +281,7 @@ class PlaceMerits:
 class PlaceJudge:
     """Judges places for one `Filming`.
 
-    Each moment has ROWS rows, each a direction in the recording's world. The product of a row and a place is a number,
+    Each moment has ROWS row vectors in the recording's world. The dot product of a row vector and a place is a number,
     such as the distance of the place from a side of the picture.
     """
 

@@ -184,9 +184,9 @@ class Corners:
         return np.hstack([own, other, other[:, :1]]), np.stack([t - 1, -t, 1 - s, s, 0 * s], axis=1)
 
     def _at_seams(self, corners: I64, chords: I64) -> tuple[tuple[I64, F64], F64]:
-        """Return (pairs of `corners` (M,) with the nearest points of chords in UV, distances (M,) of the pairs in UV).
+        """Pair each of the M `corners` with the nearest point of a chord in UV; return (pairs, distances (M,) in UV).
 
-        Only chords in the same UV chart count. Pairs are (`corners`, `shares`) as in `Pairs`.
+        Only chords in the same UV chart count. The pairs have the form of `Pairs`.
         """
         if not len(corners):
             return (np.zeros((0, 5), np.int64), np.zeros((0, 5))), np.zeros(0)

@@ -189,7 +189,8 @@ def validate(
 
     `renderer`: renderer from `open_renderer`.
     `float_network`: float network to evaluate too, or None.
-    `look`: called with the seed and the evaluation of every sample. Painters have the names of runtimes and `FLOAT`.
+    `look`: function that gets the seed and the evaluation of every sample. The keys of an evaluation's pictures are
+    the names of runtimes, and `FLOAT`.
     Raises errors as `integer_painter` and `held_out_motions` do.
     """
     digests = digests_of(bundle.folder, bundle.manifest)

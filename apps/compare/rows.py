@@ -356,7 +356,7 @@ class Noise(NamedTuple):
         return self._chance(TAILS.get(statistic, 1.0) * WALL_DEVIATION, explained=self.others[0])
 
     def of_wait(self, statistic: str) -> Chance:
-        """Return the `Chance` of a wait in ms, which may be almost 0. No known cause explains a change of it.
+        """Return the `Chance` of a wait in ms. The wait may be almost 0. No known cause explains a change of the wait.
 
         `statistic`: as in `MEASURES`.
         """

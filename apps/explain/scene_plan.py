@@ -1,9 +1,9 @@
 """The plan that a run makes for each frame of a scene: in words and figures, with costs and savings, and as a drawing.
 
-Rule: the run's own pose stage decides. `ScenePlan` measures how far a level of detail moves vertices on the picture,
-against the whole body in float64. Costs are computed, never measured, by the model of `trilane predict`. In this model,
-the cost of an avatar in view depends on its joints and on the vertices that its mesh level keeps. Every figure says
-whether it is a bound, measured or computed.
+Rule: the run's own pose stage decides. `ScenePlan` compares a level of detail with the whole body in float64: it
+measures the distance of their vertices in the picture. Costs are computed, never measured, by the model of `trilane
+predict`. In this model, the cost of an avatar in view depends on its joints and on the vertices that its mesh level
+keeps. Every figure says whether it is a bound, measured or computed.
 
 The drawing shows the plan for a frame of each phase, not the painted frame. Its parts are the vertices of the bodies,
 the bodies' rectangles and the tensor's crop rectangles.

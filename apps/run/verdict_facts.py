@@ -147,7 +147,7 @@ def _named_bound(
 ) -> NamedBound | None:
     """Return `bound` with ms on the critical path by stage; None without a bound.
 
-    The stages are the one that bounds, and those of the bounding unit with a share of LEAST_NAMED or more.
+    The result names the stage that bounds. It also names other stages of its unit with a share of LEAST_NAMED or more.
     `stages`: figures of all stages, by name. `frame_ms`: mean frame time, ms; None or 0 if unknown.
     """
     if bound is None:

@@ -124,7 +124,8 @@ def _distortion(
 ) -> tuple[str, ...]:
     """Return a note on the largest distortion of `lenses`, which is not drawn; () below LEAST_BEND_PX pixels.
 
-    `content`: object of the file, with the distortion of all views. `frames`: views, whose own keys come first.
+    `content`: object of the file, with the distortion of all views. `frames`: views; a view's keys replace
+    the file's.
     `lenses`: one lens for all views, which has the first view's distortion, or one for each. Raises BadInputError if a
     parameter of the distortion is no finite number.
     """

@@ -195,7 +195,7 @@ class _Prices:
 
 #: Costs in a format whose world is arbitrary (ANY_WORLD), and in a format whose world is aligned with gravity by
 #: definition (LEVELLED). In ANY_WORLD, a turn of the device is believed only after every axis. It costs more than
-#: another axis together with a picture whose own up is off that axis by 45 degrees, the most possible. A view straight
+#: another axis with a picture whose up direction differs from it by 45 degrees, the largest difference. A view straight
 #: down along the usual axis is believed only if other axes have horizons that are 0.15 rad off. In LEVELLED, such a
 #: view is believed before every other axis.
 ANY_WORLD = _Prices(axis=0.2, turn=0.4, between=0.25, nadir=0.5, nadir_deg=5.0)

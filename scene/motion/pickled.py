@@ -97,7 +97,7 @@ class _Reader:
         return values[::-1]
 
     def bytes_of(self, raw: Any) -> bytes:
-        """Return `raw` if it is bytes, or the bytes for which Python 2 and older protocols wrote the text `raw`.
+        """Return `raw` as bytes. Python 2 and the protocols 0 to 2 write bytes as a text, one character for each byte.
 
         The same text object always gives the same bytes object.
         """

@@ -332,7 +332,7 @@ class TrunkLine:
         return {"knee": (), "spine3": SPINE[:2]}.get(self.top, SPINE)
 
     def shares(self, rest: Tracks) -> F64:
-        """Return the place of each of the avatar's three joints of the spine along the line (3,), 0 to 1.
+        """Return the places (3,) of the avatar's three spine joints along the line, 0 to 1.
 
         Joints at the upper end and above it get 1. `rest`: joints of the avatar at rest.
         """

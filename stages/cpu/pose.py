@@ -360,7 +360,7 @@ class PoseStage:
         self._made.pop(FrameWork.FULL, None)
 
     def step_to(self, rung: int) -> None:
-        """Give tensors the pixels of `RunConfig.works[rung]` from now on."""
+        """Limit the pixels of later tensors to the share `RunConfig.works[rung]`, in thousandths."""
         self._rung = rung
 
     def _shown_by(self, work: FrameWork) -> bytes | None:

@@ -218,11 +218,11 @@ SCALE_LIMITS = (1e-2, 1e2)
 
 
 def equalised(model: onnx.ModelProto) -> onnx.ModelProto:
-    """Return a copy of the float network with the Conv -> ReLU -> Conv chains that `_pairs` finds equalised.
+    """Return a copy of the float network in which each Conv -> ReLU -> Conv chain from `_pairs` is equalised.
 
     ROUNDS times, each chain in turn is equalised channel by channel. For a channel between the two Convs, r1 is the
-    largest absolute weight of the first Conv that makes the channel. r2 is the largest absolute weight of the second
-    Conv that reads the channel. The scale s is sqrt(r1 / r2), clipped to SCALE_LIMITS; s is 1 if r1 or r2 is 0. The
+    largest absolute weight with which the first Conv makes the channel. r2 is the largest absolute weight with which
+    the second Conv reads it. The scale s is sqrt(r1 / r2), clipped to SCALE_LIMITS; s is 1 if r1 or r2 is 0. The
     first Conv's weights and bias of the channel are divided by s. The second Conv's weights are multiplied by s.
     """
     result = copy.deepcopy(model)

@@ -340,7 +340,7 @@ WRONG: dict[str, tuple[str, ...]] = {
         STAGES.replace('"u"', '"' + "漢" * 40 + '"'),
         *("stages.a.unit", "expected at most 40 letters from a to z"),
     ),
-    "a stage that is no key of TOML": (
+    "a stage name with an umlaut": (
         STAGES.replace("a =", '"überlagerung" =').replace('"a"', '"überlagerung"'),
         *("stages", "the name 'überlagerung', expected at most 40 letters from a to z"),
     ),
